@@ -1,7 +1,7 @@
-"""What a record of `benchmarks.yardstick` keeps of a run's files, and how two records differ.
+"""Digests of a run's files for records of `benchmarks.yardstick`, and differences between two records.
 
-Digests say whether values are the same to the bit. Beside them stand a mean, quantiles and sums under random
-signs, so that the size of a difference is known without the arrays.
+Digests show whether values are identical to the bit. A mean, quantiles and sums under random signs are kept
+beside them, so that the size of a difference is known without the arrays.
 """
 
 import hashlib
@@ -21,7 +21,7 @@ _UNSTEADY_KEYS = {"seconds", "machine", "fps", "from_cache"}
 _UNSTEADY_ENDINGS = ("_seconds", "_s", "_ms", "_hz", "_mb")
 _UNSTEADY_ARRAYS = {"update_s"}
 _OPTION_KEYS = {"photographs"}
-"""Of the text within NPZ files: how a dataset was chosen, by names of options."""
+"""Entries of text within NPZ files that hold names of options: how a dataset was chosen."""
 _TIME = re.compile(r"\d[\d.,]*\s*(?:ms|s|seconds?|min|minutes?|hz|mb|gib|times a second)\b", re.IGNORECASE)
 _NUMBER = re.compile(r"\d+(?:[.,]\d+)*")
 _QUANTILES = (0.0, 0.05, 0.25, 0.5, 0.75, 0.95, 1.0)
@@ -29,12 +29,12 @@ _SKETCH = 32  # random sums of an array, from which the size of a difference is 
 
 
 def describe_array(array: np.ndarray) -> dict[str, Any]:
-    """The digest of an array, and of numbers also what the size of a difference is worked out from.
+    """The digest of an array, and for numbers also statistics that give the size of a difference.
 
     Returns:
-        "sha256" over dtype, shape and bytes, "dtype" and "shape"; of numbers besides "mean", "quantiles" and
-        "sketch" (sums under random signs, those of shape and seed alone), all of finite values, and
-        "not_finite", how many others there are.
+        "sha256" over dtype, shape and bytes, "dtype" and "shape"; for numbers also "mean", "quantiles" and
+        "sketch" (sums under random signs, which depend on shape and seed alone), all of finite values, and
+        "not_finite", the number of other values.
     """
     array = np.ascontiguousarray(array)
     digest = hashlib.sha256(f"{array.dtype.str}|{array.shape}|".encode())
@@ -58,7 +58,7 @@ def _sketch(values: np.ndarray) -> list[float]:
 
 
 def describe_text(text: str) -> dict[str, Any]:
-    """What JSON says without what is unsteady or an option's name; of other text its length alone."""
+    """The value of JSON text without unsteady entries and names of options; the length of any other text."""
     try:
         value = json.loads(text)
     except ValueError:
@@ -87,7 +87,7 @@ def steady(value: Any, left_out: Iterable[str] = ()) -> Any:
 
 
 def _is_after_a_time(row: Any) -> bool:
-    """Whether it is a fit's row about a share of its minutes: which look that is depends on the machine."""
+    """Whether it is a row of a fit's curve at a share of its minutes, whose step depends on the machine."""
     return isinstance(row, Mapping) and "part" in row and row.get("sh_degree", 0) is None
 
 
@@ -107,8 +107,8 @@ def _arrays(path: Path) -> Iterator[tuple[str, np.ndarray]]:
 
 
 def describe_file(path: Path) -> dict[str, Any]:
-    """What is kept of one file: {"arrays": ...} or {"says": ...}; of others, such as videos,
-    reports and settings, nothing but that they are there."""
+    """The digest of one file: {"arrays": ...} or {"says": ...}; of others, such as videos, reports and
+    settings, only their existence."""
     if path.suffix in (".npz", ".ply", ".png"):
         arrays = {name: array for name, array in _arrays(path) if name not in _UNSTEADY_ARRAYS}
         return {
@@ -125,13 +125,13 @@ def describe_file(path: Path) -> dict[str, Any]:
 
 
 def describe_run(folder: Path) -> dict[str, Any]:
-    """What is kept of all files of a run, by their paths within it."""
+    """Digests of all files of a run, by their paths within it."""
     files = sorted(path for path in folder.rglob("*") if path.is_file())
     return {path.relative_to(folder).as_posix(): describe_file(path) for path in files}
 
 
 def compare(before: Mapping[str, Any], after: Mapping[str, Any]) -> dict[str, list[str]]:
-    """By case, what differs between two records, a line each; no line where all is the same to the bit.
+    """Differences between two records by case, a line each; no line where all is identical to the bit.
 
     Raises:
         ValueError: the records are of different formats.
@@ -164,8 +164,8 @@ def _compare_files(path: str, before: Mapping[str, Any] | None, after: Mapping[s
         if name not in ours or name not in theirs:
             lines.append(f"{path}: {name}: array " + ("new" if name not in ours else "missing"))
         elif "text" in ours[name] or "text" in theirs[name]:
-            told = _compare_values(name, ours[name].get("text"), theirs[name].get("text"))
-            lines += [f"{path}: {line}" for line in told]
+            texts = _compare_values(name, ours[name].get("text"), theirs[name].get("text"))
+            lines += [f"{path}: {line}" for line in texts]
         elif ours[name]["sha256"] != theirs[name]["sha256"]:
             lines.append(f"{path}: {name}: {array_difference(ours[name], theirs[name])}")
     return lines

@@ -1,6 +1,6 @@
 """Update rate of each method's step. To add a method, add a function to `STEPS`."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from itertools import islice
@@ -15,7 +15,7 @@ from benchmarks.metrics import Metric
 from benchmarks.timing import compile_program, median_and_p95, sample
 from benchmarks.workloads import ball
 from gsjax.data import open_sequence
-from gsjax.engine.drive import drive
+from gsjax.engine.drive import Tick, drive
 from gsjax.engine.track.tracking import track
 from gsjax.engine.verbs import deform as deform_steps
 from gsjax.geometry.cameras import Camera
@@ -93,11 +93,8 @@ def field(repeats: int) -> StepTimes:
     teacher = teacher_of_objects([thing], [np.eye(3, 512, dtype=np.float32)])
     method = Distill(DistillConfig(iterations=repeats + 1, contrast_after=0.0))
     problem, run = method.start(gaussians_from_activated(*scene[:5]), [camera], teacher)
-    updates = list(drive(method, problem, run))
-    if any(bool(update.info["skipped"]) for update in updates):
-        raise RuntimeError("a step of the distillation was skipped: a number was not finite")
     what = f"{FIT_GAUSSIANS} Gaussians, 1 camera of {width}x{height}, {method.config.channels} channels"
-    return StepTimes(what, [u.seconds for u in updates[1:]], updates[0].compile_seconds)
+    return _step_times(what, drive(method, problem, run))
 
 
 def deform(repeats: int) -> StepTimes:
@@ -105,10 +102,15 @@ def deform(repeats: int) -> StepTimes:
     seen = open_sequence(TISSUE)
     config = DeformConfig(warmup=0, iterations=repeats + 1, graph=GraphConfig(after=0.0))
     ticks = deform_steps(seen, config, tools="draw")
+    what = f"{ticks.run.params.gaussians.num} Gaussians, 1 camera of {seen.width}x{seen.height}"
+    return _step_times(what, ticks)
+
+
+def _step_times(what: str, ticks: Iterable[Tick]) -> StepTimes:
+    """Times of all steps of a loop; the first one compiles."""
     updates = list(ticks)
     if any(bool(update.info["skipped"]) for update in updates):
-        raise RuntimeError("a step of the deforming scene was skipped: a number was not finite")
-    what = f"{ticks.run.params.gaussians.num} Gaussians, 1 camera of {seen.width}x{seen.height}"
+        raise RuntimeError("a step was skipped: a number was not finite")
     return StepTimes(what, [u.seconds for u in updates[1:]], updates[0].compile_seconds)
 
 

@@ -3,7 +3,7 @@
     python -m benchmarks.yardstick OUT [--only NAME ...] [--optimized]    # writes OUT/yardstick.json
     python -m benchmarks.yardstick --compare BEFORE.json AFTER.json       # exits with 1 where they differ
 
-Each case is one small, seeded command in a process of its own. Its record holds which files there are, a
+Each case is one small, seeded command in its own process. Its record holds the list of its files, a
 digest of every array in NPZ and PLY files and of the pixels of every PNG, and the content of metrics.json and
 metrics.jsonl. Whatever two runs of the same program may differ by is left out: times, rates, memory, machines
 and paths, and the content of videos and reports. Settings are left out too, and of sentences all but their
@@ -38,7 +38,7 @@ class Case:
     """One command.
 
     Attributes:
-        name: what `--only` calls it, and the name of its run folder.
+        name: name for `--only`, and of its run folder.
         arguments: of `gsjax`, without `--out`; "{runs}" stands for the folder that holds all run folders.
         needs: the name of the case whose run it reads, if any.
     """

@@ -39,7 +39,7 @@ CAMERAS, MASK_CAMERA, HELD_OUT, EVERY = (0, 1), 1, 2, 6
 TRACKER = replace(
     PRESETS["fast"],
     start=StartConfig(object_pixels=2.5, background_pixels=6.0, iterations=60),
-    grow=GrowConfig(slots=0),  # what joined an object would have no features
+    grow=GrowConfig(slots=0),  # Gaussians that joined would have no features
 )
 NODES, CHANNELS, RADIUS, RATE = 16, 8, 0.5, 0.03  # nodes of each group; metres
 WARM = 10  # frames after which all classes have been learned, whatever the noise
@@ -53,7 +53,7 @@ GRAPHS = {
 
 
 class Problem(NamedTuple):
-    """The recording, and all that stands still while it is followed."""
+    """The recording, and everything that stays fixed while it is tracked."""
 
     frames: list[Frame]
     masks: np.ndarray  # [T,C,H,W]
@@ -68,7 +68,7 @@ class Problem(NamedTuple):
 
 @cache
 def problem() -> Problem:
-    """Made once for all cells."""
+    """The problem, made once for all cells."""
     recording = gsjax.open_sequence(recorded(RECORDING))
     seen = recording.select(cameras=CAMERAS)
     frames = [seen.frame(t) for t in range(seen.num_frames)]
@@ -78,7 +78,7 @@ def problem() -> Problem:
     _, codes = codebook_of(at_first)
     _, _, axes = np.linalg.svd(codes, full_matrices=False)
     codebook = np.zeros((len(codes), CHANNELS), np.float32)
-    codebook[:, : len(axes)] = codes @ axes.T  # lengths and angles as they were
+    codebook[:, : len(axes)] = codes @ axes.T  # preserves lengths and angles
     nodes = nodes_of(scene.gaussians, NODES, np.asarray(scene.labels))
     alone = recording.select(cameras=(HELD_OUT,))
     held_out = [(alone.frame(t).cameras, alone.mask(t, 0)) for t in range(0, seen.num_frames, EVERY)]
@@ -96,7 +96,8 @@ def problem() -> Problem:
 
 @cache
 def stepper(graph: str, shrink: int) -> tuple[Callable, tuple, Camera]:
-    """The jitted step of a kind of graph, its first state, and cameras that features are drawn in."""
+    """The jitted step with a kind of graph, its first state, and the cameras that features are rendered
+    in."""
     p, config = problem(), GRAPHS[graph]
     tracker = Track(TRACKER).step(p.shape)
     views = part_of(p.frames[0], shrink=shrink).cameras
@@ -109,13 +110,11 @@ def stepper(graph: str, shrink: int) -> tuple[Callable, tuple, Camera]:
 
 
 def noisy(mask: np.ndarray, kind: str, share: float, random: np.random.Generator) -> np.ndarray:
-    """A teacher's labels of a picture: a simulated stand-in for a model that errs anew in every picture.
+    """A teacher's labels of a picture: a simulated stand-in for a model with new errors in every picture.
 
-    Args:
-        mask: true labels [H,W], 0 the background.
-        kind: what is mislabelled as one: "things", each class in a picture, or "patches" of 16 pixels.
-        share: how many of those have another's label.
-        random: its generator.
+    Args: mask: true labels [H,W], 0 the background. kind: units that are mislabelled as a whole: "things",
+    each class in a picture, or "patches" of 16 pixels. share: the share of units with a wrong label. random:
+    random generator.
     """
     count = int(problem().masks.max()) + 1
     if kind == "things":
@@ -128,7 +127,7 @@ def noisy(mask: np.ndarray, kind: str, share: float, random: np.random.Generator
 
 
 def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
-    """The recording followed and learned once, a step a frame; labels against truth after every one."""
+    """One pass over the recording, a step a frame; labels are scored against the truth after each."""
     shrink = int(options["shrink"])
     p, (step, state, views) = problem(), stepper(options["graph"], shrink)
     random, cells = np.random.default_rng(seed), slice(shrink // 2, None, shrink)
@@ -162,7 +161,7 @@ def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
 
 
 def durations(graph: str, shrink: int, given: tuple) -> tuple[float, float]:
-    """Milliseconds of a step with this graph, and of one without a graph: medians, taken in turns."""
+    """Median milliseconds of a step with this graph and of one without a graph, called in turn."""
     steps = [stepper(kind, shrink) for kind in (graph, "none")]
     took = [[timed(step, state, *given)[1] for step, state, _ in steps] for _ in range(CALLS + 1)]
     ours, without = np.median(took[1:], axis=0)  # the first may compile
@@ -170,14 +169,14 @@ def durations(graph: str, shrink: int, given: tuple) -> tuple[float, float]:
 
 
 def labels_of_gaussians(features: jax.Array) -> np.ndarray:
-    """The class that each Gaussian's blended feature is nearest to."""
+    """The class nearest to each Gaussian's blended feature."""
     p = problem()
     blended = np.einsum("nk,nkc->nc", np.asarray(p.nodes.weights), np.asarray(features)[p.nodes.indices])
     return (blended @ p.codebook.T).argmax(axis=1)
 
 
 def of_gaussians(labels: np.ndarray, truth: np.ndarray) -> float:
-    """Mean IoU over all classes but the background, of Gaussians whose class is known."""
+    """Mean IoU over all classes except the background, for Gaussians whose class is known."""
     overlap = LabelOverlap()
     overlap.add(labels, truth)
     return overlap.mean_iou(range(1, int(truth.max()) + 1))
@@ -197,7 +196,7 @@ def _held_out_plan():
 
 
 def drawn_labels(tracked: Tracked, labels: np.ndarray, camera: Any) -> np.ndarray:
-    """Which class most of each pixel of the held-out camera is."""
+    """The class with the largest share of each pixel of the held-out camera."""
     p = problem()
     classes = jax.nn.one_hot(labels, len(p.codebook))
     shares = _shares(tracked.gaussians(), camera, _held_out_plan(), classes)

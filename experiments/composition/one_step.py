@@ -15,7 +15,7 @@ from gsjax.scene.render import render
 
 
 class Memory(NamedTuple):
-    """The last T frames: when, where each node was, and what the teacher had for it (-1: nothing)."""
+    """The last T frames: their times, the nodes' places, and the teacher's ids of nodes (-1: none)."""
 
     times: Float[Array, "T"]
     places: Float[Array, "T n 3"]
@@ -23,7 +23,7 @@ class Memory(NamedTuple):
 
 
 def empty_memory(frames: int, nodes: int) -> Memory:
-    """Before the first frame."""
+    """The memory before the first frame."""
     return Memory(jnp.zeros(frames), jnp.zeros((frames, nodes, 3)), jnp.full((frames, nodes), -1, jnp.int32))
 
 
@@ -32,12 +32,12 @@ def composed(tracker, nodes, codebook, radius, optimizer, config, plan):
 
     Args:
         tracker: a `Step`, from `gsjax.methods.track.step`.
-        nodes: Gaussians that have features, of which the others blend theirs (`nodes_of`).
-        codebook: what the teacher may say, a row a class.
-        radius: of the scene, metres.
-        optimizer: of features.
+        nodes: Gaussians with features, from which the others blend theirs (`nodes_of`).
+        codebook: the teacher's feature of each class, a row a class.
+        radius: radius of the scene, metres.
+        optimizer: optimizer of the features.
         config: `GraphConfig`.
-        plan: to draw features with.
+        plan: plan for rendering features.
     """
 
     def spread(features):

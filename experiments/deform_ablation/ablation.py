@@ -1,4 +1,4 @@
-"""What is each part of SurstSplat and GaussianClin worth, and what of a teacher that errs?"""
+"""What is each part of SurstSplat and GaussianClin worth, also with a teacher that errs?"""
 
 from dataclasses import replace
 from pathlib import Path
@@ -21,7 +21,7 @@ def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
     config = _config(options["method"], part, seed)
     if options.get("features") == "over time":
         config = replace(config, deformation=replace(config.deformation, feature=True))
-    if options.get("graph") == "heavy":  # half of the Gaussians are nodes, and what they say counts ten times
+    if options.get("graph") == "heavy":  # half of the Gaussians are nodes, with ten times the weight
         heavy = {"nodes": HEAVY_NODES} | dict.fromkeys(_COUNTED, 1.0)
         config = replace(config, graph=replace(config.graph, **heavy))
     codes = None if part == "features" else np.eye(CLASSES, config.channels)
@@ -31,8 +31,8 @@ def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
         errors = options["errors"]
         lesson = Lesson([with_errors(region_map(data, t), errors, rng) for t in data.train], codes)
     found = learned([data.frame(t) for t in data.train], config, lesson)
-    told = {**scores(found, data), **track_errors(found, data), **summary(found)}
-    return told if codes is None else told | meanings(found, data, codes)
+    row = {**scores(found, data), **track_errors(found, data), **summary(found)}
+    return row if codes is None else row | meanings(found, data, codes)
 
 
 def _config(method: str, part: str, seed: int) -> DeformConfig:
@@ -45,6 +45,6 @@ def _config(method: str, part: str, seed: int) -> DeformConfig:
         return replace(config, warmup=steps, iterations=0, warmup_frames="all")
     if part == "graph":
         return replace(config, graph=replace(config.graph, kind="none"))
-    if part == "matching":  # what nodes say is left, and who is like whom is not
+    if part == "matching":  # keeps the node loss, drops the pairwise one
         return replace(config, graph=replace(config.graph, structure=0.0))
     return config

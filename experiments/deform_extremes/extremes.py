@@ -1,4 +1,4 @@
-"""Does a deforming scene stay finite where it should not be asked to work at all?"""
+"""Does a deforming scene stay finite with extreme settings, teachers and scenes?"""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -11,9 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 
 import gsjax
+from experiments.shared.deforming import one_frame
 from gsjax.engine.deform.scores import draw
 from gsjax.engine.drive import drive
-from gsjax.geometry.cameras import Camera
 from gsjax.methods.deform import (
     Deform,
     DeformConfig,
@@ -43,7 +43,7 @@ FAR_TIMES = (-1e9, 0.0, 0.5, 1.0, 1e9)
 
 
 class Given(NamedTuple):
-    """What a reconstruction is given."""
+    """The input of a reconstruction."""
 
     frames: list[Frame]
     config: DeformConfig
@@ -162,11 +162,11 @@ def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
 
 def _given(seed: int) -> Given:
     seen = gsjax.open_sequence(DATA)
-    last = seen.num_frames - 1
     frames = []
     for t in range(seen.num_frames):
-        camera = Camera(seen.viewmats[t, :1], seen.Ks[t, :1], seen.width, seen.height, seen.near)
-        mask, time = seen.mask(t, 0)[None] == 0, np.asarray(t / last)
-        frames.append(Frame(seen.image(t, 0)[None], seen.depth(t, 0)[None], camera, mask, time))
+        pose, time = (seen.viewmats[t, 0], seen.Ks[t, 0]), t / (seen.num_frames - 1)
+        frames.append(
+            one_frame(seen.image(t, 0), *pose, time, seen.depth(t, 0), seen.mask(t, 0) == 0, seen.near)
+        )
     ids = (np.arange(seen.width) > seen.width // 2)[None].repeat(seen.height, 0).astype(np.int32)
     return Given(frames, replace(BASE, seed=seed), Lesson([ids] * seen.num_frames, CODES))

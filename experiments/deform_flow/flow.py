@@ -1,6 +1,7 @@
 """Does a deformation field find where each point of a shirt goes between two pictures with depth?"""
 
 from dataclasses import dataclass, replace
+from itertools import islice
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -13,6 +14,7 @@ from jaxtyping import Bool, Float, UInt8
 
 from experiments.shared.deforming import Reconstructed, drawn, one_frame
 from experiments.shared.recordings import recorded
+from experiments.shared.timing import run_through
 from gsjax.data.resizing import area_resized, nearest_resized
 from gsjax.engine.drive import drive
 from gsjax.methods.deform import Deform, DeformConfig
@@ -48,11 +50,11 @@ class Pair:
 
     @property
     def start(self) -> Float[np.ndarray, "n 3"]:
-        """The known pixels' points in the first picture."""
+        """Points of the known pixels in the first picture."""
         return lifted(self.depths[0], self.K)[self.known]
 
     def frame(self, t: int, scale: float) -> Frame:
-        """A picture, smaller."""
+        """One picture, scaled down."""
         height, width = (round(side * scale) for side in self.depths[0].shape)
 
         def size(*_: int) -> tuple[int, int]:
@@ -64,8 +66,8 @@ class Pair:
 
 
 def pair(name: str = "deepdeform") -> Pair:
-    """The pair as NeuralTracking's example data have it: uint16 millimetres, and flow as three int32 (width,
-    height, channels) before float32 planes."""
+    """The pair in the format of NeuralTracking's example data: depth in uint16 millimetres, and flow as three
+    int32 (width, height, channels) before float32 planes."""
     (root,) = sorted((recorded(name) / "train").iterdir())
     images = tuple(cv2.imread(str(p))[..., ::-1] for p in sorted((root / "color").iterdir()))
     depths = tuple(
@@ -116,8 +118,8 @@ def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
 
 
 def by_optical_flow(data: Pair, scale: float) -> Float[np.ndarray, "n 3"]:
-    """Each pixel goes where dense optical flow says, and lies there at the second picture's depth, or at its
-    own where that is unknown or outside."""
+    """Pixels moved by dense optical flow, at the second picture's depth there, or at their own depth where
+    that is unknown or outside."""
     height, width = data.known.shape
     size = (round(width * scale), round(height * scale))
     images = (cv2.resize(image, size, interpolation=cv2.INTER_AREA) for image in data.images)
@@ -132,7 +134,8 @@ def by_optical_flow(data: Pair, scale: float) -> Float[np.ndarray, "n 3"]:
 
 
 def by_field(data: Pair, seed: int, coarse: tuple[tuple[float, int], ...]) -> Reconstructed:
-    """The first picture as it is, then both; smaller pictures of both before, if wanted."""
+    """A scene fitted to the first picture, then to both; optionally to smaller pictures of both in
+    between."""
     config = replace(CONFIG, seed=seed)
     method, total = Deform(config), config.warmup + config.iterations
     problem, run = method.start([data.frame(t, SCALE) for t in (0, 1)])
@@ -141,27 +144,23 @@ def by_field(data: Pair, seed: int, coarse: tuple[tuple[float, int], ...]) -> Re
         smaller, other = method.start([data.frame(t, scale) for t in (0, 1)])
         smaller = smaller._replace(radius=problem.radius, bounds=problem.bounds)
         parts.append((smaller, other.plans, parts[-1][2] + steps))
-    seconds = compiling = skipped = 0.0
+    times = []
     for part, plans, last in [*parts, (problem, run.plans, total)]:
-        for now in drive(method, part, run.having(plans=plans)):
-            run = now.run
-            seconds, compiling = seconds + now.seconds, compiling + now.compile_seconds
-            skipped += float(now.info["skipped"])
-            if now.step >= last:
-                break
-    assert not skipped, f"{skipped:.0f} steps were skipped"
-    return Reconstructed(config, problem, run, seconds, compiling)
+        ticks = drive(method, part, run.having(plans=plans))
+        times.append(run_through(islice(ticks, last - run.step)))
+        run = ticks.run
+    return Reconstructed(config, problem, run, *np.sum(times, axis=0).tolist())
 
 
 def carried(found: Reconstructed, data: Pair) -> Float[np.ndarray, "n 3"]:
-    """How far the Gaussians around each pixel's point move between the two times."""
+    """Displacement of the Gaussians around each pixel's point between the two times."""
     at = jax.jit(lambda scene, moving, time: scene.at(time, moving).means)
     means = [np.asarray(at(found.run.params, found.run.kept.moving, jnp.asarray(t))) for t in (0.0, 1.0)]
     return carried_points(data.start, np.stack(means))[1] - data.start
 
 
 def figure(rows: list[dict[str, Any]], path: Path) -> None:
-    """Which share of the pixels is off by how much."""
+    """Cumulative distribution of the errors over pixels."""
     from matplotlib.figure import Figure
 
     from experiments.shared.plots import BLUE, GREEN, GREY, ORANGE, PURPLE, SKY

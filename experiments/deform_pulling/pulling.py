@@ -1,4 +1,4 @@
-"""What can be had of a real clip without depth, masks, poses and calibration?"""
+"""How good is a reconstruction of a real clip without depth, masks, poses and calibration?"""
 
 import warnings
 from dataclasses import replace
@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Bool, UInt8
 
 import gsjax
-from experiments.shared.deforming import EVERY, Reconstructed, drawn, learned, one_frame, summary
+from experiments.shared.deforming import Reconstructed, copies_of, drawn, learned, one_frame, split, summary
 from experiments.shared.recordings import recorded
 from gsjax.data import DataWarning, Sequence
 from gsjax.engine.deform.data import unit_times
@@ -28,15 +28,15 @@ COPIES = {
 
 
 def clip() -> Sequence:
-    """The clip; 60 degrees of view are assumed."""
+    """The clip; a field of view of 60 degrees is assumed."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DataWarning)
         return gsjax.open_sequence(recorded("endonerf_pulling") / "pulling_gt.mp4").scaled(SCALE)
 
 
 def no_tool(image: UInt8[np.ndarray, "h w 3"]) -> Bool[np.ndarray, "h w"]:
-    """Where colour says that there is no tool: tools are grey or blue, large, and come in from the border;
-    so do some highlights, and the strip that the display draws at the bottom."""
+    """Pixels that are no tool by their colour: tools are grey or blue, large, and enter from the border, as
+    do some highlights and the display's strip at the bottom."""
     height, width = image.shape[:2]
     red, green, blue = np.moveaxis(cv2.GaussianBlur(image, (0, 0), 1.0).astype(int), -1, 0)
     grey = ((red - blue < 25) & (red - green < 40)).astype(np.uint8)
@@ -51,10 +51,9 @@ def no_tool(image: UInt8[np.ndarray, "h w 3"]) -> Bool[np.ndarray, "h w"]:
 
 
 def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
-    """Every eighth frame held out; the camera is taken to stand still, and the scene begins on a plane."""
+    """Every eighth frame held out; the camera is assumed static, and the scene starts on a plane."""
     sequence = clip()
-    test = [t for t in range(sequence.num_frames) if (t - 1) % EVERY == 0]
-    train = [t for t in range(sequence.num_frames) if t not in test]
+    train, test = split(sequence.num_frames)
     config = replace(BASE, seed=seed)
     if options["variant"] == "static":
         config = replace(config, warmup=config.warmup + config.iterations, iterations=0, warmup_frames="all")
@@ -85,14 +84,9 @@ def _mask(frame: Frame) -> Bool[np.ndarray, "h w"] | None:
 
 
 def _copies(sequence: Sequence, t: int, frame: Frame) -> dict[str, float]:
-    """PSNR of a frame as copies of others, over the same pixels."""
-
-    def image(t):
-        return sequence.image(min(max(t, 0), sequence.num_frames - 1), 0) / 255.0
-
-    guesses = {"previous": image(t - 1), "neighbors": (image(t - 1) + image(t + 1)) / 2, "first": image(0)}
+    """PSNR of copies of other frames, over the same pixels."""
     true, mask = frame.images[0] / 255.0, _mask(frame)
-    return {f"psnr_{name}": psnr(guess, true, mask) for name, guess in guesses.items()}
+    return {f"psnr_{name}": psnr(guess, true, mask) for name, guess in copies_of(sequence, t).items()}
 
 
 def figure(rows: list[dict[str, Any]], path: Path) -> None:

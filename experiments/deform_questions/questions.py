@@ -1,4 +1,4 @@
-"""How often are ten types of question on a deforming scene answered as the simulation's truth has it?"""
+"""How often are ten types of question about a deforming scene answered correctly?"""
 
 from dataclasses import replace
 from pathlib import Path
@@ -33,7 +33,7 @@ CONFIG = replace(
     graph=GraphConfig(kind="none"),
 )
 WRONG = {"labels all right": 0.0, "labels 30 % wrong": 0.3}
-ASKED = 120  # of each type, but when
+ASKED = 120  # questions of each type except when
 FIRST = 0.25  # of the recording: the frame that the canonical scene is like, with the tool in view
 WITHIN = {"depth": 1.0, "distance": 2.0, "motion": 0.5, "when": 2}  # mm, and frames
 EVENTS = ("first seen", "fastest", "nearest", "touch")
@@ -48,8 +48,8 @@ class Asked(NamedTuple):
 
 
 def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
-    """Questions on five regions of the tissue and the tool, answered from a scene, or by the one answer to
-    each type that is right most often."""
+    """Questions about five regions of the tissue and the tool, answered from a scene, or by the best constant
+    answer to each type."""
     data, truth = _data(options["scene"], seed)
     asked = questions(truth)
     if options["answers"] == "blind":
@@ -80,7 +80,7 @@ def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
 
 
 def _data(scene: str, seed: int) -> tuple[Dataset, Truth]:
-    """What is learned from, and what is true: tissue_0 is learned at half of its width and height."""
+    """Training data and truth; of tissue_0 the training pictures have half of its width and height."""
     if scene == "tissue_0":
         return dataset(scale=0.5), Truth(dataset())
     data = built_in(seed)
@@ -88,7 +88,7 @@ def _data(scene: str, seed: int) -> tuple[Dataset, Truth]:
 
 
 def questions(truth: Truth) -> list[Asked]:
-    """The same for all that answer."""
+    """The questions, the same for all answerers."""
     rng, things, texts = np.random.default_rng(0), NAMES[1:], []
     for kind in QUESTIONS:
         if kind.name == "when":
@@ -105,7 +105,7 @@ def questions(truth: Truth) -> list[Asked]:
 
 
 def _learned(data: Dataset, truth: Truth, wrong: float, seed: int) -> Reconstructed:
-    """The scene with its tool, of all frames that are not held out, and a teacher that errs."""
+    """The scene with its tool, learned from all training frames with a teacher that errs."""
     rng, config = np.random.default_rng(seed), replace(CONFIG, seed=seed)
     codes, step = np.eye(len(NAMES), config.channels), truth.data.sequence.width // data.sequence.width
     labels = truth.labels[:, step // 2 :: step, step // 2 :: step]
@@ -115,7 +115,7 @@ def _learned(data: Dataset, truth: Truth, wrong: float, seed: int) -> Reconstruc
 
 
 def _facts(data: Dataset, found: Reconstructed) -> SceneFacts:
-    """Of all frames."""
+    """Facts of all frames."""
     seen = data.sequence
     viewmats, Ks = (jnp.asarray(a[:, 0], jnp.float32) for a in (seen.viewmats, seen.Ks))
     cameras = Camera(viewmats, Ks, seen.width, seen.height)
@@ -125,14 +125,14 @@ def _facts(data: Dataset, found: Reconstructed) -> SceneFacts:
 
 
 def _right(kind: str, answer: Any, true: Any) -> bool:
-    """Whether an answer is the true one: a number within what is stated, anything else to the letter."""
+    """Whether an answer is right: a number within the tolerance of its type, anything else exactly."""
     if kind not in WITHIN or answer is None or true is None:
         return answer == true
     return abs(answer - true) <= WITHIN[kind]
 
 
 def _blind(asked: list[Asked]) -> dict[str, float]:
-    """Of the one answer to all questions of a type that is right most often."""
+    """Shares of right answers of the best constant answer to each type."""
     shares = {}
     for kind in QUESTIONS:
         true = [one.true for one in asked if one.meant.kind == kind.name]
@@ -143,5 +143,5 @@ def _blind(asked: list[Asked]) -> dict[str, float]:
 
 
 def _share(right: list[bool], which: list[bool]) -> float:
-    """Per cent of those that are right."""
+    """Percentage of right answers among the chosen ones."""
     return 100 * float(np.mean(np.array(right)[which]))

@@ -1,4 +1,4 @@
-"""How well is deforming tissue seen where it was not photographed, and followed?"""
+"""How well are held-out frames of deforming tissue rendered, and its points tracked?"""
 
 from dataclasses import replace
 from pathlib import Path
@@ -22,7 +22,7 @@ CHANNELS = BASE.channels
 
 
 def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
-    """tissue_0, every eighth frame held out, tools masked."""
+    """One variant on tissue_0, with every eighth frame held out and tools masked."""
     data, variant = dataset(), options["variant"]
     config, semantic = replace(BASE, seed=seed), variant not in ("deformation alone", "static")
     if variant == "static":

@@ -1,4 +1,4 @@
-"""What do a coarser field, fewer nodes, a gate or fewer channels cost, and what do they save?"""
+"""Cost and savings of a coarser field, fewer nodes, a gate or fewer channels."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -30,16 +30,16 @@ _TIMED = 32
 
 
 def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
-    """tissue_0 with its regions, one setting changed at a time."""
+    """One setting changed, on tissue_0 with its regions."""
     data = dataset(scale=options.get("scale", SCALE))
     config = _config(options, seed)
     codes, reference = np.eye(CLASSES, config.channels), _reference_ms(seed)
     found = learned(*_taught(data, codes, config))
-    told = {**scores(found, data), **track_errors(found, data), **summary(found)}
+    row = {**scores(found, data), **track_errors(found, data), **summary(found)}
     return {
-        **told,
+        **row,
         **meanings(found, data, codes),
-        "pace": told["step_ms"] / reference,
+        "pace": row["step_ms"] / reference,
         "deform_ms": _deform_ms(found),
         "fps": frames_per_second(found, data.frame(0)),
     }
@@ -53,20 +53,21 @@ def _config(options: dict[str, Any], seed: int) -> DeformConfig:
 
 
 def _taught(data: Dataset, codes: np.ndarray, config: DeformConfig) -> tuple[list, DeformConfig, Lesson]:
-    """What `learned` is given: frames, settings, and what each pixel shows."""
+    """Arguments of `learned`: frames, settings, and the class of each pixel."""
     lesson = Lesson([region_map(data, t) for t in data.train], codes)
     return [data.frame(t) for t in data.train], config, lesson
 
 
 def _reference_ms(seed: int) -> float:
-    """A step of the first row's, as fast as this machine is now: the mean of a few, in the same shares."""
+    """Milliseconds of a step with the first row's settings on this machine now: a short run with the same
+    shares of warmup and iterations."""
     config = replace(BASE, seed=seed, warmup=_TIMED // 4, iterations=3 * _TIMED // 4)
     codes = np.eye(CLASSES, config.channels)
     return summary(learned(*_taught(dataset(scale=SCALE), codes, config)))["step_ms"]
 
 
 def _deform_ms(found: Reconstructed) -> float:
-    """To deform all Gaussians and bring a slope back through that; the median."""
+    """Median milliseconds of deforming all Gaussians and differentiating that."""
     scene, moving = found.run.params, found.run.kept.moving
 
     def squares(scene, moving, time):
@@ -83,11 +84,11 @@ def _deform_ms(found: Reconstructed) -> float:
 
 
 def figure(rows: list[dict[str, Any]], path: Path) -> None:
-    """PSNR and tracks over how long a step takes, each setting by its name."""
+    """PSNR and track errors over the time of a step, each setting labelled."""
     from matplotlib.figure import Figure
 
     drawing = Figure(figsize=(11, 5), dpi=110, layout="constrained")
-    told = (*_FIELD, "nodes", "moving_share", "channels", "graph", "start_pixels", "iterations", "scale")
+    names = (*_FIELD, "nodes", "moving_share", "channels", "graph", "start_pixels", "iterations", "scale")
     for axes, key, words in zip(
         drawing.subplots(1, 2),
         ("psnr", "track_median_mm"),
@@ -95,9 +96,9 @@ def figure(rows: list[dict[str, Any]], path: Path) -> None:
         strict=True,
     ):
         for i, row in enumerate(rows):
-            said = (f"{one} {row[one]}".replace("_", " ") for one in told if row.get(one) is not None)
+            changed = (f"{name} {row[name]}".replace("_", " ") for name in names if row.get(name) is not None)
             axes.plot(row["pace"], row[key], "k*" if i == 0 else "o", ms=10 if i == 0 else 4)
-            axes.annotate(", ".join(said), (row["pace"], row[key]), fontsize=6, va="bottom")
+            axes.annotate(", ".join(changed), (row["pace"], row[key]), fontsize=6, va="bottom")
         axes.set(xscale="log", xlabel="a step, times the first row's (star)", ylabel=words)
         axes.grid(alpha=0.3)
     drawing.savefig(path, format=path.suffix.removeprefix(".") or "png")

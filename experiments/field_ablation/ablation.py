@@ -1,4 +1,4 @@
-"""What is each part of the distillation worth? One is left out, or made otherwise, at a time."""
+"""What is each part of the distillation worth? One is left out or replaced at a time."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -11,7 +11,15 @@ import jax.numpy as jnp
 import numpy as np
 
 from experiments.field_ablation.autoencoder import trained
-from experiments.shared.fields import Learned, codebook_of, fitted, flawed_teacher, learned, of_field, scored
+from experiments.shared.fields import (
+    Learned,
+    articulated,
+    codebook_of,
+    flawed_teacher,
+    learned,
+    of_field,
+    scored,
+)
 from gsjax.engine.distill.scene import FieldScene, scaled
 from gsjax.methods.distill import DistillConfig, DistillWeightsConfig, Teacher, features_of
 from gsjax.methods.distill.field import FeatureField
@@ -31,8 +39,8 @@ SQUEEZED = {"autoencoder to 8, without both": 8, "autoencoder to 16, without bot
 
 
 def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
-    """One variant on articulated_0 with flawed masks at half of its resolution, judged at all of it."""
-    whole = fitted("articulated_0", folder, eval_cameras=(3, 8), frames="0:1")
+    """One variant on articulated_0 with flawed masks at half resolution, scored at full resolution."""
+    whole = articulated(folder)
     names, codes = codebook_of(whole.photographs)
     teacher, _ = flawed_teacher(whole, codes, seed, scale=SCALE)
     scene = scaled(whole, SCALE)
@@ -55,17 +63,17 @@ def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
 
 
 def _squeezed(scene: FieldScene, teacher: Teacher, size: int, seed: int) -> tuple[Learned, float, int]:
-    """A code for each Gaussian, distilled from the embeddings' codes and decoded before it is asked in 3D;
-    seconds that the autoencoder took, and its weights.
+    """A code for each Gaussian, distilled from the embeddings' codes and decoded before the query in 3D; the
+    seconds of training the autoencoder, and the number of its weights.
 
-    LangSplat decodes rendered codes, which is another 2D query than ours: there is none here.
+    LangSplat decodes rendered codes, a 2D query unlike ours, so there is no 2D query here.
     """
     assert teacher.codebook is not None
     begun = perf_counter()
     model, _ = trained(teacher.codebook, size, seed)
     codes = np.asarray(model.encode(jnp.asarray(teacher.codebook)))
     aside = perf_counter() - begun
-    weights = DistillWeightsConfig(rec=1000.0 / 512 * size, contrast=0.0, tv=0.0)  # as much a pixel
+    weights = DistillWeightsConfig(rec=1000.0 / 512 * size, contrast=0.0, tv=0.0)  # the same loss per pixel
     config = replace(NEITHER, encoding="table", channels=size, weights=weights, seed=seed)
     found = learned(scene, scene.taught, teacher._replace(codebook=codes), config)
     low = features_of(found.field, None) @ found.field.lift.T

@@ -1,5 +1,5 @@
-"""Features squeezed by an autoencoder of the scene, as LangSplat does (Qin et al. 2024, section 3.3): what a
-Gaussian carries is a code, and a decoder makes the feature of what was rendered."""
+"""Features compressed by an autoencoder of the scene, as in LangSplat (Qin et al. 2024, section 3.3):
+Gaussians carry codes, and a decoder turns rendered codes into features."""
 
 from typing import NamedTuple
 
@@ -30,7 +30,8 @@ class Autoencoder(NamedTuple):
 
 
 def trained(features: Float[np.ndarray, "n d"], size: int, seed: int) -> tuple[Autoencoder, float]:
-    """An autoencoder of a scene's embeddings, by squared difference and angle; and 1 - cosine in the end."""
+    """An autoencoder of a scene's embeddings, trained on squared difference and angle; and the final 1 -
+    cosine."""
     first, second = jax.random.split(jax.random.key(seed))
     dimension, given = features.shape[1], jnp.asarray(features)
     model = Autoencoder(

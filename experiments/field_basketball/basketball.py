@@ -1,4 +1,4 @@
-"""What is foreground in a dome of real cameras, asked of a field that four of them had no part in?"""
+"""Foreground in a dome of real cameras, from a field whose training left four of them out."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -11,13 +11,13 @@ from gsjax.data import ReadOptions
 from gsjax.methods.distill import DistillConfig, teacher_of_objects
 from gsjax.methods.fit import FitConfig, StartConfig
 
-WITHHELD = (4, 12, 20, 27)  # cameras whose masks only judge
-HELD_OUT = (0, 10, 15, 30)  # that the scene was not fitted to; they have no masks
+WITHHELD = (4, 12, 20, 27)  # cameras whose masks are used for scores only
+HELD_OUT = (0, 10, 15, 30)  # cameras that the scene is not fitted to; they have no masks
 FIT = FitConfig(steps=4_000, cap=30_000, sh_degree=0, start=StartConfig(count=20_000))
 
 
 def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
-    """Real masks of 23 cameras, distilled and lifted by a vote."""
+    """Real masks of 23 cameras, both distilled and lifted by a vote."""
     scene = fitted(
         "panoptic_basketball",
         folder,

@@ -1,4 +1,4 @@
-"""Does a distillation stay finite where it should not be asked to work at all?"""
+"""Does a distillation stay finite with extreme settings, teachers and scenes?"""
 
 from dataclasses import replace
 from pathlib import Path
@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from experiments.shared.fields import codebook_of, fitted, flawed_teacher, true_labels
+from experiments.shared.fields import articulated, codebook_of, flawed_teacher, true_labels
 from gsjax.engine.distill.scene import FieldScene, scaled
 from gsjax.engine.drive import drive
 from gsjax.methods.distill import (
@@ -96,8 +96,8 @@ def _one_pixel(ids: np.ndarray) -> np.ndarray:
 
 
 def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
-    """Forty steps of one case at a quarter of the resolution, and a query of all Gaussians."""
-    scene = fitted("articulated_0", folder, eval_cameras=(3, 8), frames="0:1")
+    """Forty steps of one case at a quarter of the resolution, and a query for all Gaussians."""
+    scene = articulated(folder)
     _, codes = codebook_of(scene.photographs)
     teacher, _ = flawed_teacher(scene, codes, seed, scale=SCALE)
     scene = scaled(scene, SCALE)

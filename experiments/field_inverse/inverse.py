@@ -1,4 +1,5 @@
-"""Three ways to ask a field in 3D: exactly, by the pseudo-inverse of its convolution, by a learned one."""
+"""Three ways to query a field in 3D: exactly, by the pseudo-inverse of its convolution, by a learned
+inverse."""
 
 from functools import partial
 from pathlib import Path
@@ -8,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from experiments.shared.fields import codebook_of, fitted, flawed_teacher, learned, scored
+from experiments.shared.fields import articulated, codebook_of, flawed_teacher, learned, scored
 from experiments.shared.timing import jitted, median_ms, timed
 from gsjax.engine.distill.scene import scaled
 from gsjax.methods.distill import (
@@ -25,9 +26,9 @@ _KEPT: dict[int, Any] = {}  # the field of each seed, distilled once
 
 
 def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
-    """One way, on articulated_0 with flawed masks at half of its resolution."""
+    """One way, on articulated_0 with flawed masks at half resolution."""
     if seed not in _KEPT:
-        scene = fitted("articulated_0", folder, eval_cameras=(3, 8), frames="0:1")
+        scene = articulated(folder)
         names, codes = codebook_of(scene.photographs)
         teacher, _ = flawed_teacher(scene, codes, seed, scale=SCALE)
         config, small = DistillConfig(iterations=ITERATIONS, seed=seed), scaled(scene, SCALE)
@@ -46,7 +47,7 @@ def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
         ask, given = jitted(gaussian_cosines), (field, located, codes)
     else:
         ask, given = jitted(back_projected_cosines), (field, located, codes, inverse)
-        others = features[1::2]  # which the learned one did not see
+        others = features[1::2]  # held out from learning the inverse
         back = others @ field.lift.T @ inverse.T
         error = float(jnp.linalg.norm(back - others) / jnp.linalg.norm(others))
     cosines = np.asarray(ask(*given))

@@ -1,14 +1,14 @@
-"""How well does a field say, of views and of Gaussians, what flawed masks say, against a plain vote?"""
+"""How well does a field reproduce flawed masks, in views and on Gaussians, against a plain vote?"""
 
 from pathlib import Path
 from typing import Any
 
 from experiments.shared.fields import (
     NO_FLAWS,
+    articulated,
     by_majority,
     codebook_of,
     first_tracked,
-    fitted,
     flawed_teacher,
     learned,
     of_field,
@@ -19,14 +19,15 @@ from gsjax.methods.distill import DistillConfig
 
 
 def scene_of(name: str, folder: Path) -> FieldScene:
-    """Fitted to eight cameras; or, where there are two, as the tracker begins with it."""
+    """The scene fitted to eight cameras; or, for recordings of few cameras, the tracker's first scene."""
     if name == "articulated_0":
-        return fitted(name, folder, eval_cameras=(3, 8), frames="0:1")
+        return articulated(folder)
     return first_tracked(name, folder, cameras=(0, 1), mask_camera=1, eval_cameras=(2,))
 
 
 def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
-    """Masks of one seed, lifted by a vote and distilled into a field; and the best that a vote could do."""
+    """Masks of one seed, lifted by a vote and distilled into a field; and a vote of the true masks as a
+    bound."""
     scene = scene_of(options["scene"], folder)
     names, codes = codebook_of(scene.photographs)
     _, true = flawed_teacher(scene, codes, seed, NO_FLAWS)

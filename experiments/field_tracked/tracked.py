@@ -1,4 +1,4 @@
-"""Do features that were distilled once stay where they belong while the tracker moves the Gaussians?"""
+"""Do features that are distilled once stay with their objects while the tracker moves the Gaussians?"""
 
 from pathlib import Path
 from typing import Any
@@ -22,8 +22,8 @@ CAMERAS, MASK_CAMERA, HELD_OUT, EVERY = (0, 1), 1, (2,), 6
 
 
 def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
-    """A recording tracked, the field of its first frame carried along, and both held against the true masks
-    of the camera that nothing learned from; beside it, the same had the Gaussians stayed where they were."""
+    """Track a recording with the field of its first frame, and score labels and features against the true
+    masks of a held-out camera; for comparison, the same with Gaussians that never move."""
     path = folder.parents[1] / "field_scenes" / f"{options['recording']}_all"
     if not (path / "report.html").is_file():
         words = ["track", recorded(options["recording"]), "--out", path, "--overwrite"]
@@ -33,9 +33,7 @@ def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
     names, codes = codebook_of(first.photographs)
     teacher, _ = flawed_teacher(first, codes, seed, NO_FLAWS if options["masks"] == "true" else Flaws())
     found = learned(first, first.taught, teacher, DistillConfig(iterations=options["iterations"], seed=seed))
-    carried = FeatureField(
-        features_of(found.field, found.located), found.field.lift
-    )  # by Gaussian, not place
+    carried = FeatureField(features_of(found.field, found.located), found.field.lift)  # a row a Gaussian
     of_gaussians = of_field(found, codes)
     rows, totals, left, right = [], ClassScores(names), ClassScores(names), []
     recording = saved.recording.judged

@@ -1,9 +1,9 @@
-"""What does speed cost? Channels, levels, table, resolution and steps, one after the other."""
+"""What does speed cost? Channels, levels, table, resolution and steps, one varied at a time."""
 
 from pathlib import Path
 from typing import Any
 
-from experiments.shared.fields import codebook_of, fitted, flawed_teacher, learned, of_field, scored
+from experiments.shared.fields import articulated, codebook_of, flawed_teacher, learned, of_field, scored
 from gsjax.engine.distill.scene import scaled
 from gsjax.methods.distill import DistillConfig
 from gsjax.scene.feature_grid import FeatureGridConfig
@@ -20,20 +20,22 @@ MIDDLE = {"channels": 256, "levels": 16, "log2_entries": 20, "hidden": 128, "sca
 
 
 def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
-    """One setting on articulated_0 with flawed masks; what is not named is as in the middle."""
-    told = MIDDLE | options
-    scene = fitted("articulated_0", folder, eval_cameras=(3, 8), frames="0:1")
+    """One setting on articulated_0 with flawed masks; settings not named are those of `MIDDLE`."""
+    given = MIDDLE | options
+    scene = articulated(folder)
     names, codes = codebook_of(scene.photographs)
-    small = scaled(scene, told["scale"])
-    teacher, _ = flawed_teacher(scene, codes, seed, scale=told["scale"])
-    grid = FeatureGridConfig(levels=told["levels"], log2_entries=told["log2_entries"], hidden=told["hidden"])
-    config = DistillConfig(iterations=told["iterations"], channels=told["channels"], grid=grid, seed=seed)
+    small = scaled(scene, given["scale"])
+    teacher, _ = flawed_teacher(scene, codes, seed, scale=given["scale"])
+    grid = FeatureGridConfig(
+        levels=given["levels"], log2_entries=given["log2_entries"], hidden=given["hidden"]
+    )
+    config = DistillConfig(iterations=given["iterations"], channels=given["channels"], grid=grid, seed=seed)
     found = learned(small, small.taught, teacher, config)
-    # Judged at full resolution, whatever it learned from.
+    # Scored at full resolution, whatever the training resolution.
     asked = scored(scene, of_field(found, codes), names, (found.field, found.located, codes))
     return {
         **asked,
-        "step_ms": 1e3 * found.seconds / max(1, told["iterations"] - 1),
+        "step_ms": 1e3 * found.seconds / max(1, given["iterations"] - 1),
         "minutes": found.seconds / 60,
         "memory_mb": found.memory_mb,
         "trained": found.trained,
@@ -55,7 +57,7 @@ def figure(rows: list[dict[str, Any]], path: Path) -> None:
         axes.plot([r["minutes"] for r in some], [r["miou_3d"] for r in some], "o-", ms=4, label=words)
         for row in some:
             if row.get("iterations") == MIDDLE["iterations"] and name != "iterations":
-                continue  # one word for the middle
+                continue  # one label for the middle
             axes.annotate(f"{row[name]:g}", (row["minutes"], row["miou_3d"]), fontsize=7, va="bottom")
     axes.set(xscale="log", xlabel="minutes of steps", ylabel="mIoU of held-out views, 3D query")
     axes.grid(alpha=0.3)

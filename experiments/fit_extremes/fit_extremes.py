@@ -1,4 +1,4 @@
-"""`gsjax fit` where data is at the edge of sense."""
+"""`gsjax fit` with extreme data."""
 
 import json
 from pathlib import Path
@@ -16,7 +16,7 @@ SMALL = ["--fit.steps", "300", "--fit.cap", "2000", "--fit.start.count", "1000",
 
 
 def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
-    """One fit in a process of its own."""
+    """One fit, in its own process."""
     data, out = folder / "data", folder / "run"
     more = CASES[options["case"]](data)
     ran = ended("fit", data, "--out", out, "--overwrite", *SMALL, *more)
@@ -48,7 +48,7 @@ def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
 def photographs(
     folder: Path, count: int = 6, size=(64, 48), image=None, turned=None, points=None, masked: bool = False
 ) -> None:
-    """A transforms.json and its pictures: the built-in table, or other pictures from its cameras."""
+    """Write a transforms.json with pictures: those of the built-in table, or others from its cameras."""
     (folder / "images").mkdir(parents=True, exist_ok=True)
     sequence = tabletop(frames=-(-count // 3), width=64, height=48)
     frames = []
@@ -56,7 +56,7 @@ def photographs(
         t, c = divmod(i, 3)
         shown = sequence.image(t, c) if image is None else image
         viewmat = sequence.viewmats[t, c]
-        if turned is not None:  # a camera that turns where it stands sees another part of the same picture
+        if turned is not None:  # a camera that rotates in place sees another part of the same picture
             K, viewmat, turn = sequence.Ks[0, 0], sequence.viewmats[0, 0].copy(), _turn(turned * (i - 2.5))
             viewmat[:3] = turn @ viewmat[:3]
             shown = cv2.warpPerspective(sequence.image(0, 0), K @ turn @ np.linalg.inv(K), (64, 48))
@@ -70,7 +70,7 @@ def photographs(
             cv2.imwrite(str(folder / f"images/mask_{i}.png"), np.zeros(size[::-1], np.uint8))
             frame["mask_path"] = f"images/mask_{i}.png"
         frames.append(frame)
-    told: dict[str, Any] = {"frames": frames}
+    transforms: dict[str, Any] = {"frames": frames}
     if points is not None:
         rows = "\n".join(f"{x} {y} {z} 200 100 50" for x, y, z in points)
         head = "ply\nformat ascii 1.0\nelement vertex {}\n" + "".join(
@@ -79,12 +79,12 @@ def photographs(
             for name in names
         )
         (folder / "points.ply").write_text(head.format(len(points)) + "end_header\n" + rows + "\n")
-        told["ply_file_path"] = "points.ply"
-    (folder / "transforms.json").write_text(json.dumps(told))
+        transforms["ply_file_path"] = "points.ply"
+    (folder / "transforms.json").write_text(json.dumps(transforms))
 
 
 def _turn(angle: float) -> np.ndarray:
-    """About the camera's y axis."""
+    """Rotation about the camera's y axis."""
     return np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
 
 

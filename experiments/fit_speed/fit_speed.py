@@ -1,4 +1,4 @@
-"""What a step of the static fit takes, part by part."""
+"""Time of a step of the static fit, part by part."""
 
 from itertools import pairwise
 from pathlib import Path
@@ -20,12 +20,12 @@ from gsjax.scene.gaussians import gaussians_from_activated
 from gsjax.scene.render import plan_render, render
 
 WIDTH, HEIGHT, REPEATS = 480, 270, 9
-HALFWAY, RADIUS = 0.5, 1.0  # of the fit, 0 to 1, and of the scene
+HALFWAY, RADIUS = 0.5, 1.0  # progress of the fit, and radius of the scene
 PARTS = ("draw", "loss", "backward", "adam", "grow")
 
 
 def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
-    """Programs that do more and more of a step, called in turn."""
+    """Programs that each include one more part of a step, called in turn."""
     count, config = options["count"], FitConfig(cap=options["count"])
     seen, start = (ball(count, WIDTH, HEIGHT, seed=seed + i) for i in range(2))
     camera = Camera(seen.viewmat[None], seen.K[None], WIDTH, HEIGHT)
@@ -82,7 +82,7 @@ def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
 
 
 def figure(rows: list[dict[str, Any]], path: Path) -> None:
-    """A bar a count, of parts."""
+    """A stacked bar for each number of Gaussians."""
     from matplotlib.figure import Figure
 
     drawing = Figure(figsize=(7, 2.6), layout="constrained")

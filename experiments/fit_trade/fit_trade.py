@@ -1,15 +1,15 @@
-"""What does each part of a fit buy in a given time?"""
+"""What is each part of a fit worth within a given time?"""
 
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
-from time import perf_counter
 from typing import Any
 
 import jax
 import numpy as np
 
 from experiments.shared.recordings import recorded
+from experiments.shared.timing import median_ms
 from experiments.static_fit.static_fit import SCENES
 from gsjax.data import open_photographs
 from gsjax.engine.drive import drive
@@ -41,7 +41,7 @@ SETTINGS = {
 
 @lru_cache(maxsize=2)
 def frames_at(scene: str, size: float = 1.0) -> tuple[list[Frame], list[Frame]]:
-    """Fitted and held-out photographs; `size` 1 is that of static_fit."""
+    """Fitted and held-out photographs; `size` is relative to static_fit's."""
     how = SCENES[scene]
     photographs = open_photographs(str(recorded(scene)), how.get("read")).scaled(size * how["scale"])
     chosen, held_out = split(photographs, 8)
@@ -49,7 +49,7 @@ def frames_at(scene: str, size: float = 1.0) -> tuple[list[Frame], list[Frame]]:
 
 
 def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
-    """A fit of a few minutes, and its score now and then."""
+    """A fit of a few minutes, scored at intervals."""
     jax.clear_caches()
     scene, setting = options["scene"], options["setting"]
     shown, held_out = frames_at(scene)
@@ -77,24 +77,19 @@ def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
         "unneeded": gaussians.num - kept.num,
         "steps": steps,
         "steps_a_second": steps / spent.seconds,
-        "step_over_draw": float(np.median(recent)) / _draw_seconds(gaussians, shown[0]),
+        "step_over_draw": 1e3 * float(np.median(recent)) / _draw_ms(gaussians, shown[0]),
         "curve": rows,
     }
 
 
-def _draw_seconds(gaussians: Gaussians, frame: Frame) -> float:
-    """Median time of drawing a photograph's view, which a step is compared with."""
+def _draw_ms(gaussians: Gaussians, frame: Frame) -> float:
+    """Median milliseconds of rendering a photograph's view, which a step is compared with."""
     camera = on_device(frame.cameras)
-    plan, times = plan_render(gaussians, camera), []
-    for _ in range(6):
-        begun = perf_counter()
-        jax.block_until_ready(render(gaussians, camera, plan).colors)
-        times.append(perf_counter() - begun)
-    return float(np.median(times[1:]))
+    return median_ms(render, gaussians, camera, plan_render(gaussians, camera))
 
 
 def figure(rows: list[dict[str, Any]], path: Path) -> None:
-    """A row a scene: PSNR over minutes with the best of each moment, and over what is needed for it."""
+    """A row for each scene: PSNR over minutes with the best so far, and over the number of Gaussians."""
     from matplotlib.figure import Figure
 
     scenes = list(dict.fromkeys(row["scene"] for row in rows))

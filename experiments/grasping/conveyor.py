@@ -27,7 +27,7 @@ AWAY = 3.0
 
 @dataclass(frozen=True)
 class Trial:
-    """How a trial begins."""
+    """Initial state of a trial."""
 
     target: str
     speed: float  # of the belt along y, m/s
@@ -35,7 +35,7 @@ class Trial:
 
 
 def draw_trial(seed: int, moving: bool) -> Trial:
-    """The target and two other objects, 13 cm apart at least; a moving belt brings them from one side."""
+    """The target and two other objects, at least 13 cm apart; a moving belt brings them from one side."""
     rng = np.random.default_rng([seed, moving])
     names = [str(name) for name in rng.permutation(list(OBJECTS))[:3]]
     speed = float(rng.uniform(0.03, 0.08) * rng.choice([-1, 1])) if moving else 0.0
@@ -51,7 +51,7 @@ def draw_trial(seed: int, moving: bool) -> Trial:
 
 
 class Conveyor:
-    """The simulated world; made once, begun anew for each trial."""
+    """The simulated world, made once and reset for each trial."""
 
     def __init__(self, width: int, height: int):
         robot = Panda(idn=0)
@@ -78,7 +78,7 @@ class Conveyor:
         self.cameras = Cameras(self.model, VIEWS, width, height, fovy=32.0)
 
     def begin(self, trial: Trial) -> None:
-        """Everything in its place and settled on the belt, which runs."""
+        """Place all objects and let them settle on the running belt."""
         mujoco.mj_resetData(self.model, self.data)
         for i, name in enumerate(OBJECTS):
             x, y, yaw = trial.places.get(name, (AWAY + i, AWAY, 0.0))

@@ -1,8 +1,8 @@
 """Grasp what lies still, or comes along on a belt, by the Gaussians that the tracker follows.
 
-An object is named in the first frame, whose mask in one camera is the simulator's: it stands for a segmenter,
-and the name for a language query. From then on the arm knows what three RGB-D cameras show. It does what a
-frame led to after the next one is taken, so each command is one control period old.
+An object is named in the first frame, whose mask in one camera is the simulator's: the mask stands in for a
+segmenter, and the name for a language query. From then on the arm knows only what three RGB-D cameras show. A
+frame's command is carried out after the next frame is taken, so each command is one control period old.
 """
 
 from dataclasses import replace
@@ -25,26 +25,24 @@ from gsjax.methods.track import PRESETS, TrackedScene
 from gsjax.scene.frame import Frame
 
 FAST = PRESETS["fast"]
-# Colours come straight from the pixels, and nothing joins objects: fewer programs to compile a trial.
+# Colours come straight from the pixels, and no Gaussians join objects: fewer programs to compile.
 CONFIG = replace(FAST, grow=replace(FAST.grow, slots=0))
 WIDTH, HEIGHT, MASK_CAMERA = 240, 180, 0
 OWN, BACKGROUND = 512, 8192  # Gaussians of an object and of the background
-OTHERS, NEAR = 1024, 0.25  # points around an object that may be in the way, and how far that is, metres
-# robosuite's hand: its palm begins 31 mm behind the tool's point and its fingers end 9 mm beyond it.
-# Both are taken to be nearer to what they might hit, by 4 and 2 mm.
+OTHERS, NEAR = 1024, 0.25  # points around an object that may be in the way, and their distance, metres
+# robosuite's hand: its palm starts 31 mm behind the tool's point and its fingers end 9 mm beyond it. Margins
+# of 4 and 2 mm are added.
 GRIPPER = Gripper(finger_thickness=0.027, finger_height=0.038, tip=0.011, palm_height=0.092)
 KEY = jax.random.key(0)
 TILT = 0.35  # of the approach away from straight down, radians
 SEARCH = 4  # the held grasp is scored at every update, and new ones are drawn at every fourth
 BETTER = 0.1  # a new grasp replaces the held one if its score is this much larger
-CARROT = (
-    0.045  # how far along its path the tool is told to be, metres: this over the servos' lag is its speed
-)
+CARROT = 0.045  # lead of the commanded position, metres: over the servos' lag this is the tool's speed
 AT_GRASP = (0.004, 0.008, 0.08)  # across and along the approach, metres, and radians: then the fingers close
 REACHING, CLOSING, LIFTING, HOLDING = 260, 14, 45, 15  # control periods at most
-LIFT, LIFTED = 0.15, 0.10  # how far the tool rises, and how far an object must have to be a success, metres
-WINDOW = 8  # frames from which the object's velocity is taken
-LEAD = LAG + 2 * PERIOD  # from a frame to where the arm is once it has done what that frame asked for
+LIFT, LIFTED = 0.15, 0.10  # rise of the tool, and of an object that counts as lifted, metres
+WINDOW = 8  # frames from which the object's velocity is estimated
+LEAD = LAG + 2 * PERIOD  # from a frame to the time at which the arm has carried out its command
 
 
 class Body(NamedTuple):
@@ -56,7 +54,7 @@ class Body(NamedTuple):
 
 
 class Begun(NamedTuple):
-    """What all methods begin with."""
+    """The start shared by all methods."""
 
     scene: TrackedScene
     frame: Frame
@@ -84,7 +82,7 @@ def begun(trial_seed: int, moving: bool) -> Begun:
 
 
 def around(begun: Begun, means: np.ndarray, center: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Points near the object that are not its own, and which of them count."""
+    """Points near the object that belong to others, and which entries are valid."""
     label = begun.scene.labels[begun.body.rows[0]]
     near = np.linalg.norm(means - center, axis=1) < NEAR
     rows = np.flatnonzero(np.asarray(begun.scene.labels != label) & near)
@@ -98,7 +96,7 @@ OPTIONS = {"approach": jnp.array([0.0, 0.0, -1.0]), "max_angle": TILT}
 
 @jax.jit
 def search(held: jax.Array, *cloud: jax.Array) -> Grasp:
-    """The held grasp scored again, or the best of new ones where that is better or the only feasible one."""
+    """The held grasp with a new score, or the best new grasp where it is better or the only feasible one."""
     new, old = best_grasp(KEY, *cloud, GRIPPER, **OPTIONS), score(held, *cloud)
     keep = old.feasible & ~(new.feasible & (new.score > old.score + BETTER))
     return jax.tree.map(partial(jnp.where, keep), old, new)
@@ -113,14 +111,14 @@ plan = jax.jit(straight_line)
 
 
 class Aim:
-    """The grasp aimed at, which moves with the object: where the points of the first frame are now."""
+    """The target grasp, which moves with the object."""
 
     def __init__(self, begun: Begun):
         self.begun, self.held, self.track = begun, np.full((4, 4), np.nan), []
         self.see(np.eye(4), np.asarray(begun.scene.gaussians.means))
 
     def see(self, motion: np.ndarray, means: np.ndarray) -> None:
-        """The object has moved by `motion` since the first frame, and all Gaussians are at `means`."""
+        """Update with the object's motion since the first frame and the current centres of all Gaussians."""
         body = self.begun.body
         points = body.points @ motion[:3, :3].T + motion[:3, 3]
         center = points.mean(0)
@@ -134,13 +132,13 @@ class Aim:
         self.track.append(center)
 
     def coast(self) -> None:
-        """The fingers hide the object: it is taken to go on as it did."""
+        """Extrapolate the object's motion while the fingers hide it."""
         step = self.ahead(PERIOD)[:3, 3] - self.grasp.pose[:3, 3]
         self.grasp.pose[:3, 3] += step
         self.track.append(self.track[-1] + step)
 
     def ahead(self, seconds: float) -> np.ndarray:
-        """The grasp's pose after `seconds`, if the object goes on as it does."""
+        """The grasp's pose after `seconds` at the object's current velocity."""
         recent = np.array(self.track[-WINDOW:])
         velocity = (recent[-1] - recent[0]) / max(len(recent) - 1, 1) / PERIOD
         pose = np.array(self.grasp.pose, float)
@@ -166,7 +164,7 @@ def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
 
 
 class Attempt:
-    """Reach, close, lift: the arm's side of a trial."""
+    """The arm's side of a trial: reach, close, lift."""
 
     def __init__(self, conveyor: Conveyor, trial: Trial, first: Begun, source: str):
         self.conveyor, self.trial, self.start, self.source = conveyor, trial, first, source
@@ -176,8 +174,8 @@ class Attempt:
         self.errors: list[float] = []
         self.waiting = HOME
 
-    def look(self) -> None:
-        """Take a frame and aim again."""
+    def observe(self) -> None:
+        """Take a frame and update the aim."""
         if self.source == "first frame":
             return
         means = np.array(self.start.scene.gaussians.means)
@@ -196,18 +194,18 @@ class Attempt:
         self.errors.append(1e3 * float(np.linalg.norm(((motion - truth) @ center)[:3])))
 
     def act(self, pose: np.ndarray, finger: float) -> None:
-        """One control period, which carries out what was asked for a period ago."""
+        """One control period, which carries out the command of the period before."""
         self.conveyor.step(self.waiting, finger)
         self.waiting = pose
 
     def goal(self, seconds: float) -> np.ndarray:
-        """Where the tool should be after `seconds`, fingers exchanged if that is less of a turn."""
+        """Goal of the tool after `seconds`, with the fingers exchanged if that is a smaller rotation."""
         pose, tool = self.aim.ahead(seconds), self.conveyor.arm.pose()
         flipped = pose @ np.diag([-1.0, -1.0, 1.0, 1.0])
         return max(pose, flipped, key=lambda goal: np.trace(goal[:3, :3].T @ tool[:3, :3]))
 
     def along_path(self, tool: np.ndarray) -> np.ndarray:
-        """A pose a little further on a new plan to where the grasp will be when the arm has come there."""
+        """A pose slightly ahead on a new path to where the grasp will be when the arm arrives."""
         goal = self.goal(LEAD)
         path = np.asarray(plan(tool.astype(np.float32), self.aim.grasp._replace(pose=np.float32(goal))).poses)
         to_grasp = path[: len(path) // 2]
@@ -215,14 +213,14 @@ class Attempt:
         return to_grasp[np.argmax(ahead > CARROT) if (ahead > CARROT).any() else -1]
 
     def run(self) -> dict[str, Any]:
-        """The whole attempt, and what is said of it."""
+        """The whole attempt, and its results."""
         arm, heights, there = self.conveyor.arm, [], False
         possible, height = bool(self.aim.grasp.feasible), self.first[2, 3]
         periods = 0
         while periods < REACHING and not there:
             periods += 1
             self.act(self.along_path(arm.pose()), OPEN)
-            self.look()
+            self.observe()
             there = reached(arm.pose(), self.goal(0.0))
         before = self.errors[-1] if self.errors else None
         for _ in range(CLOSING if there else 0):
@@ -248,7 +246,7 @@ class Attempt:
 
 
 def figure(rows: list[dict[str, Any]], path: Path) -> None:
-    """How often each method lifts, and how far off the tracker is."""
+    """Success rates of the methods, and errors of the tracker."""
     from experiments.shared.plots import draw_grasping
 
     draw_grasping(rows, path)

@@ -1,4 +1,4 @@
-"""What goes wrong with a recording, done to one that is sound."""
+"""Faults of recordings, applied to sound ones."""
 
 from dataclasses import replace
 
@@ -33,7 +33,7 @@ def noisy_depth(sequence: Sequence, times: float) -> Sequence:
 
 
 def without_cameras(sequence: Sequence, lost: tuple[int, ...], frames: range) -> Sequence:
-    """Some cameras deliver black pictures and no depth for a while."""
+    """Some cameras deliver black pictures and no depth during `frames`."""
 
     def image(t: int, c: int) -> np.ndarray:
         picture = sequence.load_image(t, c)
@@ -43,7 +43,7 @@ def without_cameras(sequence: Sequence, lost: tuple[int, ...], frames: range) ->
         measured = sequence.load_depth(t, c)
         return np.zeros_like(measured) if c in lost and t in frames else measured
 
-    def mask(t: int, c: int) -> np.ndarray:  # what only a dead camera would show, nobody sees
+    def mask(t: int, c: int) -> np.ndarray:  # objects that only a dead camera would show are unseen
         labels = sequence.load_mask(t, c)
         return np.zeros_like(labels) if c in lost and t in frames else labels
 

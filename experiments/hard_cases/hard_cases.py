@@ -1,4 +1,4 @@
-"""The tracker where it may lose an object: does it, does it say so, and does it find it again?"""
+"""The tracker where it may lose an object: does it, does it report so, and does it find it again?"""
 
 from dataclasses import replace
 from functools import cache
@@ -11,20 +11,20 @@ from scipy.spatial.transform import Rotation
 
 from experiments.hard_cases.faults import noisy_depth, without_cameras, without_frames
 from experiments.hard_cases.stages import HEIGHT, STAGES, WIDTH, gripper, stage
-from experiments.shared.recordings import MASK_CAMERA, QUIET, Start, recorded, tracked
+from experiments.shared.recordings import Start, recorded, start_of, tracked
 from gsjax.data import Sequence, Truth, open_sequence
 from gsjax.data.simulated import tabletop
-from gsjax.engine.recording import Recording, draw_ahead, first_mask, remembered
+from gsjax.engine.recording import Recording, remembered
 from gsjax.engine.track.loop import Tracking
 from gsjax.engine.track.scoring import lost_over_frames, score_motion, turn_unknown
-from gsjax.methods.track import PRESETS, TrackConfig, start_scene
+from gsjax.methods.track import PRESETS, TrackConfig
 
-START = TrackConfig(start=replace(PRESETS["fast"].start, iterations=40))  # colours hardly matter here
+START = TrackConfig(start=replace(PRESETS["fast"].start, iterations=40))  # few: colours hardly matter here
 ASTRAY_MM = 20.0  # the objects are 60 to 130 mm long
-TURNED_DEG = 8.0  # an object that is turned otherwise by more than this ...
-TURN_MM = 40.0  # ... may have its seen surface's centroid so far off, though its place is right
-FEWEST_PIXELS = 30  # of all cameras together, that show what can be followed
-MOST_SILENT = 3  # frames in a row in which an object may be astray before that is said
+TURNED_DEG = 8.0  # an object whose orientation is off by more than this ...
+TURN_MM = 40.0  # ... may have its visible surface's centroid off by this, though its position is right
+FEWEST_PIXELS = 30  # of all cameras together, for an object to count as visible
+MOST_SILENT = 3  # consecutive frames in which an object may be astray before it is reported
 
 
 def table(**how: bool) -> Sequence:
@@ -33,7 +33,7 @@ def table(**how: bool) -> Sequence:
 
 
 def knocked(step: int) -> Sequence:
-    """Every so-manieth frame of a MuJoCo recording in which boxes are knocked over."""
+    """Every n-th frame of a MuJoCo recording in which boxes are knocked over."""
     return open_sequence(str(recorded("tabletop_1"))).select(slice(None, None, step))
 
 
@@ -60,15 +60,11 @@ def started(case: str) -> Start:
     """The recording and its scene at the first frame."""
     jax.clear_caches()  # every case has shapes of its own, and programs fill the process's memory map
     sequence = remembered(CASES[case]())
-    recording = Recording(sequence, sequence, sequence.num_frames, True)
-    mask, frame = first_mask(sequence, MASK_CAMERA, "files"), sequence.frame(0)
-    assert mask.labels is not None
-    draw_ahead(recording, QUIET)
-    return Start(recording, mask, frame, start_scene(frame, mask.labels, MASK_CAMERA, START))
+    return start_of(Recording(sequence, sequence, sequence.num_frames, True), START)
 
 
 def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
-    """Follow the objects of one case, and say of each what became of it."""
+    """Track the objects of one case, and judge each."""
     start = started(options["case"])
     recording, tracking = start.recording, tracked(start, PRESETS[options["preset"]])
     truth = recording.tracked.truth
@@ -80,7 +76,7 @@ def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
             score.centroid_errors_mm,
             turn_errors(tracking, truth, label),
             pixels[label],
-            *said(tracking, label),
+            *reported(tracking, label),
         )
         for label, score in motion.items()
         if score.num_scored
@@ -101,16 +97,16 @@ def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
 
 
 def seen_pixels(sequence: Sequence) -> dict[int, np.ndarray]:
-    """How many pixels of all cameras truly show each label, frame by frame."""
+    """Number of pixels of all cameras that truly show each label, frame by frame."""
     views = [(t, c) for t in range(sequence.num_frames) for c in range(sequence.num_cameras)]
     masks = np.stack([sequence.mask(t, c) for t, c in views])
     masks = masks.reshape(sequence.num_frames, -1)
     return {int(label): (masks == label).sum(axis=1) for label in sequence.truth.label_ids}
 
 
-def said(tracking: Tracking, label: int) -> tuple[np.ndarray, np.ndarray]:
-    """In which frames the tracker says that the object is lost, or that it sees none of it; and in which that
-    it does not know how the object is turned."""
+def reported(tracking: Tracking, label: int) -> tuple[np.ndarray, np.ndarray]:
+    """Frames in which the tracker reports an object as lost or unseen; and frames in which it reports the
+    orientation as unknown."""
     mine = np.asarray(tracking.scene.label_ids)[1:] == label
     unseen = ~np.asarray(tracking.visible)[:, mine].any(axis=1)
     lost = lost_over_frames(tracking, None, label) | unseen
@@ -118,9 +114,9 @@ def said(tracking: Tracking, label: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def turn_errors(tracking: Tracking, truth: Truth, label: int) -> np.ndarray:
-    """Angle between how the tracker and the truth have turned an object since the first frame, degrees."""
+    """Angle between the tracked and the true rotation of an object since the first frame, degrees."""
     group = tracking.scene.label_ids.index(label)
-    one = int(np.argmax(np.asarray(tracking.scene.labels) == group))  # any Gaussian turns as its object does
+    one = int(np.argmax(np.asarray(tracking.scene.labels) == group))  # any Gaussian turns with its object
     found = Rotation.from_quat(tracking.quats()[:, one], scalar_first=True)
     poses = truth.poses[: tracking.num_frames, truth.label_ids.tolist().index(label), :3, :3]
     true = Rotation.from_matrix(poses)
@@ -129,28 +125,28 @@ def turn_errors(tracking: Tracking, truth: Truth, label: int) -> np.ndarray:
 
 
 def judge(
-    errors: np.ndarray, turns: np.ndarray, pixels: np.ndarray, said: np.ndarray, unsure: np.ndarray
+    errors: np.ndarray, turns: np.ndarray, pixels: np.ndarray, lost: np.ndarray, unsure: np.ndarray
 ) -> dict[str, Any]:
-    """What became of one object.
+    """The outcome for one object, from values of each frame.
 
     Args:
-        errors: of its centroid, millimetres, frame by frame.
-        turns: errors of how it is turned, degrees.
-        pixels: that truly show it.
-        said: whether the tracker said that it is lost or unseen.
-        unsure: whether it said that it does not know how the object is turned.
+        errors: errors of its centroid, millimetres.
+        turns: errors of its orientation, degrees.
+        pixels: number of pixels that truly show it.
+        lost: whether the tracker reports it as lost or unseen.
+        unsure: whether the tracker reports its orientation as unknown.
     """
     there = pixels >= FEWEST_PIXELS
     astray = (errors > ASTRAY_MM) & there
     wrongly = turns > TURNED_DEG
-    told = said | (unsure & wrongly & (errors <= TURN_MM))
-    silent = longest(astray & ~told)
+    noticed = lost | (unsure & wrongly & (errors <= TURN_MM))
+    silent = longest(astray & ~noticed)
     ends = bool(astray[there][-1])
     if not astray.any():
         verdict = "sound"
-    elif silent > MOST_SILENT or not (astray & told).any():
+    elif silent > MOST_SILENT or not (astray & noticed).any():
         verdict = "astray, unsaid"
-    elif not (astray & said).any():
+    elif not (astray & lost).any():
         verdict = "turn unknown, said so"
     else:
         verdict = "lost, said so" if ends else "lost, found again"
@@ -162,14 +158,14 @@ def judge(
         "end_mm": float(errors[there][-1]),
         "astray": int(astray.sum()),
         "silent": silent,
-        "unsaid": int((astray & ~told).sum()),
+        "unsaid": int((astray & ~noticed).sum()),
         "sound_frames": int(sound.sum()),
-        "false_alarms": int((sound & said).sum()),
+        "false_alarms": int((sound & lost).sum()),
         "turn_right_frames": int((there & ~wrongly).sum()),
-        "false_doubts": int((there & ~wrongly & unsure & ~said).sum()),
+        "false_doubts": int((there & ~wrongly & unsure & ~lost).sum()),
         "turns_deg": turns.round(1).tolist(),
         "errors_mm": errors.round(2).tolist(),
-        "said": said.tolist(),
+        "said": lost.tolist(),
         "unsure": unsure.tolist(),
         "there": there.tolist(),
     }
@@ -197,11 +193,11 @@ def figure(rows: list[dict[str, Any]], path: Path) -> None:
         axes = grid[place % height, place // height * len(presets) + presets.index(row["preset"])]
         axes.set_visible(True)
         for i, (name, found) in enumerate(row["objects"].items()):
-            errors, told = np.maximum(found["errors_mm"], 0.05), np.asarray(found["said"])
+            errors, lost = np.maximum(found["errors_mm"], 0.05), np.asarray(found["said"])
             there, frames = np.asarray(found["there"]), np.arange(len(errors))
             axes.plot(frames, np.where(there, errors, np.nan), color=f"C{i}", label=name, linewidth=1.5)
             axes.plot(frames, np.where(there, np.nan, errors), color=f"C{i}", linewidth=1, alpha=0.25)
-            axes.plot(frames[told], errors[told], "o", color=f"C{i}", markersize=3.5)
+            axes.plot(frames[lost], errors[lost], "o", color=f"C{i}", markersize=3.5)
         axes.axhline(ASTRAY_MM, color="#888888", linewidth=0.8, linestyle=":")
         axes.set(yscale="log", ylim=(0.05, 3000), yticks=(0.1, 1, 10, 100, 1000))
         axes.set_title(f"{row['case']}, {row['preset']}: {row['verdict']}", fontsize=9)

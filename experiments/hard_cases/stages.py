@@ -1,4 +1,4 @@
-"""Small scenes on a table that each do one thing that a tracker may lose."""
+"""Small scenes on a table, each with one kind of motion that may defeat a tracker."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -24,7 +24,7 @@ Poses = np.ndarray  # [FRAMES, 4, 4]
 
 
 class Thing(NamedTuple):
-    """An object: solids of one body, and where it goes."""
+    """An object: the solids of one body, and its poses."""
 
     name: str
     solids: tuple[Primitive, ...]
@@ -45,19 +45,19 @@ def _plain(color):
 
 
 def _path(x, y, z=0.065, yaw=0.0, pitch=0.0) -> Poses:
-    """Poses along coordinates, metres and radians, each of one value or one a frame."""
+    """Poses from coordinates in metres and radians, each one value or one per frame."""
     places = np.stack([np.broadcast_to(a, FRAMES).astype(float) for a in (x, y, z)], axis=1)
     yaw, pitch = (np.broadcast_to(a, FRAMES).astype(float) for a in (yaw, pitch))
     return rigid(turn(_UP, yaw) * turn((0.0, 1.0, 0.0), pitch), places)
 
 
 def _between(start: float, stop: float, low: float, high: float) -> np.ndarray:
-    """A coordinate that goes from `low` to `high` between two frames."""
+    """A coordinate that moves from `low` to `high` between two frames."""
     return along_keyframes(np.arange(FRAMES, dtype=float), (start, stop), [[low], [high]])[:, 0]
 
 
 def _block(x=-0.16, y=0.16) -> Thing:
-    """What never moves."""
+    """A block that never moves."""
     return Thing(
         "block",
         _box((0.034, 0.034, 0.03), "checker", ((0.24, 0.56, 0.32), (0.8, 0.86, 0.6)), 8),
@@ -66,7 +66,7 @@ def _block(x=-0.16, y=0.16) -> Thing:
 
 
 def jumps() -> list[Thing]:
-    """40 mm from one frame to the next, every fourth frame, to all sides; the can turns by 20 degrees too."""
+    """Jumps of 40 mm in random directions at every fourth frame; the can also turns by 20 degrees."""
     rng = np.random.default_rng(0)
     count = FRAMES // 4
 
@@ -90,7 +90,7 @@ def jumps() -> list[Thing]:
 
 
 def spins(degrees: float) -> list[Thing]:
-    """A box and a can that turn about the vertical, and a box that tumbles, by so much a frame."""
+    """A box and a can that turn about the vertical, and a box that tumbles, by the given angle a frame."""
     angle = np.deg2rad(degrees) * np.arange(FRAMES)
     return [
         Thing("carton", _box(), _path(0.02, -0.13, yaw=angle)),
@@ -183,8 +183,8 @@ STAGES: dict[str, Callable[[], list[Thing]]] = {
 
 
 def gripper() -> Sequence:
-    """A hand closes on a can from 70 mm to its sides, lifts it, and turns it by 60 degrees: its fingers move
-    against it, and all of the robot has one label."""
+    """A hand with an opening of 70 mm closes on a can, lifts it, and turns it by 60 degrees: the fingers move
+    relative to it, and all of the robot has one label."""
     opening = _between(2, 16, 0.07, 0.034)
     can = _path(0.02, 0.0, 0.055 + _between(20, 36, 0.0, 0.12), _between(20, 36, 0.0, 1.05))
     grasp = can @ rigid(None, np.tile([0.0, 0.0, 0.02], (FRAMES, 1)))

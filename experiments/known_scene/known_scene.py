@@ -1,4 +1,4 @@
-"""Is a scene of known Gaussians found again from its photographs?"""
+"""Is a scene of known Gaussians recovered from its photographs?"""
 
 from dataclasses import replace
 from pathlib import Path
@@ -21,12 +21,12 @@ from gsjax.scene.render import plan_render, render
 
 WIDTH, HEIGHT = 324, 210
 SEEN, UNSEEN = 24, 8
-HALF_SIZE = 0.5  # of the cube of the garden that is drawn, in its own units
+HALF_SIZE = 0.5  # of the cube of the garden that is used, in its own units
 JUDGED_EVERY = 500
 
 
 def garden(count: int, seed: int) -> Gaussians:
-    """Gaussians on points of the garden and in their colours, stretched and turned at random."""
+    """Gaussians at points of the garden with their colours, stretched and rotated at random."""
     stored, random = np.load(recorded("garden_points") / "test_garden.npz"), np.random.default_rng(seed)
     inside = np.flatnonzero((np.abs(stored["means3d"]) <= HALF_SIZE).all(1))
     chosen = random.choice(inside, count, replace=False)
@@ -37,7 +37,7 @@ def garden(count: int, seed: int) -> Gaussians:
 
 
 def cameras() -> list[Float[np.ndarray, "4 4"]]:
-    """All around, at two heights in turn; each fourth of them is kept apart."""
+    """Poses all around the scene, at alternating heights; every fourth is held out."""
     angles = np.arange(SEEN + UNSEEN) * 2 * np.pi / (SEEN + UNSEEN)
     heights = np.where(np.arange(len(angles)) % 2, 0.55, 0.9)
     eyes = np.stack([1.3 * np.cos(angles), 1.3 * np.sin(angles), heights], axis=-1)
@@ -51,8 +51,8 @@ def picture(scene: Gaussians, viewmat: np.ndarray, K: np.ndarray) -> np.ndarray:
 
 
 def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
-    """Photographs of the known scene, rounded to 8 bits; a fit that starts from points that are off by a
-    third of their spacing; PSNR of views that were never photographed."""
+    """PSNR of held-out views of a fit to photographs of the known scene, rounded to 8 bits; it starts from
+    points that are off by a third of their spacing."""
     truth, viewmats = garden(options["count"], seed), cameras()
     K = intrinsics(0.75 * WIDTH, WIDTH, HEIGHT)
     photographs = [np.round(255 * picture(truth, v, K)).astype(np.uint8) for v in viewmats]
@@ -67,7 +67,7 @@ def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
     off = means + random.normal(size=means.shape) * spacing_scales(means)[:, None] / 3
     colors = np.clip(0.5 + 0.2820948 * np.asarray(truth.sh0[:, 0]), 0, 1)
     config = FitConfig(steps=options["steps"], cap=round(1.2 * options["count"]), sh_degree=0, seed=seed)
-    if options["growth"] == "none":  # the number is known: nothing is to move elsewhere, or to cost anything
+    if options["growth"] == "none":  # the number is known: no relocation, no noise, no costs
         still = GrowthConfig(begin=config.steps, noise=0.0, opacity_cost=0.0, scale_cost=0.0)
         config = replace(config, growth=still, cap=options["count"])
     method = Fit(config)

@@ -27,7 +27,7 @@ SPECK = 100  # pixels: smaller patches of the colour are not the block
 
 
 def block_pixels(image: np.ndarray) -> np.ndarray:
-    """Where the picture has the block's orange: H < 14 or > 174, S > 140, V > 120 in OpenCV's HSV."""
+    """Pixels of the block's orange: H < 14 or > 174, S > 140, V > 120 in OpenCV's HSV."""
     hue, saturation, value = np.moveaxis(cv2.cvtColor(image, cv2.COLOR_RGB2HSV), -1, 0)
     orange = ((hue < 14) | (hue > 174)) & (saturation > 140) & (value > 120)
     _, patches, stats, _ = cv2.connectedComponentsWithStats(orange.astype(np.uint8))
@@ -44,9 +44,9 @@ def main(
 
     Args:
         recording: the push_t folder.
-        stride: every so many frames of about 18 ms.
-        seconds: of the recording, from its start.
-        tracked: ids of the cameras that the tracker sees; the others are only judged.
+        stride: every n-th frame of about 18 ms is taken.
+        seconds: length of the part that is used, from the start.
+        tracked: ids of the cameras that the tracker sees; the others are only scored.
     """
     whole = gsjax.open_sequence(recording)
     length = int((whole.times < whole.times[0] + seconds).sum())
@@ -70,7 +70,7 @@ def main(
     for t, now in enumerate(track(scene, first, frames), start=1):
         moving.append(score(now.result.pose, t))
         still.append(score(start, t))
-        updates.append(tracked_frame.seconds)
+        updates.append(now.seconds)
         print(f"{judged.times[t] - judged.times[0]:5.2f} s  IoU {np.round(moving[-1], 3)}", flush=True)
 
     result = {

@@ -1,6 +1,6 @@
-"""One frame-to-frame update by different optimizers: error over time, from one start and on the same images.
+"""One frame-to-frame update by different optimizers: error over time, from the same start and images.
 
-The update begins with a scene fitted to frame t, and ends at frame t + gap, whose true motion is known.
+The update starts from a scene fitted to frame t and ends at frame t + gap, whose true motion is known.
 """
 
 from functools import cache, partial
@@ -29,12 +29,12 @@ METHODS = {
     "direct alignment": partial(methods.direct, counts=[0, 4, 8, 16, 32]),
     "direct, searched": partial(methods.direct, counts=[0, 12], find=methods.searched),
 }
-NEAR = 1.5  # times the best error of all: what counts as arrived
+NEAR = 1.5  # an error of at most this times the best of all counts as arrived
 
 
 @cache
 def updates(recording: str, gap: int) -> list[Update]:
-    """The updates of one kind; a scene is fitted once."""
+    """The updates of one kind; each scene is fitted once."""
     dataset, frames = RECORDINGS[recording]
     return [update_of(opened(dataset), scene(dataset, t), t, gap) for t in frames]
 
@@ -52,7 +52,7 @@ def scene(dataset: str, t: int):
 
 @cache
 def traces(recording: str, gap: int) -> dict[str, dict[str, Any]]:
-    """All methods on one kind of update, for each is compared with the best; means over the updates."""
+    """All methods on one kind of update, since each is compared with the best; means over the updates."""
     given = updates(recording, gap)
     draws, found = [median_ms(methods.draw, update.batch) for update in given], {}
     for name, method in METHODS.items():
@@ -70,7 +70,7 @@ def traces(recording: str, gap: int) -> dict[str, dict[str, Any]]:
 
 
 def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
-    """One method on one kind of update. All of that kind run with the first one."""
+    """One method on one kind of update. All methods run together the first time."""
     found = traces(options["recording"], options["gap"])
     mine = found[options["method"]]
     best = min(trace["point_mm"].min() for trace in found.values())

@@ -1,6 +1,6 @@
-"""The methods that are compared: what each has found after 0, 1, 2, 4, ... iterations, and what that takes.
+"""The methods compared: the motion that each finds after 0, 1, 2, 4, ... iterations, and its time.
 
-All begin by standing still. Times are from images in memory, and medians of calls that are warm.
+All start from no motion. Times begin with images in memory and are medians of warm calls.
 """
 
 from collections.abc import Callable
@@ -31,18 +31,18 @@ from gsjax.optim.step import Step
 from gsjax.scene.render import render
 
 ALIGN, REFINE = AlignConfig(), RefineConfig(delta_rate=3e-5)
-# Tuned on other updates than those of the table: see docs/results-optimizers.md.
+# Tuned on updates other than those of the table: see docs/results-optimizers.md.
 TRANSLATION_RATE, ROTATION_RATE = 6e-3, 3e-2  # Adam's at first, metres and radians
 BLOCKS, SOFTNESS = (8,) * 6 + (4,) * 4, 0.3  # Levenberg-Marquardt's, iteration by iteration
-ICP_REACH, ICP_MARGIN = 0.03, 0.05  # metres; pairs further apart, and points further off, do not count
+ICP_REACH, ICP_MARGIN = 0.03, 0.05  # metres; pairs and points farther apart do not count
 
 
 class Trace(NamedTuple):
-    """What a method has found.
+    """The result of a method.
 
     Attributes:
-        counts: after so many iterations.
-        motions: that motion.
+        counts: numbers of iterations.
+        motions: the motion after each of them.
         ms: milliseconds until then.
     """
 
@@ -57,21 +57,21 @@ def standing(update: Update) -> Motion:
 
 
 draw = jitted(lambda batch: render(place(batch.scene, batch.pose), batch.frame.cameras, batch.plan).colors)
-"""The reference for times: what may move and what surrounds it, drawn once in all cameras."""
+"""The reference for times: all that may move with its surroundings, rendered once in all cameras."""
 
 ADAM = optax.scale_by_adam(b1=0.8, b2=0.95)  # as in `refine`
 
 
 @partial(jitted, static_argnames="config")
 def adam_step(motion, state, batch, rates, config=REFINE):
-    """One iteration down refine's loss, with a rate for each number of a twist and one for delta."""
+    """One iteration on the loss of `refine`, with a rate for each number of a twist and one for delta."""
     loss = partial(refine_loss, batch=batch, step=0, key=None, config=config)
     change, state = ADAM.update(jax.grad(loss, has_aux=True)(motion)[0], state)
     return jax.tree.map(lambda a, rate, by: a - rate * by, motion, rates, change), state
 
 
 def descend(start: Motion, batch, rates: Motion, count: int, config=REFINE) -> Motion:
-    """`count` iterations of Adam whose rates fall to a tenth over them, as in `refine`."""
+    """`count` iterations of Adam with rates that fall to a tenth, as in `refine`."""
     motion, state = start, ADAM.init(start)
     for i in range(count):
         falling = jax.tree.map(lambda rate, i=i: rate * 0.1 ** (i / count), rates)
@@ -85,7 +85,7 @@ def adam(
     rotation_rate: float = ROTATION_RATE,
     delta_rate: float = REFINE.delta_rate,
 ) -> Trace:
-    """Adam on D_k and delta_i; every count is a run with a schedule of its own."""
+    """Adam on D_k and delta_i; every count is a separate run with its own schedule."""
     start, batch = standing(update), update.batch
     rates = Motion(jnp.repeat(jnp.array([TRANSLATION_RATE, rotation_rate]), 3), jnp.array(delta_rate))
     each = median_ms(adam_step, start, ADAM.init(start), batch, rates)
@@ -106,12 +106,13 @@ def least_squares(motions, state, batch, block):
 
 
 def levenberg_marquardt(update: Update, counts: list[int]) -> Trace:
-    """On rendered residuals, coarse to fine, with a dense Jacobian by columns; rigid groups."""
+    """Levenberg-Marquardt on rendered residuals of rigid groups, coarse to fine, with a dense Jacobian by
+    columns."""
     batch = update.batch._replace(plan=replace(update.batch.plan, derivative="forward"))
     motions, found, ms = jaxlie.SE3.identity((len(batch.centers),)), [standing(update)], []
     state, last = None, None
     for block in BLOCKS[: max(counts)]:
-        if block != last:  # another problem from here on
+        if block != last:  # a new problem from here on
             state, last = rigid_step(block).init(motions), block
             timed(least_squares, motions, state, batch, block)  # compiles
         (motions, state), took = timed(least_squares, motions, state, batch, block)
@@ -125,7 +126,7 @@ lift = jitted(jax.vmap(unproject, in_axes=(None, 0, 0, 0)))
 
 
 def icp(update: Update, counts: list[int], reach: float = ICP_REACH) -> Trace:
-    """Iterative closest points: pixels that showed a group, against all measured points near it."""
+    """Iterative closest points: the pixels that showed a group against all measured points near it."""
     frame, centers = update.batch.frame, np.asarray(update.batch.centers, np.float64)
     grid = pixel_grid(frame.cameras.width, frame.cameras.height).reshape(-1, 2)
     depths = frame.depths.reshape(len(frame.depths), -1)
@@ -174,14 +175,14 @@ def aligned(start, points, centers, frame, config=ALIGN):
 
 @partial(jitted, static_argnames="config")
 def searched(start, points, centers, frame, config=ALIGN):
-    """The same, and then every group is looked for all around."""
+    """Alignment followed by a search for every group in all directions."""
     images, count = tone_images(frame, config.shading), len(centers)
     seen = (config, first_watch(jnp.ones(count)), jnp.ones(count, bool), jnp.int32(count))
     return search(start[None], points, centers, images, *seen).estimate.twists
 
 
 def direct(update: Update, counts: list[int], find: Callable = aligned) -> Trace:
-    """Direct alignment of pixels, half of the iterations wide and half narrow; 0 is standing still."""
+    """Direct alignment of pixels, half of the iterations wide and half narrow; 0 is no motion."""
     start, ms = standing(update), [0.0]
     given = (start.twists, update.points, update.batch.centers, update.batch.frame)
     motions = [start]

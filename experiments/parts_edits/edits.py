@@ -1,4 +1,4 @@
-"""Does each edit move what it should, leave the rest to the pixel, and how many frames a second are drawn?"""
+"""Does each edit move what it should and leave every other pixel unchanged, and at what frame rate?"""
 
 from dataclasses import replace
 from pathlib import Path
@@ -48,7 +48,8 @@ EDITS = {
 
 
 class Seen(NamedTuple):
-    """A film as a camera sees it: colours, depth and alpha of each frame, and where edited parts show."""
+    """A film from one camera: colours, depth and alpha of each frame, the pixels of edited parts, and the
+    rate."""
 
     colors: np.ndarray
     depths: np.ndarray
@@ -58,8 +59,8 @@ class Seen(NamedTuple):
 
 
 def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
-    """One edit of what was discovered in articulated_0, seen by the camera that shows most of the parts that
-    it names."""
+    """One edit of the parts discovered in articulated_0, rendered in the camera that shows most of the parts
+    that it names."""
     saved = open_parts_run(_discovered(folder))
     before_film, film, concerned, named = films(saved, options["edit"])
     camera = camera_of(saved, named)
@@ -67,9 +68,9 @@ def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
     with VideoWriter(folder / "before_after.mp4", 15.0) as video:
         for pair in zip(before.colors, after.colors, strict=True):
             video.write(np.concatenate(pair, axis=1))
-    moves = _as_asked(before, after, before_film, film, camera, concerned)
+    moves = _as_requested(before, after, before_film, film, camera, concerned)
     vacated = before.edited & ~after.edited
-    # Beside itself: what should be there is not known, so holes count, and ghosts cannot.
+    # Compared with itself: the true background is unknown, so holes count and ghosts cannot.
     clean = place_is_clean(after.colors, after.alphas, after.colors, vacated)
     beyond = beyond_captured(saved.layer, film[0].trajectory)
     touched, apart = before.edited | after.edited, np.abs(after.colors - before.colors).max(-1)
@@ -89,8 +90,8 @@ def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
 
 
 def films(saved: PartsRun, name: str) -> tuple[Film, Film, list[int], list[int]]:
-    """The film before an edit, the film after it, as long, which parts of the scene it concerns and changes
-    (isolating one freezes all others, but what stands still anyway stays as it is), and which it names."""
+    """The film before an edit, the film after it of the same length, the parts that it concerns and changes
+    (isolating one freezes all others, but static parts do not change), and the parts that it names."""
     edit = parse_op(EDITS[name].format(run=saved.path))
     trajectory = saved.layer.trajectory
     length = float(trajectory.times[-1] - trajectory.times[0] + trajectory.times[1] - trajectory.times[0])
@@ -109,7 +110,7 @@ def films(saved: PartsRun, name: str) -> tuple[Film, Film, list[int], list[int]]
 
 
 def camera_of(saved: PartsRun, parts: list[int]) -> Camera:
-    """The camera in which most pixels show these parts, when their motion is half over."""
+    """The camera in which most pixels show these parts halfway through their motion."""
     judged, layer = saved.recording.judged, saved.layer
     marks = jnp.isin(layer.scene.labels, jnp.array(parts)).astype(jnp.float32)[:, None]
     now = moment(layer.trajectory, len(layer.trajectory.times) // 2)
@@ -120,8 +121,8 @@ def camera_of(saved: PartsRun, parts: list[int]) -> Camera:
 
 
 def seen(film: Film, camera: Camera, concerned: list[int], saved: PartsRun) -> Seen:
-    """What a camera sees of a film. Pixels count as edited where parts that are concerned, or another layer,
-    have any share."""
+    """A film from one camera. Pixels count as edited where the concerned parts, or another layer, have any
+    share."""
     of = [layer.scene.weights[:, jnp.array(concerned, int)].max(-1, initial=0) > 0 for layer in film[:1]]
     of += [jnp.ones(layer.scene.gaussians.num, bool) for layer in film[1:]]
     marks = jnp.concatenate(of).astype(jnp.float32)[:, None]
@@ -143,31 +144,31 @@ def seen(film: Film, camera: Camera, concerned: list[int], saved: PartsRun) -> S
     return Seen(*map(np.stack, zip(*found, strict=True)), 1 / float(np.median(seconds)))
 
 
-def _as_asked(
+def _as_requested(
     before: Seen, after: Seen, before_film: Film, film: Film, camera: Camera, concerned: list[int]
 ) -> Finding:
-    """Whether parts of the scene that the edit moved are seen where it should have put them."""
-    asked = np.full((*before.edited.shape, 2), np.nan)
+    """Whether parts that the edit moved are seen where it should have put them."""
+    requested = np.full((*before.edited.shape, 2), np.nan)
     scene, viewmat, K = before_film[0].scene, np.asarray(camera.viewmat[0]), np.asarray(camera.K[0])
     labels = np.eye(scene.num_parts, dtype=np.float32)[np.asarray(scene.labels)]
-    for t in range(len(asked)):
+    for t in range(len(requested)):
         was, now = (moment(one[0].trajectory, t) for one in (before_film, film))
         plan = plan_render(gaussians := gaussians_at(scene, was), camera)
         shown = np.asarray(render(gaussians, camera, plan, features=jnp.asarray(labels)).features)[0]
         for part in concerned:
             if float(now.opacities[part]) < 1 or float(now.scales[part]) != 1:
-                continue  # what it should look like then is not told by where it was
+                continue  # its former place does not determine how it should look
             first, second = (_rigid(scene.centers[part], at, part) for at in (was, now))
             motion = second @ np.linalg.inv(first)
             if np.abs(motion - np.eye(4)).max() > 1e-6:
                 mine = shown[..., part] > 0.9
-                told = requested_displacement(before.depths[t], after.depths[t], mine, motion, viewmat, K)
-                asked[t] = np.where(np.isfinite(told), told, asked[t])
-    return requested_motion_is_seen(before.colors, after.colors, asked)
+                shift = requested_displacement(before.depths[t], after.depths[t], mine, motion, viewmat, K)
+                requested[t] = np.where(np.isfinite(shift), shift, requested[t])
+    return requested_motion_is_seen(before.colors, after.colors, requested)
 
 
 def _rigid(center: Any, at: Moment, part: int) -> np.ndarray:
-    """Of a part, from the canonical scene to a moment."""
+    """The motion of a part from the canonical scene to a moment."""
     rotations, offsets = rigid_motions(center[None], jax.tree.map(lambda a: a[part : part + 1], at.pose))
     motion = np.eye(4)
     motion[:3, :3], motion[:3, 3] = rotations[0], offsets[0]
@@ -178,13 +179,13 @@ def _discovered(folder: Path) -> Path:
     """A run of `gsjax parts`, made once for all edits."""
     path = folder.parent / "discovered"
     if not (path / "report.html").is_file():
-        told = Options(str(recorded("articulated_0")), path, eval_cameras=HELD_OUT, anchor=ANCHOR)
-        run_parts(replace(told, overwrite=True, scene=canonical_of(told, folder)))
+        options = Options(str(recorded("articulated_0")), path, eval_cameras=HELD_OUT, anchor=ANCHOR)
+        run_parts(replace(options, overwrite=True, scene=canonical_of(options, folder)))
     return path
 
 
 def figure(rows: list[dict[str, Any]], path: Path) -> None:
-    """What stays, what moves as asked, and how fast, a bar for each edit."""
+    """Share of unchanged pixels, share of requested motion seen, and frame rate: a bar for each edit."""
     from matplotlib.figure import Figure
 
     panels = (

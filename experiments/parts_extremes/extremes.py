@@ -1,4 +1,4 @@
-"""The discovery of parts where data and settings are at the edge of sense."""
+"""The discovery of parts with extreme data and settings."""
 
 import warnings
 from collections.abc import Callable
@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Int
 
 from experiments.shared.discoveries import FIT, Options, canonical_of
+from experiments.shared.recordings import labels_at
 from gsjax.data import Sequence, open_sequence
 from gsjax.engine.drive import drive
 from gsjax.io.ply import read_ply
@@ -24,7 +25,7 @@ from gsjax.methods.parts import (
     choose_anchor,
     moved_pixels,
 )
-from gsjax.metrics.tracking import relative_motion, true_labels
+from gsjax.metrics.tracking import relative_motion
 from gsjax.perception.segmenters import PieceSegmenter
 from gsjax.scene.gaussians import Gaussians, take
 
@@ -33,14 +34,14 @@ BLOCK, BOX = 1, 2  # labels
 
 
 class Case(NamedTuple):
-    """What a discovery is given.
+    """The input of a discovery.
 
     Attributes:
-        sequence: what cameras see.
-        gaussians: as in frame 0.
-        labels: the true ones of these.
-        config: how.
-        meter: how long a metre is.
+        sequence: the recording.
+        gaussians: the scene at frame 0.
+        labels: true labels of the Gaussians.
+        config: settings.
+        meter: length of a metre in units of the scene.
     """
 
     sequence: Sequence
@@ -51,7 +52,7 @@ class Case(NamedTuple):
 
 
 def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
-    """One discovery; an error in words is an outcome, any other is raised."""
+    """One discovery; a ValueError is an outcome, any other error is raised."""
     case = CASES[options["case"]](as_it_is(folder.parent / "canonical"))
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", UserWarning)
@@ -60,12 +61,12 @@ def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
         except ValueError as error:
             nothing = dict.fromkeys(("skipped", "parts", "block_mm", "box_mm", "update_s"))
             return nothing | {"finite": None, "said": f"error: {error}"}
-    told = dict.fromkeys(str(one.message) for one in caught if one.category is UserWarning)
-    return row | {"said": "; ".join(told)}
+    warned = dict.fromkeys(str(one.message) for one in caught if one.category is UserWarning)
+    return row | {"said": "; ".join(warned)}
 
 
 def discovered(case: Case) -> dict[str, Any]:
-    """As `gsjax parts` does it, from a scene that is there."""
+    """A discovery as in `gsjax parts`, from an existing scene."""
     sequence, config = case.sequence, case.config
     anchor = choose_anchor(sequence.image, sequence.num_frames, sequence.num_cameras, 0)
     moved = moved_pixels(sequence.image, anchor, sequence.num_cameras)
@@ -91,8 +92,7 @@ def discovered(case: Case) -> dict[str, Any]:
 
 
 def _error_mm(case: Case, result: PartsResult, label: int) -> float:
-    """How far half of the Gaussians of an object are from where they truly are, at most, in the mean over the
-    frames."""
+    """Median over the Gaussians of an object of their error, averaged over the frames, mm."""
     mine, truth = case.labels == label, case.sequence.truth
     frames = range(case.sequence.num_frames)
     means = np.stack([np.asarray(result.at(t).means)[mine] for t in frames])
@@ -103,20 +103,17 @@ def _error_mm(case: Case, result: PartsResult, label: int) -> float:
 
 
 def as_it_is(folder: Path) -> Case:
-    """The scene and its recording, without anything odd."""
+    """The scene and its recording, unchanged."""
     sequence = open_sequence(DATASET)
     fit = replace(FIT, steps=1500, cap=5_000, start=replace(FIT.start, count=3_000))
     gaussians, _ = read_ply(canonical_of(Options(DATASET, folder, anchor=0, fit=fit), folder) / "scene.ply")
-    seen = zip(
-        *((sequence.mask(0, c), sequence.depth(0, c)) for c in range(sequence.num_cameras)), strict=True
-    )
-    labels = true_labels(np.asarray(gaussians.means), *seen, list(sequence.viewmats[0]), list(sequence.Ks[0]))
+    labels = labels_at(sequence, np.asarray(gaussians.means))
     config = PartsConfig()
     return Case(sequence, gaussians, labels, replace(config, refine=replace(config.refine, iterations=60)))
 
 
 def seen_as(change: Callable[[np.ndarray, int, int], np.ndarray]) -> Callable[[Case], Case]:
-    """Other pictures: `change(picture, t, c)`."""
+    """A case with pictures replaced by `change(picture, t, c)`."""
 
     def changed(case: Case) -> Case:
         load = case.sequence.load_image
@@ -127,13 +124,13 @@ def seen_as(change: Callable[[np.ndarray, int, int], np.ndarray]) -> Callable[[C
     return changed
 
 
-def looked_at(**selected: Any) -> Callable[[Case], Case]:
-    """Other frames, or cameras."""
-    return lambda case: case._replace(sequence=case.sequence.select(**selected))
+def selected(**which: Any) -> Callable[[Case], Case]:
+    """A case with a selection of frames or cameras."""
+    return lambda case: case._replace(sequence=case.sequence.select(**which))
 
 
 def set_to(section: str, **values: Any) -> Callable[[Case], Case]:
-    """Other settings."""
+    """A case with other settings."""
 
     def changed(case: Case) -> Case:
         one = replace(getattr(case.config, section), **values)
@@ -143,7 +140,7 @@ def set_to(section: str, **values: Any) -> Callable[[Case], Case]:
 
 
 def larger(by: float) -> Callable[[Case], Case]:
-    """Everything, cameras too."""
+    """A case in which everything is scaled, cameras included."""
 
     def changed(case: Case) -> Case:
         sequence, truth = case.sequence, case.sequence.truth
@@ -169,7 +166,7 @@ def larger(by: float) -> Callable[[Case], Case]:
 
 
 def fewer_gaussians(count: int) -> Callable[[Case], Case]:
-    """Only some of the scene, most of what is labelled."""
+    """A case with a random subset of the Gaussians."""
 
     def changed(case: Case) -> Case:
         rows = np.sort(np.random.default_rng(0).permutation(case.gaussians.num)[:count])
@@ -179,7 +176,7 @@ def fewer_gaussians(count: int) -> Callable[[Case], Case]:
 
 
 def bad_depth(case: Case) -> Case:
-    """A third of the pixels is NaN, a third infinite."""
+    """Depth of which a third is NaN and a third infinite."""
     load = case.sequence.load_depth
 
     def broken(t: int, c: int) -> np.ndarray:
@@ -191,20 +188,20 @@ def bad_depth(case: Case) -> Case:
 
 
 def as_at_first(case: Case) -> Case:
-    """All pictures are those of frame 0."""
+    """A recording in which all pictures are those of frame 0."""
     load = case.sequence.load_image
     return case._replace(sequence=replace(case.sequence, load_image=lambda t, c: load(0, c)))
 
 
 def noise(picture: np.ndarray, t: int, c: int) -> np.ndarray:
-    """In one camera."""
+    """Random pixels in one camera."""
     return np.random.default_rng((t, c)).integers(0, 255, picture.shape, np.uint8) if c == 2 else picture
 
 
 CASES: dict[str, Callable[[Case], Case]] = {
     "as it is": lambda case: case,
-    "two cameras": looked_at(cameras=[2, 3]),
-    "every fifth frame": looked_at(frames=slice(0, None, 5)),
+    "two cameras": selected(cameras=[2, 3]),
+    "every fifth frame": selected(frames=slice(0, None, 5)),
     "twenty times larger": larger(20.0),
     "twenty times smaller": larger(0.05),
     "one camera black from frame 3 on": seen_as(lambda p, t, c: 0 * p if c == 2 and t >= 3 else p),
@@ -218,5 +215,5 @@ CASES: dict[str, Callable[[Case], Case]] = {
     "weights learned a thousand times as fast": set_to("stream", field_rate=1.0),
     "one slot for parts": set_to("discover", most_parts=1),
     "nothing moves": as_at_first,
-    "one camera": looked_at(cameras=[2]),
+    "one camera": selected(cameras=[2]),
 }

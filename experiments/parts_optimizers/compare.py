@@ -1,7 +1,7 @@
 """The handles' poses at one frame by different optimizers: error over time, on the same pictures.
 
-Parts are the true ones, and the update begins with their true poses at an earlier frame: what is compared is
-the optimizers alone.
+Parts are the true ones, and the update starts from their true poses at an earlier frame, so that only the
+optimizers differ.
 """
 
 from dataclasses import replace
@@ -15,7 +15,7 @@ import numpy as np
 import optimistix
 from jaxtyping import Array, Float
 
-from experiments.shared.discoveries import Options, canonical_of, pose_from, told_the_truth
+from experiments.shared.discoveries import Options, canonical_of, pose_from, start_from_truth
 from experiments.shared.recordings import recorded
 from experiments.shared.timing import jitted, median_ms, timed
 from gsjax.engine.recording import open_recording
@@ -39,24 +39,24 @@ from gsjax.scene.region import TILE
 from gsjax.scene.render import plan_render, render
 
 HELD_OUT, ANCHOR = (3, 8), 0
-FRAMES = (4, 16, 30)  # that updates begin at; 7, which is not among them, is what was tuned on
+FRAMES = (4, 16, 30)  # frames that updates start from; tuning used frame 7, which is not among them
 HALF, WHOLE = 2, 1
-MOVED_M = 0.002  # parts that move less between two frames are not judged
-NEAR = 1.5  # times the best error of all: what counts as arrived
+MOVED_M = 0.002  # parts that move less between two frames are not scored
+NEAR = 1.5  # an error of at most this times the best of all counts as arrived
 ADAM_COUNTS, COUNTS = (5, 10, 20, 40, 60, 120), (1, 2, 4, 6)
-# The background has columns of zeros, so of all best moves the least is taken.
+# The background has columns of zeros, so the least-norm solution is taken.
 GAUSS_NEWTON = optimistix.GaussNewton(1e-4, 1e-5, linear_solver=lineax.AutoLinearSolver(well_posed=False))
 
 
 class Update(NamedTuple):
-    """What a method is given, and what it is judged by.
+    """The input of a method, and the truth that it is scored against.
 
     Attributes:
         canonical: the scene; its handles are the true parts.
-        weights: of its movable Gaussians.
+        weights: weights of its movable Gaussians.
         start: the true pose at the earlier frame.
         end: the true pose at the later one.
-        frames: what the cameras see at the later one, by how many times smaller than it was.
+        frames: the later frame, by the factor by which its pictures are scaled down.
     """
 
     canonical: Canonical
@@ -66,22 +66,22 @@ class Update(NamedTuple):
     frames: dict[int, Frame]
 
     def errors(self, pose: HandlePose) -> dict[int, float]:
-        """Of each part that moves, the mean distance of its points from where they truly are, mm."""
+        """For each part that moves, the mean distance of its points from their true places, mm."""
         means, labels = np.asarray(self.canonical.movable.means), np.asarray(self.weights.argmax(-1))
         found, true, before = (self._placed(means, one) for one in (pose, self.end, self.start))
-        told = {}
+        errors = {}
         for part in np.unique(labels[labels != BACKGROUND]).tolist():
             of = labels == part
             if np.linalg.norm(true[part, of] - before[part, of], axis=-1).mean() > MOVED_M:
-                told[part] = 1000 * float(np.linalg.norm(found[part, of] - true[part, of], axis=-1).mean())
-        return told
+                errors[part] = 1000 * float(np.linalg.norm(found[part, of] - true[part, of], axis=-1).mean())
+        return errors
 
     def _placed(self, means: np.ndarray, pose: HandlePose) -> Float[np.ndarray, "P M 3"]:
         rotations, offsets = map(np.asarray, rigid_motions(self.canonical.centers, pose))
         return np.einsum("pij,mj->pmi", rotations, means) + offsets[:, None]
 
     def batch(self, size: int, cameras: tuple[int, ...], derivative: str) -> StreamBatch:
-        """For one iteration that looks through some of the cameras."""
+        """The batch of one iteration with some of the cameras."""
         frame = self.frames[size]
         at = self.canonical, self.weights, self.start
         seen = with_part_masks(frame, *at, TILE // size, blend=PartsConfig().stream.blend)
@@ -96,7 +96,7 @@ class Update(NamedTuple):
 
 
 class Trace(NamedTuple):
-    """What a method has found: after so many iterations, and milliseconds, these poses."""
+    """The result of a method: numbers of iterations, milliseconds until then, and the poses."""
 
     counts: tuple[int, ...]
     ms: list[float]
@@ -105,12 +105,12 @@ class Trace(NamedTuple):
 
 @cache
 def updates(gap: int, frames: tuple[int, ...] = FRAMES) -> list[Update]:
-    """Of articulated_0, from each of the frames to the one so many frames on."""
+    """Updates in articulated_0, from each of `frames` to the frame `gap` later."""
     dataset = recorded("articulated_0")
-    asked = Options(str(dataset), Path("unused"), eval_cameras=HELD_OUT, anchor=ANCHOR)
+    options = Options(str(dataset), Path("unused"), eval_cameras=HELD_OUT, anchor=ANCHOR)
     sequence = open_recording(str(dataset), (), HELD_OUT, ":").tracked
-    fitted = canonical_of(asked, FOLDER) / "scene.ply"
-    start, motions, _ = told_the_truth(
+    fitted = canonical_of(options, FOLDER) / "scene.ply"
+    start, motions, _ = start_from_truth(
         sequence, read_ply(fitted)[0], ANCHOR, replace(PartsConfig(), weights="table")
     )
     canonical, weights = start.canonical, skinning_weights(start.field, start.canonical)
@@ -128,7 +128,7 @@ FOLDER = Path("runs/experiments/parts_optimizers/canonical")
 
 
 def adam(update: Update, coarse: float | None = None) -> Trace:
-    """As the stream has it, without the past; the field stands still."""
+    """Adam as in the stream, without the past and with a fixed field."""
     config = replace(PartsConfig().stream, past=0, field_rate=0.0)
     config = config if coarse is None else replace(config, coarse=coarse)
     step = stream_step(config)
@@ -158,7 +158,8 @@ def adam(update: Update, coarse: float | None = None) -> Trace:
 def least_squares(
     update: Update, solver, block: int = 4, softness: float = 0.1, most: int | None = None
 ) -> Trace:
-    """Of all cameras at once, or of so many that take turns; the last iterations at the whole size."""
+    """Least squares on all cameras at once, or on groups of `most` in turn; the last iterations at full
+    size."""
 
     def residual(motions, batch, *, step, key):
         config = PartsConfig().stream
@@ -176,7 +177,7 @@ def least_squares(
     motions, poses, ms = motions_of(update.start), [], []
     for size, count in ((HALF, COUNTS[-2]), (WHOLE, COUNTS[-1] - COUNTS[-2])):
         batches = [update.batch(size, tuple(sorted(group)), "forward") for group in groups.tolist()]
-        state = step.init(motions)  # another problem from here on
+        state = step.init(motions)  # a new problem from here on
         timed(advance, motions, state, batches[0])  # compiles
         for i in range(count):
             (motions, state, _), took = timed(advance, motions, state, batches[i % len(batches)])
@@ -196,13 +197,13 @@ METHODS = {
 
 @jitted
 def draw(batch: StreamBatch, pose: HandlePose):
-    """The reference for times: the scene in all cameras at half the size."""
+    """The reference for times: the scene rendered in all cameras at half the size."""
     return render(posed(batch.canonical, batch.weights, pose), batch.now.cameras, batch.plan).colors
 
 
 @cache
 def traces(gap: int) -> dict[str, dict[str, Any]]:
-    """All methods, for each is compared with the best; means over the updates."""
+    """All methods, since each is compared with the best; means over the updates."""
     given, found, draws = updates(gap), {}, []
     for name, method in METHODS.items():
         runs = [method(update) for update in given]
@@ -223,7 +224,7 @@ def traces(gap: int) -> dict[str, dict[str, Any]]:
 
 
 def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
-    """One method over one gap. All of that gap run with the first one."""
+    """One method over one gap. All methods of a gap run together the first time."""
     found = traces(options["gap"])
     mine = found[options["method"]]
     there = np.flatnonzero(mine["mm"] <= NEAR * min(trace["mm"].min() for trace in found.values()))

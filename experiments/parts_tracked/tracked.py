@@ -1,4 +1,5 @@
-"""Do parts that are tracked in pictures and lifted stay parts? All methods begin with the same true masks."""
+"""Do parts that are tracked in pictures and lifted hold together? All methods start from the same true
+masks."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -14,8 +15,9 @@ from jaxtyping import Bool, Float, Int
 from scipy.ndimage import map_coordinates
 from trimesh.registration import procrustes
 
-from experiments.shared.discoveries import Options, canonical_of, pose_from, told_the_truth
+from experiments.shared.discoveries import Options, canonical_of, pose_from, start_from_truth
 from experiments.shared.recordings import recorded
+from experiments.shared.timing import jitted
 from gsjax.data import Sequence
 from gsjax.engine.drive import drive
 from gsjax.engine.recording import open_recording
@@ -25,27 +27,27 @@ from gsjax.io.ply import read_ply
 from gsjax.methods.parts import Parts, PartsConfig, Start
 from gsjax.methods.parts.discovery import close_frame, weights_of_run
 from gsjax.methods.parts.stream import posed, skinning_weights
-from gsjax.optim.compiler import host_options
 from gsjax.perception.optical_flow import DisFlow
 from gsjax.perception.propagation import FlowPropagator
+from gsjax.rasterize.plan import with_room
 from gsjax.scene.handles import HandlePose, rigid_motions
 from gsjax.scene.render import plan_render, render, render_with_room
 
 HELD_OUT, ANCHOR = (3, 8), 0
 AFTER = (5, 15, 39)
-TRIMMED = 3.0  # points so many times as far off as half of them are taken for lost
-LEAST_POINTS = 6  # of a part that is to be placed
-NEAR_M = 0.02  # behind what is seen, a Gaussian is not seen
+TRIMMED = 3.0  # points off by more than this many medians are taken as lost
+LEAST_POINTS = 6  # needed to place a part
+NEAR_M = 0.02  # a Gaussian this far behind the visible surface is occluded
 
 
 class Problem(NamedTuple):
-    """What methods are given, and what they are judged by.
+    """The input of the methods, and the truth that they are scored against.
 
     Attributes:
-        sequence: the recording, looked through.
-        start: a discovery that knows the true masks.
-        motions: the true ones, of each handle.
-        labels: the true masks by handle, [T,C,H,W].
+        sequence: the recording's training cameras.
+        start: a discovery that starts from the true masks.
+        motions: true motions of the handles.
+        labels: true masks by handle, [T,C,H,W].
     """
 
     sequence: Sequence
@@ -55,7 +57,7 @@ class Problem(NamedTuple):
 
 
 class Tracked(NamedTuple):
-    """What a method finds: masks by handle, and the motion of each handle, where it has any."""
+    """The result of a method: masks by handle, and the motions of the handles, if it has any."""
 
     labels: Int[np.ndarray, "T C H W"]
     motions: Float[np.ndarray, "T P 4 4"] | None
@@ -66,15 +68,15 @@ def problem(folder: Path) -> Problem:
     """articulated_0, from the anchor on."""
     dataset = str(recorded("articulated_0"))
     sequence = open_recording(dataset, (), HELD_OUT, ":").tracked
-    asked = Options(dataset, folder, eval_cameras=HELD_OUT, anchor=ANCHOR)
-    gaussians, _ = read_ply(canonical_of(asked, folder) / "scene.ply")
-    start, motions, slots = told_the_truth(sequence, gaussians, ANCHOR, PartsConfig())
+    options = Options(dataset, folder, eval_cameras=HELD_OUT, anchor=ANCHOR)
+    gaussians, _ = read_ply(canonical_of(options, folder) / "scene.ply")
+    start, motions, slots = start_from_truth(sequence, gaussians, ANCHOR, PartsConfig())
     every = [[sequence.mask(t, c) for c in range(sequence.num_cameras)] for t in range(sequence.num_frames)]
     return Problem(sequence, start, motions, slots[np.maximum(every, 0)])
 
 
 def masks_tracked(given: Problem) -> Tracked:
-    """In each video on its own, from frame to frame."""
+    """Masks tracked in each video separately, from frame to frame."""
     sequence, found = given.sequence, []
     for c in range(sequence.num_cameras):
         video = np.stack([sequence.image(t, c) for t in range(sequence.num_frames)])
@@ -83,7 +85,7 @@ def masks_tracked(given: Problem) -> Tracked:
 
 
 def points_lifted(given: Problem) -> Tracked:
-    """Each part goes where the tracks of its Gaussians meet in space, which videos that see them have."""
+    """Parts moved to where the 2D tracks of their Gaussians meet in space."""
     sequence, canonical = given.sequence, given.start.canonical
     means = np.asarray(canonical.movable.means, np.float64)
     parts = np.asarray(skinning_weights(given.start.field, canonical)).argmax(-1)
@@ -99,7 +101,7 @@ def points_lifted(given: Problem) -> Tracked:
 
 
 def followed(given: Problem) -> Tracked:
-    """As `gsjax parts` does, but for the masks; the parts stay those that masks tell of."""
+    """As in `gsjax parts`, except that the parts stay those of the true masks."""
     usual = PartsConfig()
     unify, refine = replace(usual.unify, every=0), replace(usual.refine, iterations=0)
     config = replace(usual, unify=unify, refine=refine)
@@ -119,7 +121,8 @@ def followed(given: Problem) -> Tracked:
 def _tracks(
     given: Problem, c: int, means: Float[np.ndarray, "n 3"], parts: Int[np.ndarray, "n"]
 ) -> Float[np.ndarray, "T n 2"]:
-    """Where one camera sees points in each frame, by flow from frame to frame; NaN from where one is lost."""
+    """Pixels of points in one camera over all frames, by flow from frame to frame; NaN once a point is
+    lost."""
     sequence, canonical = given.sequence, given.start.canonical
     camera = sequence.frame(ANCHOR).cameras
     one = jax.tree.map(lambda a: a[c : c + 1], camera)
@@ -145,7 +148,7 @@ def _tracks(
 
 
 def _met(places: list[Float[np.ndarray, "n 2"]], sequence: Sequence, t: int) -> Float[np.ndarray, "n 3"]:
-    """Where rays of two or more cameras come nearest to each other, in the mean of squares; NaN without."""
+    """Least-squares intersections of the rays of two or more cameras; NaN with fewer."""
     lhs, rhs, count = np.zeros((len(places[0]), 3, 3)), np.zeros((len(places[0]), 3)), 0
     for c, uv in enumerate(places):
         viewmat, K = sequence.viewmats[t, c], sequence.Ks[t, c]
@@ -161,7 +164,7 @@ def _met(places: list[Float[np.ndarray, "n 2"]], sequence: Sequence, t: int) -> 
 
 
 def _fitted(means: Float[np.ndarray, "n 3"], points: Float[np.ndarray, "n 3"]) -> np.ndarray | None:
-    """The rigid motion from one to the other, without points that were lost; None where too few are left."""
+    """The rigid motion from `means` to `points`, without lost points; None where too few are left."""
     kept = np.ones(len(means), bool)
     for _ in range(4):
         if kept.sum() < LEAST_POINTS:
@@ -175,24 +178,23 @@ def _fitted(means: Float[np.ndarray, "n 3"], points: Float[np.ndarray, "n 3"]) -
 def _masks(
     given: Problem, motions: Float[np.ndarray, "T P 4 4"], weights: Any = None
 ) -> Int[np.ndarray, "T C H W"]:
-    """What is seen of each part in all frames, if handles move like that."""
+    """Masks of the parts in all frames for the given motions of the handles."""
     canonical, sequence = given.start.canonical, given.sequence
     weights = skinning_weights(given.start.field, canonical) if weights is None else weights
     shares = jnp.concatenate([weights, jax.nn.one_hot(jnp.zeros(canonical.fixed.num, int), weights.shape[1])])
     centers, plan, found = np.asarray(canonical.centers), None, []
-    draw = jax.jit(
-        lambda gaussians, cameras, plan: render(gaussians, cameras, plan, features=shares),
-        compiler_options=host_options(),
-    )
+
+    @jitted
+    def draw(gaussians, cameras, plan):
+        drawn = render(gaussians, cameras, plan, features=shares)
+        return drawn.features, drawn.meta
+
     for t, motion in enumerate(motions):
         gaussians = posed(canonical, weights, pose_from(motion, centers))
         cameras = sequence.frame(t).cameras
         plan = plan or plan_render(gaussians, cameras, headroom=2.0)
-        drawn = draw(gaussians, cameras, plan)
-        if bool(drawn.meta.overflow.any()):
-            plan = plan.grown(int(drawn.meta.needed.max()), 2.0)
-            drawn = draw(gaussians, cameras, plan)
-        found.append(np.asarray(drawn.features.argmax(-1)))
+        drawn, plan = with_room(partial(draw, gaussians, cameras), plan, 2.0)
+        found.append(np.asarray(drawn.argmax(-1)))
     return np.stack(found)
 
 
@@ -233,14 +235,14 @@ def _iou(found: Bool[np.ndarray, "C H W"], true: Bool[np.ndarray, "C H W"]) -> f
 def _point_error(
     means: Float[np.ndarray, "n 3"], found: Float[np.ndarray, "T 4 4"], true: Float[np.ndarray, "T 4 4"]
 ) -> float:
-    """Of half the points of a part, at most, in the mean over time, mm."""
+    """Median over the points of a part of their error, averaged over time, mm."""
     gap = found - true
     off = np.einsum("tij,nj->tni", gap[:, :3, :3], means) + gap[:, None, :3, 3]
     return 1000 * float(np.median(np.linalg.norm(off, axis=-1).mean(0)))
 
 
 def figure(rows: list[dict[str, Any]], path: Path) -> None:
-    """Overlap over time."""
+    """Overlap with the true masks over time."""
     from matplotlib.figure import Figure
 
     drawing = Figure(figsize=(7, 4), dpi=110, layout="constrained")

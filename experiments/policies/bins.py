@@ -16,14 +16,18 @@ STEP = 0.015  # how far the commanded position moves in a period at most, metres
 REACH = 0.05  # how far the commanded position may be from the tool along each axis, metres
 SPACE = np.array([[-0.15, -0.55, 0.855], [0.35, 0.6, 1.2]])  # where it may be, metres
 HORIZON = 160  # periods of a rollout
-ABOVE, CARRY, LOW = 0.10, 1.08, 0.9  # over the can at first; of the tool when it carries and lets go; metres
+ABOVE, CARRY, LOW = (
+    0.10,
+    1.08,
+    0.9,
+)  # start above the can; height of the tool when carrying, releasing; metres
 LIFTED = 0.91  # height of a can that stands 5 cm over the floor of its bin, metres
-NOISE = 0.004  # of demonstrated motions, metres: what follows shows how to make up for it
+NOISE = 0.004  # of demonstrated motions, metres: later actions show how to correct it
 
 
 @dataclass(frozen=True)
 class Proprioception:
-    """What the arm knows of itself: where it was told to be, where it is, and how far it is open, metres."""
+    """The arm's proprioception: commanded position, position of the tool, and opening of the hand, metres."""
 
     command: np.ndarray
     tool: np.ndarray
@@ -54,7 +58,7 @@ class Bins:
         self.home[:3, 3] = 0.0, -0.1, 1.1
 
     def begin(self, seed: int) -> None:
-        """The can somewhere in its bin, as robosuite draws it; the arm at its beginning."""
+        """Place the can in its bin at random, as robosuite does, and the arm at its start."""
         rng = np.random.default_rng(seed)
         mujoco.mj_resetData(self.model, self.data)
         self.data.qpos[:] = self.clean
@@ -67,7 +71,7 @@ class Bins:
             self.move(np.array([0.0, 0.0, 0.0, -1.0]))
 
     def move(self, action: np.ndarray, guarded: bool = False) -> None:
-        """One control period; a policy's command is kept near the tool and in the bins, lest it runs away."""
+        """One control period; with `guarded` the command is kept near the tool and within the bins."""
         self.command = self.command + STEP * np.clip(action[:3], -1, 1)
         if guarded:
             tool = self.arm.pose()[:3, 3]
@@ -90,13 +94,13 @@ class Bins:
 
 
 class Script:
-    """Demonstrates: over the can, down, close, up, over the goal, down, open, up."""
+    """A scripted demonstration: over the can, down, close, up, over the goal, down, open, up."""
 
     def __init__(self, world: Bins):
         self.world, self.phase, self.count = world, 0, 0
 
     def __call__(self) -> np.ndarray:
-        """The next action; it looks at the can's true place until the can is grasped."""
+        """The next action; it uses the can's true position until the can is grasped."""
         can, at = self.world.can()[:3, 3], self.world.command
         if self.phase < 2:
             self.aim = can.copy()

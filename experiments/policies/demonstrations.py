@@ -1,7 +1,7 @@
 """Records demonstrations into runs/policies: `MUJOCO_GL=egl python -m experiments.policies.demonstrations`.
 
-Only those that succeed are kept. Each file holds what any of the policies may see, so that all learn from the
-same: images, the can's true poses, what the tracker makes of the depth images, proprioception and actions.
+Only successful ones are kept. Each file holds the observations of all policies, so that all learn from the
+same data: images, the can's true poses, its tracked poses, proprioception and actions.
 """
 
 import sys
@@ -19,7 +19,7 @@ AFTER = 6  # periods recorded after success
 
 
 def demonstrate(world: Bins, seed: int, look: bool = True) -> dict[str, np.ndarray] | None:
-    """One demonstration, or None if the can did not end where it should; without looking it is empty."""
+    """One demonstration, or None if it fails; without `look` it holds no observations."""
     world.begin(seed)
     rng, script, tracking = np.random.default_rng(seed), Script(world), Tracking(world)
     steps, done = [], 0
@@ -38,7 +38,7 @@ def demonstrate(world: Bins, seed: int, look: bool = True) -> dict[str, np.ndarr
 
 
 def record(count: int) -> None:
-    """Demonstrations until there are `count` good ones; those on disk count."""
+    """Record demonstrations until `count` have succeeded; those on disk count."""
     HOME.mkdir(parents=True, exist_ok=True)
     world, good, tried = Bins(), 0, 0
     while good < count:

@@ -1,4 +1,4 @@
-"""Behaviour cloning: what the policies see, what they are, and how all of them are trained."""
+"""Behaviour cloning: the inputs of the policies, their networks, and their training."""
 
 from functools import cache
 from pathlib import Path
@@ -14,9 +14,9 @@ from jaxtyping import Array, Float, Key
 from experiments.policies.sight import described
 
 Seen = Literal["tracked Gaussians", "images", "true poses"]
-CHUNK = 4  # actions predicted at a time, and carried out before the next look
+CHUNK = 4  # actions predicted at a time, and carried out before the next observation
 UPDATES, BATCH, RATE = 4000, 32, 1e-3
-SHIFT = 3  # pixels by which training images are shifted at most
+SHIFT = 3  # largest shift of training images, pixels
 
 
 class Keypoints(eqx.Module):
@@ -67,13 +67,13 @@ class Policy(eqx.Module):
 
 
 def vector_of(seen: Seen, felt: np.ndarray, pose: np.ndarray, first: np.ndarray) -> np.ndarray:
-    """What a policy reads beside images; those that see images are told of no pose."""
+    """A policy's input beside images; policies that see images get no pose."""
     return felt if seen == "images" else np.concatenate([felt, described(pose, first, felt)])
 
 
 @cache
 def demonstrations(folder: Path, seen: Seen) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """All moments of all demonstrations: vectors [N, D], images [N, C, h, w, 3], next actions [N, CHUNK, 4].
+    """All steps of all demonstrations: vectors [N, D], images [N, C, h, w, 3], next actions [N, CHUNK, 4].
 
     Raises:
         FileNotFoundError: none are there.
@@ -100,7 +100,7 @@ def _loss(policy: Policy, vectors: Array, images: Array, chunks: Array) -> Array
 
 @cache
 def trained(folder: Path, seen: Seen, seed: int) -> Policy:
-    """A policy after `UPDATES` of AdamW on batches of `BATCH` moments, with the L1 loss."""
+    """A policy after `UPDATES` of AdamW on batches of `BATCH` steps, with the L1 loss."""
     vectors, images, chunks = demonstrations(folder, seen)
     cameras = images.shape[1] if seen == "images" else 0
     policy = Policy(vectors, cameras, jax.random.key(seed))

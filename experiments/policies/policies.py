@@ -1,4 +1,4 @@
-"""Behaviour cloning on what the tracker says of an object, beside images and the truth."""
+"""Behaviour cloning on the tracked pose of an object, on images, and on the true pose."""
 
 import json
 from functools import cache
@@ -28,7 +28,7 @@ def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
     while periods < HORIZON and not bins.success():
         periods += 1
         pose, images = bins.can(), np.zeros((0, 1, 1, 3), np.float32)
-        if seen == "tracked Gaussians":  # in every period, or what it follows jumps
+        if seen == "tracked Gaussians":  # in every period, so that motions between frames stay small
             pose = tracking.see(*bins.cameras.images(bins.data))
             offset = np.linalg.inv(start) @ (first if first is not None else pose)
             errors.append(1e3 * float(np.linalg.norm((bins.can() @ offset - pose)[:3, 3])))
@@ -52,7 +52,7 @@ def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
 
 
 def figure(rows: list[dict[str, Any]], path: Path) -> None:
-    """How often each policy succeeds."""
+    """Success rates of the policies."""
     from experiments.shared.plots import draw_policies
 
     draw_policies(rows, path)

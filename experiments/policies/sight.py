@@ -1,4 +1,4 @@
-"""What policies are shown of the can: by the tracker, in truth, or only images."""
+"""Observations of the can for policies: the tracked pose, the true pose, or images."""
 
 from dataclasses import replace
 
@@ -12,13 +12,13 @@ from gsjax.methods.track import PRESETS
 from gsjax.scene.frame import Frame
 
 FAST = PRESETS["fast"]
-CONFIG = replace(FAST, grow=replace(FAST.grow, slots=0))  # a pose is of Gaussians that stay the same
+CONFIG = replace(FAST, grow=replace(FAST.grow, slots=0))  # a pose needs a fixed set of Gaussians
 OWN, BACKGROUND = 256, 4096  # Gaussians of the can and of everything else
-SMALL = (80, 60)  # width and height of what the image policy sees
+SMALL = (80, 60)  # width and height of the image policy's input
 
 
 class Tracking:
-    """The can as the tracker follows it from the mask of the first frame, which is the simulator's."""
+    """The can tracked from the simulator's mask of the first frame."""
 
     def __init__(self, world: Bins):
         self.world, self.box, self.frames = world, [], None
@@ -47,13 +47,13 @@ class Tracking:
 
 
 def small(colors: np.ndarray) -> np.ndarray:
-    """Images of 8 bits [C, h, w, 3] as the image policy sees them."""
+    """Images of 8 bits [C, h, w, 3], scaled down to the image policy's input."""
     return np.stack([cv2.resize(image, SMALL, interpolation=cv2.INTER_AREA) for image in colors])
 
 
 def described(pose: np.ndarray, first: np.ndarray, felt: np.ndarray) -> np.ndarray:
-    """An object's pose as a policy reads it: centre, way from the tool, and turn since the first frame (its
-    first two columns, Zhou et al., On the continuity of rotation representations, CVPR 2019)."""
+    """An object's pose as a policy's input: centre, offset from the tool, and rotation since the first frame
+    (its first two columns, Zhou et al., On the continuity of rotation representations, CVPR 2019)."""
     center = pose[:3, 3]
     turn = pose[:3, :3] @ first[:3, :3].T
     return np.concatenate([center, center - felt[3:6], turn[:, 0], turn[:, 1]]).astype(np.float32)

@@ -2,14 +2,14 @@
 
 One module for each kind of experiment, and some for all:
 
-    commands.py    commands of gsjax, each in a process of its own
-    recordings.py  recordings by their names, and the tracker on them
+    commands.py    commands of gsjax, each in its own process
+    recordings.py  recordings by name, and the tracker on them
     fields.py      feature fields: scenes, teachers, scores
     discoveries.py parts: scenes and scores
     deforming.py   deforming scenes: frames, fits, scores
-    deform_regions.py, deform_truth.py  what is true of simulated tissue
+    deform_regions.py, deform_truth.py  ground truth of simulated tissue
     one_update.py  one update of the tracker
     panda.py       a robot arm and its cameras
-    timing.py      how long a function takes
+    timing.py      run times of functions and loops
     plots.py       figures
 """

@@ -1,4 +1,4 @@
-"""Commands of gsjax as a user runs them: each in a process of its own."""
+"""Commands of gsjax as a user runs them: each in its own process."""
 
 import os
 import subprocess
@@ -24,14 +24,14 @@ def ended(*words: object) -> Ran:
     """`gsjax WORDS...`, whatever its exit code.
 
     Args:
-        words: the command's name, then its arguments, each of which is put as text.
+        words: the command's name, then its arguments, each of which is converted to text.
     """
     command = [sys.executable, "-m", "gsjax.cli", *map(str, words)]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
     try:
         assert process.stdout is not None
         output = process.stdout.read()
-        _, status, usage = os.wait4(process.pid, 0)  # tells the memory of this process alone
+        _, status, usage = os.wait4(process.pid, 0)  # reports the memory of this process alone
         process.returncode = os.waitstatus_to_exitcode(status)
     except BaseException:
         process.kill()

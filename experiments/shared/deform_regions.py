@@ -1,6 +1,6 @@
 """Meanings on simulated tissue: regions that deform with it, and a teacher that errs.
 
-It stands in for a foundation model: what a pixel shows is taken from the simulation's truth, and then made
+It stands in for a foundation model: labels of pixels are taken from the simulation's truth, and then made
 wrong in a known share of blocks.
 """
 
@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Int
 from scipy.spatial import cKDTree
 
-from experiments.shared.deforming import Dataset, Reconstructed, seen_as
+from experiments.shared.deforming import Dataset, Reconstructed, lifted, seen_as
 from gsjax.engine.deform.scores import classes_of_pixels
 from gsjax.metrics.features import feature_psnr
 from gsjax.metrics.segmentation import LabelOverlap
@@ -23,24 +23,21 @@ BLOCK_PX = 16
 
 
 def region_map(data: Dataset, t: int) -> Int[np.ndarray, "h w"]:
-    """What the left eye sees: 0 the background, 1 to 5 regions of the tissue by where on it they lie (the
-    nearest of five places on its own map, uv), -1 the tool."""
+    """Labels of the left eye's pixels: 0 the background, 1 to 5 regions of the tissue (the nearest of five
+    places on its uv map), -1 the tool."""
     frame = data.frame(t)
     seen, viewmat, K = frame.depths[0], frame.cameras.viewmat[0], frame.cameras.K[0]
     height, width = seen.shape
     high, wide = data.truth["seg"][t].shape
     seg = data.truth["seg"][t][np.ix_(np.arange(height) * high // height, np.arange(width) * wide // width)]
-    y, x = np.nonzero((seg == 1) & (seen > 0))
-    depth = seen[y, x].astype(np.float64)
-    rays = np.stack([x + 0.5, y + 0.5, np.ones(len(x))], axis=1) @ np.linalg.inv(K).T
-    camera_to_world = np.linalg.inv(viewmat)
-    points = (rays * depth[:, None]) @ camera_to_world[:3, :3].T + camera_to_world[:3, 3]
+    tissue = (seg == 1) & (seen > 0)
+    points = lifted(seen, tissue, viewmat, K)
     apart, which = cKDTree(data.truth["verts"][t]).query(points, k=_NEAREST)
     weights = 1 / np.maximum(apart, 1e-9) ** 2
     uv = (data.truth["uv"][which] * weights[..., None]).sum(axis=1) / weights.sum(axis=1, keepdims=True)
     regions = np.full((height, width), -1, np.int32)
     regions[seg == 0] = BACKGROUND
-    regions[y, x] = 1 + np.linalg.norm(uv[:, None] - _SEEDS_UV, axis=-1).argmin(axis=1)
+    regions[tissue] = 1 + np.linalg.norm(uv[:, None] - _SEEDS_UV, axis=-1).argmin(axis=1)
     return regions
 
 
@@ -51,8 +48,8 @@ def with_errors(
     block: int = BLOCK_PX,
     classes: int = CLASSES,
 ) -> Int[np.ndarray, "h w"]:
-    """Regions with the label of a share of blocks replaced by another one, as a segmenter that errs does: in
-    whole patches, and in each frame in others."""
+    """Regions with the labels of a share of blocks replaced, like a segmenter's errors: in whole patches that
+    differ from frame to frame."""
     height, width = regions.shape
     rows, columns = -(-height // block), -(-width // block)
     wrong = rng.random((rows, columns)) < share
@@ -62,8 +59,8 @@ def with_errors(
 
 
 def meanings(found: Reconstructed, data: Dataset, codes: np.ndarray) -> dict[str, float]:
-    """Of held-out frames: f-PSNR against what the teacher would say without errors, IoU of classes (a mean
-    over classes, pooled over frames), how it varies from frame to frame, and the share of right pixels."""
+    """Scores of the held-out frames: PSNR of features against the teacher's without errors, IoU of classes (a
+    mean over classes, pooled over frames), its spread over frames, and the share of right pixels."""
     overlap, each, psnrs, right = LabelOverlap(), [], [], []
     for t in data.test:
         true = region_map(data, t)

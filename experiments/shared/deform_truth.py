@@ -1,5 +1,5 @@
-"""What is true of simulated tissue in answer to ten types of question: from the simulation's labels, depth,
-tracks and poses, by code of its own, which shares nothing with what answers them."""
+"""True answers to ten types of question about simulated tissue, from the simulation's labels, depth, tracks
+and poses. Independent code: it shares nothing with the answerer under test."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 
 import gsjax
 from experiments.shared.deform_regions import REGIONS, region_map
-from experiments.shared.deforming import TOOL, Dataset
+from experiments.shared.deforming import TOOL, Dataset, lifted, pixels_in, split
 from gsjax.methods.deform import Question
 from gsjax.scene.frame import Frame
 
@@ -25,7 +25,7 @@ _EDGE_M, _OFF_VERTICES_M = 3e-3, 5e-3
 
 
 def built_in(seed: int) -> Dataset:
-    """Built-in tissue, with truth as tissue_0 has it."""
+    """The built-in tissue, with its truth in the format of tissue_0."""
     sequence = gsjax.open_sequence(f"simulated:tissue?seed={seed}&width=160&height=128&frames=40")
     truth = sequence.truth
     assert truth is not None
@@ -34,14 +34,13 @@ def built_in(seed: int) -> Dataset:
     grid = np.linspace(0, 1, round(np.sqrt(truth.tracks.shape[1])))
     uv = np.stack(np.meshgrid(grid, grid, indexing="ij"), axis=-1).reshape(-1, 2)
     seg = np.stack([1 + (sequence.mask(t, 0) == TOOL) for t in range(sequence.num_frames)])
-    told = {"verts": truth.tracks, "uv": uv, "seg": seg, "T_w_tool": truth.poses[:, 0]}
-    test = [t for t in range(sequence.num_frames) if (t - 1) % 8 == 0]
-    return Dataset(sequence, [t for t in range(sequence.num_frames) if t not in test], test, told)
+    arrays = {"verts": truth.tracks, "uv": uv, "seg": seg, "T_w_tool": truth.poses[:, 0]}
+    return Dataset(sequence, *split(sequence.num_frames), arrays)
 
 
 @dataclass(frozen=True, eq=False)
 class Truth:
-    """Of a simulated recording, as the left eye sees it."""
+    """Ground truth of a simulated recording, in views of the left eye."""
 
     data: Dataset
 
@@ -51,7 +50,7 @@ class Truth:
 
     @cached_property
     def frames(self) -> list[Frame]:
-        """What the left eye saw, tools too."""
+        """Frames of the left eye, tools included."""
         return [self.data.frame(t, tools=True) for t in range(self.count)]
 
     def pose(self, t: int) -> tuple[Float[np.ndarray, "4 4"], Float[np.ndarray, "3 3"]]:
@@ -72,19 +71,18 @@ class Truth:
 
     @cached_property
     def pieces(self) -> list[list[Int[np.ndarray, "h w"]]]:
-        """Of each frame and class: the numbers of pixels' pieces, 0 elsewhere; small ones are none."""
+        """Connected pieces of each frame and class: their numbers in a label image, 0 elsewhere; small pieces
+        are left out."""
         return [[_pieces(labels == k) for k in range(len(NAMES))] for labels in self.labels]
 
     def points(self, t: int, k: int) -> Float[np.ndarray, "n 3"]:
-        """What frame `t` shows of a class, world."""
-        (viewmat, K), depth = self.pose(t), self.depths[t]
-        rows, columns = np.nonzero((self.pieces[t][k] > 0) & (depth > 0))
-        rays = np.stack([columns + 0.5, rows + 0.5, np.ones(len(rows))], 1) @ np.linalg.inv(K).T
-        return (rays * depth[rows, columns, None] - viewmat[:3, 3]) @ viewmat[:3, :3]
+        """World points of a class that frame `t` shows."""
+        depth = self.depths[t]
+        return lifted(depth, (self.pieces[t][k] > 0) & (depth > 0), *self.pose(t))
 
     def surface(self, t: int, k: int) -> Float[np.ndarray, "n 3"]:
-        """`points` without those whose label and depth are of two surfaces, as on an edge: tissue is near its
-        vertices, and a tool no deeper than it is beside."""
+        """`points` without those whose label and depth belong to two surfaces, as on an edge: tissue is near
+        its vertices, and a tool is no deeper than in adjacent pixels."""
         found = self.points(t, k)
         if k not in (0, THE_TOOL):
             return found[cKDTree(self.data.truth["verts"][t]).query(found)[0] < _OFF_VERTICES_M]
@@ -99,7 +97,7 @@ class Truth:
 
     @cache  # noqa: B019
     def gap(self, t: int, i: int, j: int) -> float:
-        """Millimetres between what a frame shows of two classes; NaN where one is not in view."""
+        """Millimetres between the visible points of two classes in a frame; NaN where one is not in view."""
         trees = [tree for k in (i, j) if (tree := self._tree(t, k)) is not None]
         if len(trees) < 2:
             return np.nan
@@ -107,26 +105,23 @@ class Truth:
         return 1e3 * float(many.query(few.data)[0].min())
 
     def way(self, k: int, f: int, g: int) -> Float[np.ndarray, "n 3"] | None:
-        """Millimetres by which what frame `f` shows of a class is elsewhere in frame `g`; None of nothing."""
+        """Displacements in millimetres, from frame `f` to frame `g`, of a class's points visible in `f`; None
+        without any."""
         if k in (0, THE_TOOL):  # stand still, or turn as a whole
             start = self.points(f, k)
             pose = self.data.truth["T_w_tool"]
             turn = pose[g] @ np.linalg.inv(pose[f]) if k == THE_TOOL else np.eye(4)
             end = start @ turn[:3, :3].T + turn[:3, 3]
         else:
-            (viewmat, K), verts = self.pose(f), self.data.truth["verts"]
-            local = verts[f] @ viewmat[:3, :3].T + viewmat[:3, 3]
-            x, y = ((local @ K.T)[:, :2] / local[:, 2:]).T
-            height, width = self.depths[f].shape
-            inside = (x >= 0) & (y >= 0) & (x < width) & (y < height)
-            column, row = np.where(inside, x, 0).astype(int), np.where(inside, y, 0).astype(int)
-            near = np.abs(self.depths[f][row, column] - local[:, 2]) < _SEEN_WITHIN_M
+            verts = self.data.truth["verts"]
+            column, row, depth, inside = pixels_in(verts[f], self.frames[f])
+            near = np.abs(self.depths[f][row, column] - depth) < _SEEN_WITHIN_M
             seen = inside & near & (self.pieces[f][k][row, column] > 0)
             start, end = verts[f][seen], verts[g][seen]
         return 1e3 * (end - start) if len(start) else None
 
     def answer(self, asked: Question) -> Any:
-        """The true value; None where a thing that is asked about is not in view."""
+        """The true value; None where an object in question is not in view."""
         kind, things, frames = asked.kind, asked.things, asked.frames
         t, k = (frames or (0,))[0], things[0]
         pieces = self.pieces[t][k]
@@ -161,7 +156,7 @@ class Truth:
         return 1e3 * float(np.median(depth[(self.pieces[t][k] > 0) & (depth > 0)]))
 
     def _when(self, things: tuple[int, ...], event: str) -> int | None:
-        """The frame of an event; None where it never is."""
+        """The frame of an event; None where it never happens."""
         k = things[0]
         there = [t for t in range(self.count) if self.pieces[t][k].any()]
         of: dict[str, Callable[[], dict[int, float]]] = {

@@ -1,4 +1,5 @@
-"""What experiments with deforming scenes share: frames to learn from, held-out ones, scores against truth."""
+"""What experiments with deforming scenes share: training frames, held-out frames, scores against the
+truth."""
 
 from dataclasses import dataclass, replace
 from time import perf_counter
@@ -11,6 +12,7 @@ from jaxtyping import Bool, Float
 
 import gsjax
 from experiments.shared.recordings import recorded
+from experiments.shared.timing import run_through
 from gsjax.data import Sequence
 from gsjax.data.files import read_arrays
 from gsjax.engine.deform.data import unit_times
@@ -32,12 +34,12 @@ _SEEN_WITHIN_M = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class Dataset:
-    """A recording with its frames parted.
+    """A recording with its frames split into training and held-out ones.
 
     Attributes:
         sequence: camera 0 is the left eye, camera 1 the right one.
-        train: frames to learn from.
-        test: frames that are held out.
+        train: indices of the training frames.
+        test: indices of the held-out frames.
         truth: arrays of the simulation.
     """
 
@@ -47,13 +49,13 @@ class Dataset:
     truth: dict[str, np.ndarray]
 
     def classes(self, t: int) -> np.ndarray:
-        """What the left eye sees of the simulated scene, by its truth: rows of a codebook of background and
-        tissue, -1 where there is the tool."""
+        """True classes of the left eye's pixels: rows of a codebook of background and tissue, -1 at the
+        tool."""
         seg = self.truth["seg"][t].astype(np.int32)
         return np.where(seg < 2, seg, -1)
 
     def frame(self, t: int, camera: int = 0, tools: bool = False) -> Frame:
-        """What a camera saw in a frame; tools do not count unless wanted."""
+        """The frame of one camera; pixels of tools are masked out unless `tools` is set."""
         s = self.sequence
         mask = None if tools else s.mask(t, camera) != TOOL
         pose, time = (s.viewmats[t, camera], s.Ks[t, camera]), float(unit_times(s)[t])
@@ -69,24 +71,28 @@ def one_frame(
     mask: np.ndarray | None = None,
     near: float = NEAR,
 ) -> Frame:
-    """What one camera saw at a time, 0 to 1, on the host."""
+    """The frame of one camera at a time from 0 to 1, on the host."""
     height, width = image.shape[:2]
     depths, masks = (None if pixels is None else pixels[None] for pixels in (depth, mask))
     camera = Camera(viewmat[None], K[None], width, height, near)
     return Frame(image[None], depths, camera, masks, np.asarray(time))
 
 
+def split(num_frames: int) -> tuple[list[int], list[int]]:
+    """Indices of the training frames, and of the held-out ones."""
+    test = [i for i in range(num_frames) if (i - 1) % EVERY == 0]
+    return [i for i in range(num_frames) if i not in test], test
+
+
 def dataset(name: str = "tissue_0", scale: float = 1.0) -> Dataset:
-    """A recording by its name, in pictures of a fraction of their width and height."""
+    """A recording by its name, its pictures scaled down to a fraction of their width and height."""
     sequence = gsjax.open_sequence(recorded(name)).scaled(scale)
-    test = [i for i in range(sequence.num_frames) if (i - 1) % EVERY == 0]
-    train = [i for i in range(sequence.num_frames) if i not in test]
-    return Dataset(sequence, train, test, read_arrays(recorded(name) / "truth.npz"))
+    return Dataset(sequence, *split(sequence.num_frames), read_arrays(recorded(name) / "truth.npz"))
 
 
 @dataclass(frozen=True, eq=False)
 class Reconstructed:
-    """A deforming scene that was learned, and what that took."""
+    """A reconstructed deforming scene, with the seconds of its steps and of compiling."""
 
     config: DeformConfig
     problem: Problem
@@ -98,31 +104,28 @@ class Reconstructed:
 def learned(
     frames: list[Frame], config: DeformConfig, lesson: Lesson | None = None, first: int | None = None
 ) -> Reconstructed:
-    """A scene of these frames, that begins with one of them; no step may be skipped."""
+    """A scene reconstructed from these frames, starting at the frame `first`; no step may be skipped."""
     method = Deform(config)
     problem, run = method.start(frames, lesson, first=first)
     ticks = drive(method, problem, run)
-    seconds = compiling = skipped = 0.0
-    for now in ticks:
-        seconds, compiling = seconds + now.seconds, compiling + now.compile_seconds
-        skipped += float(now.info["skipped"])
-    assert not skipped, f"{skipped:.0f} steps were skipped"
+    seconds, compiling = run_through(ticks)
     return Reconstructed(config, problem, ticks.run, seconds, compiling)
 
 
 def seen_as(found: Reconstructed, frame: Frame) -> Drawn:
-    """The scene where and when a frame was seen."""
+    """The scene rendered at the pose and time of a frame."""
     return draw(found.run.params, found.run.kept.moving, frame, found.run.plans[PLAN])
 
 
 def drawn(found: Reconstructed, frame: Frame) -> tuple[np.ndarray, np.ndarray]:
-    """Colours and depth of the scene where and when a frame was seen."""
+    """Colours and depth of the scene at the pose and time of a frame."""
     got = seen_as(found, frame)
     return got.colors, got.depths
 
 
 def frames_per_second(found: Reconstructed, frame: Frame, repeats: int = 20) -> float:
-    """How often a second the scene is deformed, drawn and brought to the host, over times; the median."""
+    """Frames a second of deforming the scene, rendering it and copying it to the host: the median over
+    times."""
     took = []
     for i in range(repeats + 2):
         begun = perf_counter()
@@ -132,10 +135,11 @@ def frames_per_second(found: Reconstructed, frame: Frame, repeats: int = 20) -> 
 
 
 def scores(found: Reconstructed, data: Dataset) -> dict[str, float]:
-    """Of held-out frames, under the masks: PSNR, SSIM, depth, PSNR around the tool, and of the right eye.
+    """Scores of the held-out frames within their masks: PSNR, SSIM, depth, PSNR near the tool and of the
+    right eye.
 
-    Means over frames; `psnr_pooled` is that of the mean squared error of all their pixels, in which the worst
-    frame counts most.
+    Means over frames; `psnr_pooled` is computed from the mean squared error of all their pixels, in which the
+    worst frame counts most.
     """
     rows = []
     for t in data.test:
@@ -163,34 +167,40 @@ def _mse(image: np.ndarray, true: np.ndarray, counts: np.ndarray) -> float:
 
 
 def near_tool(frame: Frame) -> Bool[np.ndarray, "h w"]:
-    """Pixels within some of the tool."""
+    """Pixels within `NEAR_TOOL_PX` of the tool."""
     from scipy.ndimage import distance_transform_edt
 
     return distance_transform_edt(frame.masks[0]) <= NEAR_TOOL_PX
 
 
-def copies(data: Dataset) -> dict[str, float]:
-    """PSNR of held-out frames as copies of others, under the same masks: means, and pooled as in `scores`."""
-    s = data.sequence
-
-    def of(name, guess):
-        each = [_mse(guess(t), s.image(t, 0) / 255.0, data.frame(t).masks[0]) for t in data.test]
-        mean, pooled = float(np.mean(-10 * np.log10(each))), float(-10 * np.log10(np.mean(each)))
-        return {f"psnr_{name}": mean, f"pooled_{name}": pooled}
+def copies_of(sequence: Sequence, t: int) -> dict[str, Float[np.ndarray, "h w 3"]]:
+    """A frame of the first camera guessed as copies of others: the frame before, the mean of both neighbours,
+    and the first frame."""
 
     def image(t):
-        return s.image(min(max(t, 0), s.num_frames - 1), 0) / 255.0
+        return sequence.image(min(max(t, 0), sequence.num_frames - 1), 0) / 255.0
 
-    return (
-        of("previous", lambda t: image(t - 1))
-        | of("neighbors", lambda t: (image(t - 1) + image(t + 1)) / 2)
-        | of("first", lambda t: image(0))
-    )
+    return {"previous": image(t - 1), "neighbors": (image(t - 1) + image(t + 1)) / 2, "first": image(0)}
+
+
+def copies(data: Dataset) -> dict[str, float]:
+    """PSNR of copies of other frames within the masks of the held-out ones: means, and pooled as in
+    `scores`."""
+    errors: dict[str, list[float]] = {}
+    for t in data.test:
+        true, counts = data.sequence.image(t, 0) / 255.0, data.frame(t).masks[0]
+        for name, guess in copies_of(data.sequence, t).items():
+            errors.setdefault(name, []).append(_mse(guess, true, counts))
+    found = {}
+    for name, each in errors.items():
+        found[f"psnr_{name}"] = float(np.mean(-10 * np.log10(each)))
+        found[f"pooled_{name}"] = float(-10 * np.log10(np.mean(each)))
+    return found
 
 
 def track_errors(found: Reconstructed, data: Dataset) -> dict[str, float]:
-    """How far vertices that frame 0 sees are from where they truly are, each carried by the displacement of
-    the four Gaussians nearest to it in frame 0; and how far if nothing moved. Millimetres."""
+    """Errors of the tracks of vertices that frame 0 shows, each moved by the displacement of the four
+    Gaussians nearest to it in frame 0; and the errors if nothing moved. Millimetres."""
     tracks, frames = data.sequence.truth.tracks, data.sequence.num_frames
     seen = _seen(tracks[0], data.frame(0))
     start = tracks[0][seen]
@@ -215,26 +225,35 @@ def track_errors(found: Reconstructed, data: Dataset) -> dict[str, float]:
     }
 
 
-def _pixels(points: Float[np.ndarray, "n 3"], frame: Frame) -> PointPixels:
-    """Where points fall in a frame."""
+def lifted(
+    depth: Float[np.ndarray, "h w"], which: Bool[np.ndarray, "h w"], viewmat: np.ndarray, K: np.ndarray
+) -> Float[np.ndarray, "n 3"]:
+    """World points of the chosen pixels of a depth image."""
+    rows, columns = np.nonzero(which)
+    rays = np.stack([columns + 0.5, rows + 0.5, np.ones(len(rows))], axis=1) @ np.linalg.inv(K).T
+    return (rays * depth[rows, columns, None] - viewmat[:3, 3]) @ viewmat[:3, :3]
+
+
+def pixels_in(points: Float[np.ndarray, "n 3"], frame: Frame) -> PointPixels:
+    """The pixels onto which points project in a frame."""
     camera = frame.cameras
     return pixels_of(points, camera.viewmat[0], camera.K[0], camera.width, camera.height)
 
 
 def _seen(points: Float[np.ndarray, "n 3"], frame: Frame) -> Bool[np.ndarray, "n"]:
-    """Which points a frame sees, by its depth and mask."""
-    x, y, depth, inside = _pixels(points, frame)
+    """Which points are visible in a frame, by its depth and mask."""
+    x, y, depth, inside = pixels_in(points, frame)
     return inside & frame.masks[0][y, x] & (np.abs(frame.depths[0][y, x] - depth) < _SEEN_WITHIN_M)
 
 
 def _near_tool_at(points: Float[np.ndarray, "n 3"], data: Dataset, t: int) -> Bool[np.ndarray, "n"]:
     frame = data.frame(t)
-    at = _pixels(points, frame)
+    at = pixels_in(points, frame)
     return at.inside & near_tool(frame)[at.rows, at.columns]
 
 
 def summary(found: Reconstructed) -> dict[str, Any]:
-    """What it took."""
+    """Size of the scene and time that it took."""
     return {
         "gaussians": found.run.params.gaussians.num,
         "minutes": (found.seconds + found.compile_seconds) / 60,

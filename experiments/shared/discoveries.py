@@ -1,4 +1,4 @@
-"""What experiments with parts share: a canonical scene for many settings, and scores as of `gsjax parts`."""
+"""What experiments with parts share: a canonical scene for many settings, and the scores of `gsjax parts`."""
 
 import hashlib
 import json
@@ -38,8 +38,8 @@ def canonical_of(options: Options, folder: Path) -> Path:
         folder: of a cell.
     """
     assert (options.anchor is not None, options.frames, options.scale) == (True, ":", 1.0)
-    asked = f"{options.dataset} {options.cameras} {options.eval_cameras} {options.anchor} {options.fit}"
-    path = folder.parent / f"canonical-{hashlib.sha256(asked.encode()).hexdigest()[:8]}"
+    wanted = f"{options.dataset} {options.cameras} {options.eval_cameras} {options.anchor} {options.fit}"
+    path = folder.parent / f"canonical-{hashlib.sha256(wanted.encode()).hexdigest()[:8]}"
     if not (path / "report.html").is_file():
         run_fit(
             FitOptions(
@@ -57,11 +57,11 @@ def canonical_of(options: Options, folder: Path) -> Path:
 
 
 def discovered(options: Options) -> dict[str, Any]:
-    """What `gsjax parts` found, in a row: parts, motion and joints against the truth, and pictures.
+    """One row of results of `gsjax parts`: parts, motion and joints against the truth, and pictures.
 
-    `true_found` counts true parts with which half of a found one overlaps (IoU of Gaussians), `joints` those
-    whose kind of joint was found, of those that have one. Errors are over all true parts that overlap with a
-    found one at all; one that does not is in no mean, and `parts` and the index tell.
+    `true_found` counts true parts that a found one overlaps by half (IoU of Gaussians), `joints` the true
+    joints whose kind was found. Errors are means over the true parts that overlap with a found one at all; a
+    part that does not shows in `parts` and in the Rand index only.
     """
     run_parts(options)
     found = json.loads((options.out / "metrics.json").read_text())
@@ -93,7 +93,7 @@ def discovered(options: Options) -> dict[str, Any]:
 
 
 def steadiness(folder: Path) -> dict[str, Any]:
-    """How steady the run's video of the first held-out camera is, beside the recording's."""
+    """Temporal stability of the run's video of the first held-out camera, against the recording's."""
     run = open_parts_run(folder)
     camera = run.camera(None)
     videos: tuple[list[np.ndarray], list[np.ndarray]] = ([], [])
@@ -106,7 +106,7 @@ def steadiness(folder: Path) -> dict[str, Any]:
 
 
 def with_parts(options: Options, **sections: dict[str, Any]) -> Options:
-    """With other settings: `stream={"past": 0}`; `top={...}` for those that are in no section."""
+    """Options with other settings, such as `stream={"past": 0}`; `top={...}` sets those outside sections."""
     parts = replace(options.parts, **sections.pop("top", {}))
     for name, values in sections.items():
         parts = replace(parts, **{name: replace(getattr(parts, name), **values)})
@@ -114,18 +114,22 @@ def with_parts(options: Options, **sections: dict[str, Any]) -> Options:
 
 
 def pose_from(motions: Float[np.ndarray, "P 4 4"], centers: Float[np.ndarray, "P 3"]) -> HandlePose:
-    """The pose of handles at these places that moves the canonical scene by these rigid motions."""
+    """The pose of handles at `centers` that moves the canonical scene by these rigid motions."""
     centers = np.asarray(centers, np.float64)
     shifts = np.einsum("pij,pj->pi", motions[:, :3, :3], centers) + motions[:, :3, 3] - centers
     quats = jaxlie.SO3.from_matrix(jnp.asarray(motions[:, :3, :3], jnp.float32)).wxyz
     return HandlePose(quats, jnp.asarray(shifts, jnp.float32))
 
 
-def told_the_truth(
+def start_from_truth(
     sequence: Sequence, gaussians: Gaussians, anchor: int, config: PartsConfig
 ) -> tuple[Start, Float[np.ndarray, "T P 4 4"], Int[np.ndarray, "labels"]]:
-    """A discovery that begins with true masks of what moves, the true motion of each of its handles against
-    the canonical scene, and which handle each label of a mask is, 0 where none."""
+    """A discovery that starts from true masks of what moves.
+
+    Returns:
+        the start, the true motion of each of its handles relative to the canonical scene, and the handle of
+        each mask label, 0 where there is none.
+    """
     truth = sequence.truth
     motions = [relative_motion(truth.poses[:, k], anchor) for k in range(len(truth.label_ids))]
     moving = [k for k, motion in enumerate(motions) if np.abs(motion - np.eye(4)).max() > 1e-3]

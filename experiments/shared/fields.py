@@ -20,7 +20,7 @@ from gsjax.engine.distill.scores import ClassScores, class_maps, classes_of
 from gsjax.engine.drive import drive
 from gsjax.engine.fit.run import Options as FitOptions
 from gsjax.engine.fit.run import run as run_fit
-from gsjax.geometry.cameras import project
+from gsjax.geometry.cameras import pixels_of
 from gsjax.methods.distill import (
     Distill,
     DistillConfig,
@@ -50,7 +50,7 @@ NO_FLAWS = Flaws(outline=0, merged=0.0, split=0.0, missing=0.0, smallest=0)
 def fitted(
     name: str, folder: Path, eval_cameras: tuple[int, ...] = (), preset: str = "depth", **options: Any
 ) -> FieldScene:
-    """The first frame of a recording as `gsjax fit` has it, made once for all experiments."""
+    """The first frame of a recording, fitted by `gsjax fit` once for all experiments."""
     path = folder.parents[1] / "field_scenes" / name
     if not (path / "report.html").is_file():
         options.setdefault("fit", PRESETS[preset])
@@ -61,7 +61,7 @@ def fitted(
 def first_tracked(
     name: str, folder: Path, cameras: tuple[int, ...], mask_camera: int, eval_cameras: tuple[int, ...]
 ) -> FieldScene:
-    """The scene that `gsjax track` begins with, for few cameras: a Gaussian a point of depth."""
+    """The scene that `gsjax track` starts from, for few cameras: one Gaussian for each depth point."""
     path = folder.parents[1] / "field_scenes" / f"{name}_tracked"
     if not (path / "report.html").is_file():
         words = ["track", recorded(name), "--out", path, "--frames", "0:2", "--overwrite"]
@@ -70,8 +70,13 @@ def first_tracked(
     return scene_of_run(path)
 
 
+def articulated(folder: Path) -> FieldScene:
+    """The first frame of articulated_0, fitted to eight of its cameras."""
+    return fitted("articulated_0", folder, eval_cameras=(3, 8), frames="0:1")
+
+
 def codebook_of(photographs: Photographs) -> tuple[dict[int, str], Float[np.ndarray, "k d"]]:
-    """Names of the labels 0 to K, the background among them, and their codes."""
+    """Names of the labels 0 to K, the background included, and their codes."""
     there = {int(v) for i in range(photographs.num) for v in np.unique(labels_of(photographs, i))}
     known = {label: photographs.label_names.get(label, f"object {label}") for label in range(max(there) + 1)}
     names = known | {0: "background"}
@@ -87,27 +92,31 @@ def flawed_teacher(
     scale: float = 1.0,
     snap: int = 0,
 ) -> tuple[Teacher, list[np.ndarray]]:
-    """What a segmenter and an encoder might have said of a scene's photographs, outlines put on edges within
-    `snap` pixels, then made smaller by `scale`; and, for a vote of labels, which code each pixel's embedding
-    is nearest to."""
-    said = flawed_masks([labels_of(scene.photographs, i) for i in scene.taught], codes, seed, flaws)
+    """Simulated output of a segmenter and an encoder for a scene's photographs.
+
+    Outlines are snapped to edges within `snap` pixels, then masks are scaled down by `scale`.
+
+    Returns:
+        the teacher; and, for a vote of labels, the code that each pixel's embedding is nearest to.
+    """
+    found = flawed_masks([labels_of(scene.photographs, i) for i in scene.taught], codes, seed, flaws)
     images = (scene.photographs.image(i) for i in scene.taught)
-    said = said._replace(
-        labels=[snap_outlines(one, image, snap) for one, image in zip(said.labels, images, strict=True)]
+    found = found._replace(
+        labels=[snap_outlines(one, image, snap) for one, image in zip(found.labels, images, strict=True)]
     )
     if scale < 1:
         sizes = scene.photographs.scaled(scale).sizes[scene.taught].tolist()
         small = [
             cv2.resize(one.astype(np.int32), size, interpolation=cv2.INTER_NEAREST_EXACT)
-            for one, size in zip(said.labels, sizes, strict=True)
+            for one, size in zip(found.labels, sizes, strict=True)
         ]
-        said = said._replace(labels=small)
-    nearest = [(rows @ codes.T).argmax(axis=1) for rows in said.embeddings]
+        found = found._replace(labels=small)
+    nearest = [(rows @ codes.T).argmax(axis=1) for rows in found.embeddings]
     ids = [
         np.where(one < 0, -1, near[np.maximum(one, 0)])
-        for one, near in zip(said.labels, nearest, strict=True)
+        for one, near in zip(found.labels, nearest, strict=True)
     ]
-    return teacher_of_objects(said.labels, said.embeddings), ids
+    return teacher_of_objects(found.labels, found.embeddings), ids
 
 
 def labels_of(photographs: Photographs, i: int) -> Int[np.ndarray, "h w"]:
@@ -118,15 +127,15 @@ def labels_of(photographs: Photographs, i: int) -> Int[np.ndarray, "h w"]:
 
 @dataclass(frozen=True, eq=False)
 class Learned:
-    """A field that was distilled.
+    """A distilled field.
 
     Attributes:
-        field, located: as queries take them.
-        seconds: of the steps, without what compiled.
-        compile_seconds: that compiling took.
-        memory_mb: of a step: what it is given and what it needs beside, as compiled.
-        trained: how many numbers.
-        losses: of the last steps, means.
+        field, located: arguments of queries.
+        seconds: time of the steps, without compiling.
+        compile_seconds: time of compiling.
+        memory_mb: memory of a compiled step: its arguments and temporaries.
+        trained: number of trained parameters.
+        losses: means over the last steps.
     """
 
     field: FeatureField
@@ -164,7 +173,7 @@ def learned(scene: FieldScene, which: Any, teacher: Teacher, config: DistillConf
 
 
 def step_memory_mb(method: Distill, problem: Problem, run: Run) -> float:
-    """What a compiled step is given, and what it needs beside."""
+    """Memory of a compiled step's arguments and temporaries."""
     advance = jax.jit(method.step.update, compiler_options=host_options(), donate_argnums=(0, 1))
     given = (run.params, run.state, problem.views[0])
     lowered = advance.lower(*given, step=jnp.asarray(0), key=jax.random.key(0))
@@ -179,14 +188,14 @@ def scored(
     names: dict[int, str],
     by_field: tuple[FeatureField, Located | None, np.ndarray] | None = None,
 ) -> dict[str, Any]:
-    """Masks of the held-out views and selections of Gaussians against truth: means over all things, the
+    """Masks of the held-out views and selections of Gaussians against the truth: means over all objects, the
     background left out.
 
     Args:
         scene: with held-out photographs.
         of_gaussians: the label of each Gaussian; -1 none.
         names: of labels.
-        by_field: a field and the codes of the labels, for the query by pixels.
+        by_field: a field and the codes of the labels, for the query per pixel.
     """
     photographs = scene.photographs
     views = frozen_views(
@@ -226,7 +235,7 @@ def scored(
 
 
 def _drawn(scene: FieldScene, view: Any) -> Bool[np.ndarray, "h w"]:
-    """Where a view shows the scene at all."""
+    """Pixels in which a view shows the scene at all."""
     return np.asarray(paint(view[0], jnp.ones((scene.gaussians.num, 1)), view[1])[1]) > _OPAQUE
 
 
@@ -239,7 +248,7 @@ def of_field(found: Learned, codes: np.ndarray) -> Int[np.ndarray, "n"]:
 
 
 def by_majority(scene: FieldScene, which: Any, ids: list[np.ndarray], count: int) -> Int[np.ndarray, "n"]:
-    """Plain lifting of the labels of pixels."""
+    """Labels of Gaussians by a majority vote of the pixels' labels."""
     cameras = [scene.photographs.camera(i) for i in which]
     return majority_labels(
         frozen_views(scene.gaussians, cameras, scene.rasterize_mode), ids, count, scene.gaussians.num
@@ -247,8 +256,8 @@ def by_majority(scene: FieldScene, which: Any, ids: list[np.ndarray], count: int
 
 
 def true_labels(gaussians: Gaussians, photographs: Photographs) -> Int[np.ndarray, "n"]:
-    """The mask value where a Gaussian's centre falls, if the depth there is within 15 mm of it: what most
-    cameras say. -1 where none does."""
+    """The mask value at each Gaussian's centre, if the depth there is within 15 mm of it: a majority vote
+    over the cameras, -1 where no camera sees it."""
     votes = np.zeros((gaussians.num, 256), np.int32)
     for i in range(photographs.num):
         label, seen = _seen(gaussians, photographs, i)
@@ -262,16 +271,14 @@ def _seen(
     """The mask value under each centre, and whether the centre lies where the depth is."""
     camera, depth = photographs.camera(i), photographs.depth(i)
     assert depth is not None
-    pixels, z = (np.asarray(a) for a in project(gaussians.means, camera.viewmat, camera.K))
-    x, y = (np.floor(np.nan_to_num(pixels, nan=-1.0)).astype(int)[:, axis] for axis in (0, 1))
-    inside = (z > 0) & (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)
-    x, y = np.where(inside, x, 0), np.where(inside, y, 0)
+    pose = np.asarray(camera.viewmat), np.asarray(camera.K)
+    x, y, z, inside = pixels_of(np.asarray(gaussians.means), *pose, camera.width, camera.height)
     close = inside & (depth[y, x] > 0) & (np.abs(depth[y, x] - z) < TRUE_WITHIN)
     return labels_of(photographs, i)[y, x], close
 
 
 def _hidden(scene: FieldScene, truth: Int[np.ndarray, "n"]) -> dict[int, Bool[np.ndarray, "n"]]:
-    """Of each thing, the Gaussians that the first held-out camera does not see."""
+    """For each object, the Gaussians that the first held-out camera does not see."""
     _, seen = _seen(scene.gaussians, scene.photographs, scene.held_out[0])
     return {int(k): (truth == k) & ~seen for k in np.unique(truth) if k > 0}
 

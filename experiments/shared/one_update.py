@@ -1,4 +1,4 @@
-"""One update of the tracker as a problem with a known answer: a scene, the next images, the true motion."""
+"""One update of the tracker as a problem with a known solution: a scene, the next images, the true motion."""
 
 from dataclasses import replace
 from typing import NamedTuple
@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
+from experiments.shared.recordings import labels_at
 from gsjax.data import Sequence
 from gsjax.methods.track import (
     PRESETS,
@@ -25,13 +26,13 @@ from gsjax.methods.track.motion import Motion, group_means, move, place
 from gsjax.methods.track.points import Points
 from gsjax.methods.track.refine import RefineBatch
 from gsjax.methods.track.region import near_background, near_scene
-from gsjax.metrics.tracking import ObjectScore, score_object, true_labels
+from gsjax.metrics.tracking import ObjectScore, score_object
 from gsjax.rasterize.plan import rung
 from gsjax.scene.region import tiles_to_pixels, touched_tiles
 from gsjax.scene.render import plan_render
 
-# Lighter than the tracker's own, for what is compared is one update. A robot is one group here: each group
-# is six columns of a Jacobian.
+# Lighter than the tracker's own settings, since a single update is compared. A robot is one group here: each
+# group is six columns of a Jacobian.
 CONFIG = replace(
     PRESETS["paper"],
     start=StartConfig(object_pixels=2.0, background_pixels=6.0, max_extent=1.0, iterations=30),
@@ -39,13 +40,13 @@ CONFIG = replace(
 
 
 class Update(NamedTuple):
-    """What a method is given, and what it is judged by.
+    """The input of a method, and the truth that it is scored against.
 
     Attributes:
-        batch: scene, new images and region for what renders; pose and centres are of the last frame.
-        points: pixels that showed each group in the last frame, for what aligns.
-        scored: of each group that is, the Gaussians that truly belong to its object.
-        poses: that object's true poses in both frames.
+        batch: scene, new images and region, for methods that render; pose and centres are of the last frame.
+        points: pixels that showed each group in the last frame, for methods that align.
+        scored: for each scored group, the Gaussians that truly belong to its object.
+        poses: for each scored group, its object's true poses in both frames.
     """
 
     batch: RefineBatch
@@ -54,7 +55,7 @@ class Update(NamedTuple):
     poses: dict[int, Float[np.ndarray, "2 4 4"]]
 
     def scores(self, motion: Motion) -> list[ObjectScore]:
-        """Of each scored group."""
+        """The score of each scored group."""
         batch = self.batch
         moved = move(batch.pose, motion, batch.centers, batch.scene.labels[: batch.scene.num_moving])
         means = np.stack([batch.pose.means, moved.means])
@@ -88,12 +89,12 @@ def update_of(
 
     Args:
         least_mm: objects that move less are followed but not scored.
-        reach: how far from the last pose methods may begin, metres: the region holds that too.
+        reach: how far from the last pose methods may start, metres; the region covers that too.
     """
     last, frame = (sequence.frame(at) for at in (t, t + gap))
     pose, groups = first_pose(scene), np.asarray(scene.labels[: scene.num_moving])
     plan = plan_tracker(scene, pose, last, CONFIG)
-    # As the tracker refines: in tiles that moving Gaussians touch, with the background that reaches there.
+    # As in the tracker's refinement: tiles that moving Gaussians touch, with the background reaching there.
     sides = reach * np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)]).astype(np.float32)
     tiles = touched_tiles([pose.means + side for side in sides], last)
     near = near_background(scene, render_labels(scene, pose, last, plan.full), tiles)
@@ -105,10 +106,9 @@ def update_of(
         Tracked(scene, pose), TrackBatch(last, plan), CONFIG
     ).pixels
 
-    truth, cameras = sequence.truth, range(sequence.num_cameras)
+    truth = sequence.truth
     assert truth is not None
-    views = [(sequence.mask(t, c), sequence.depth(t, c)) for c in cameras]
-    labels = true_labels(pose.means, *zip(*views, strict=True), sequence.viewmats[t], sequence.Ks[t])
+    labels = labels_at(sequence, np.asarray(pose.means), t)
     scored, poses = {}, {}
     for group, value in enumerate(scene.label_ids):
         which = np.flatnonzero(truth.label_ids == value)

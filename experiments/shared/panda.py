@@ -1,8 +1,8 @@
 """A Panda arm in MuJoCo and three RGB-D cameras around it: what experiments with a robot share.
 
-Models are robosuite's. Its controllers run in Python at every step of the physics; here MuJoCo's own
-position servos hold the joints, and once a control step inverse kinematics says where to: that is fast.
-Without a display, set MUJOCO_GL=egl before starting Python.
+The models are robosuite's. Its controllers run in Python at every step of the physics; here MuJoCo's own
+position servos hold the joints, and inverse kinematics sets their targets once a control step, which is
+faster. Without a display, set MUJOCO_GL=egl before starting Python.
 """
 
 from collections.abc import Iterator
@@ -21,7 +21,7 @@ from gsjax.scene.initialize import gaussians_from_points
 ARM, TOOL = "robot0_joint", "gripper0_right_grip_site"
 ROBOT = ("robot0", "gripper0", "fixed_mount0")
 STIFFNESS, DAMPING = 1500.0, 120.0  # of the joints' servos, N m / rad and N m s / rad
-LAG = DAMPING / STIFFNESS  # how late the arm is where it is told to be, seconds
+LAG = DAMPING / STIFFNESS  # delay of the arm behind its commands, seconds
 CLOSED, OPEN = 0.0, 0.04  # each finger from the middle, metres
 RANGE = 1.9  # of the depth cameras, metres; beyond it they see nothing
 SITE_TO_TOOL = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])  # the site closes along its x
@@ -75,7 +75,8 @@ class Arm:
         mujoco.mj_forward(self.model, self.data)
 
     def servo(self, pose: np.ndarray, finger: float) -> None:
-        """One control period towards `pose`, with each finger told to be `finger` metres from the middle."""
+        """One control period towards `pose`, with each finger commanded to `finger` metres from the
+        middle."""
         weight = self.data.qfrc_bias[self.dofs] / STIFFNESS  # the arm carries itself, as a Panda does
         self.data.ctrl[self.motors] = self._joints_for(pose) + weight
         self.grip(finger)
@@ -85,7 +86,8 @@ class Arm:
         self.data.ctrl[self.fingers] = finger, -finger
 
     def _joints_for(self, pose: np.ndarray, damping: float = 0.02, rest: float = 0.05) -> np.ndarray:
-        """Joints a step of damped least squares nearer to the tool pose; what is left returns to rest."""
+        """Joints after one step of damped least squares towards the tool pose; the null space returns to
+        rest."""
         here, q = self.pose(), self.data.qpos[self.qpos]
         turn = Rotation.from_matrix(pose[:3, :3] @ here[:3, :3].T).as_rotvec()
         twist = np.concatenate([pose[:3, 3] - here[:3, 3], turn])
@@ -98,10 +100,10 @@ class Arm:
 
 
 class Cameras:
-    """RGB-D cameras that stand still. They see the robot as its collision meshes, far coarser ones."""
+    """Static RGB-D cameras. They see the robot as its collision meshes, which are far coarser."""
 
     def __init__(self, model: mujoco.MjModel, views: list[tuple], width: int, height: int, fovy: float):
-        """`views` are (eye, target), metres in the world; models need as many cameras to take over."""
+        """`views` are (eye, target), world, metres; the model needs as many cameras, which are replaced."""
         self.model, self.views = model, views
         for i, view in enumerate(views):
             viewmat = look_at(*map(np.array, view))
@@ -128,8 +130,8 @@ class Cameras:
     def images(self, data: mujoco.MjData) -> tuple[np.ndarray, np.ndarray]:
         """RGB [C, H, W, 3] of 8 bits and depth [C, H, W] in metres, 0 where it is unknown.
 
-        That is what is out of range, and the robot, which knows its joints and its shape and so which pixels
-        it covers: such a filter keeps it from being taken for what it grasps.
+        Depth is unknown out of range and on the robot, which knows its joints and shape and so the pixels
+        that it covers: this filter keeps it from being mistaken for the object that it grasps.
         """
         colors, depths = [], []
         for camera in range(len(self.views)):
@@ -143,7 +145,7 @@ class Cameras:
         return np.stack(colors), np.stack(depths)
 
     def _geoms(self, data: mujoco.MjData, camera: int) -> np.ndarray:
-        """Which geom each pixel shows; the one after the last for none."""
+        """Index of the geom that each pixel shows; the number of geoms where there is none."""
         self.renderer.enable_segmentation_rendering()
         self.renderer.update_scene(data, camera, self.option)
         found = self.renderer.render()
@@ -155,7 +157,8 @@ class Cameras:
         return as_frame(*self.images(data), self.cameras)
 
     def mask(self, data: mujoco.MjData, camera: int, bodies: list[str]) -> np.ndarray:
-        """Labels [H, W] of one camera: 1.. the bodies in order, 0 all else. It stands for a segmenter."""
+        """Labels [H, W] of one camera: 1.. the bodies in order, 0 everything else. A stand-in for a
+        segmenter."""
         names = [self.model.body(body).name for body in self.model.geom_bodyid]
         table = np.array([bodies.index(name) + 1 if name in bodies else 0 for name in names] + [0])
         return table[self._geoms(data, camera)]
@@ -167,7 +170,7 @@ def as_frame(colors: np.ndarray, depths: np.ndarray, cameras: Camera) -> Frame:
 
 
 def _dress(model: mujoco.MjModel) -> None:
-    """Show robots as their collision meshes in white, everything else as it looks; hide what marks a goal."""
+    """Show robots as white collision meshes and everything else unchanged; hide the markers of goals."""
     model.vis.quality.offsamples = 0
     for geom in range(model.ngeom):
         name = model.body(model.geom_bodyid[geom]).name
@@ -188,7 +191,7 @@ def body_pose(data: mujoco.MjData, name: str) -> np.ndarray:
 
 
 def set_body(model: mujoco.MjModel, data: mujoco.MjData, name: str, position, yaw: float) -> None:
-    """Put a free body somewhere, at rest."""
+    """Place a free body, at rest."""
     joint = model.body(name).jntadr[0]
     at = model.jnt_qposadr[joint]
     quat = Rotation.from_euler("z", yaw).as_quat(scalar_first=True)
@@ -199,10 +202,10 @@ def set_body(model: mujoco.MjModel, data: mujoco.MjData, name: str, position, ya
 def start(
     frame: Frame, mask: np.ndarray, mask_camera: int, config: StartConfig, per_object: int, background: int
 ) -> TrackedScene:
-    """What `gsjax.start_scene` makes, with the pixels' own colours and as many Gaussians for every scene.
+    """Like `gsjax.start_scene`, with the pixels' own colours and the same number of Gaussians in every scene.
 
     Arrays of the same shapes let one compiled program serve all trials. Where an object shows fewer points,
-    some come twice.
+    some are repeated.
 
     Raises:
         ValueError: an object of the mask, or the background, has no points.
@@ -222,13 +225,13 @@ def start(
 
 
 def fed(box: list[Frame]) -> Iterator[Frame]:
-    """Frames for `gsjax.track` as they are put into `box`; it must hold one when the next is asked for."""
+    """Frames for `gsjax.track`, taken from `box`, which must hold one whenever the next is requested."""
     while True:
         yield box.pop()
 
 
 def motion_between(first: np.ndarray, now: np.ndarray) -> np.ndarray:
-    """The rigid motion [4, 4] that takes the points `first` [N, 3] best to `now` (Kabsch 1976)."""
+    """The rigid motion [4, 4] that best takes the points `first` [N, 3] to `now` (Kabsch 1976)."""
     middles = first.mean(0), now.mean(0)
     u, _, vt = np.linalg.svd((now - middles[1]).T @ (first - middles[0]))
     flip = np.diag([1.0, 1.0, np.linalg.det(u @ vt)])

@@ -36,7 +36,7 @@ ARRIVALS = {
     "home_align": ("direct alignment", SKY, "o"),
     "home_search": ("direct alignment, searched", BLUE, "*"),
 }
-WIDTHS = (6, 3.5, 2.5, 1.5)  # of their lines: what lies below stays in sight
+WIDTHS = (6, 3.5, 2.5, 1.5)  # of their lines, so that those below stay visible
 
 
 def wilson(successes: float, count: int) -> tuple[float, float]:
@@ -134,7 +134,7 @@ def draw_optimizers(rows: list[dict[str, Any]], path: Path) -> None:
 
 
 def draw_basin(rows: list[dict[str, Any]], path: Path, pixels_per_mm: float) -> None:
-    """Where gradients point, and who comes home, over the displacement: a row of panels for each motion."""
+    """Cosines of gradients and shares of arrivals over the displacement: a row of panels for each motion."""
     drawing = Figure(figsize=(15, 7.4), facecolor="white", layout="constrained")
     grid = drawing.subplots(2, 4, squeeze=False)
     units = {"translation": "displaced by (mm)", "rotation": "turned by (°)"}
@@ -172,7 +172,7 @@ def draw_basin(rows: list[dict[str, Any]], path: Path, pixels_per_mm: float) -> 
 
 
 def draw_variants(axes: Axes, names: list[str], lengths: list[float], title: str) -> None:
-    """A bar for each variant of an ablation; the line is the one with all parts on."""
+    """A bar for each variant of an ablation; the line marks the variant with all parts on."""
     bars = axes.barh(names, lengths, color=["#444444" if name == "all on" else "#4c8cc4" for name in names])
     axes.bar_label(bars, [f"{v:.3g}" if v < 100 else f"{v:.0f}" for v in lengths], padding=3)
     axes.set(title=title)
@@ -184,7 +184,7 @@ def draw_variants(axes: Axes, names: list[str], lengths: list[float], title: str
 def _bars(
     axes: Axes, at: Sequence[float], found: list[list[float]], color: str, label: str | None, width: float
 ) -> None:
-    """Bars of rates, their 95 % intervals, and the rates in words above those."""
+    """Bars of rates with their 95 % intervals, and the rates as text above them."""
     rates = [float(np.mean(values)) if values else np.nan for values in found]
     axes.bar(at, rates, width, color=color, label=label, zorder=2)
     for x, values, rate in zip(at, found, rates, strict=True):
@@ -195,7 +195,7 @@ def _bars(
 
 
 def _axes(axes: Axes, title: str, xlabel: str, ylabel: str) -> None:
-    """The package's look of a plot."""
+    """The package's style of axes."""
     axes.set_title(title, loc="left", fontsize=11.5, fontweight="bold", color=INK, pad=10)
     axes.set_xlabel(xlabel, color=FAINT, fontsize=10)
     axes.set_ylabel(ylabel, color=FAINT, fontsize=10)

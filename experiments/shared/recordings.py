@@ -1,4 +1,4 @@
-"""What experiments with the tracker share: recordings, their scenes, and scores as `gsjax track` has them."""
+"""What experiments with the tracker share: recordings, their scenes, and the scores of `gsjax track`."""
 
 import os
 from functools import lru_cache
@@ -7,8 +7,10 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
+from jaxtyping import Float, Int
 from rich.console import Console
 
+from gsjax.data import Sequence
 from gsjax.engine.recording import FirstMask, Recording, draw_ahead, first_mask, open_recording
 from gsjax.engine.scores import Scores
 from gsjax.engine.track.loop import Tracking, begin, follow
@@ -16,6 +18,7 @@ from gsjax.engine.track.results import MOVED_MM
 from gsjax.engine.track.scoring import group_values, metrics, score_motion
 from gsjax.engine.track.views import views
 from gsjax.methods.track import StartConfig, TrackConfig, TrackedScene, start_scene
+from gsjax.metrics.tracking import true_labels
 from gsjax.scene.frame import Frame
 
 DATA = Path(os.environ.get("GSJAX_DATA") or Path(__file__).resolve().parents[3] / "shared" / "data")
@@ -24,12 +27,18 @@ QUIET = Console(stderr=True, quiet=True)
 
 
 class Start(NamedTuple):
-    """What a tracker begins with."""
+    """A recording and the scene that the tracker starts from."""
 
     recording: Recording
     mask: FirstMask
     frame: Frame
     scene: TrackedScene
+
+
+def labels_at(sequence: Sequence, points: Float[np.ndarray, "n 3"], t: int = 0) -> Int[np.ndarray, "n"]:
+    """True labels of points in a frame, from the masks and depths of all cameras; -1 where unknown."""
+    seen = [(sequence.mask(t, c), sequence.depth(t, c)) for c in range(sequence.num_cameras)]
+    return true_labels(points, *zip(*seen, strict=True), list(sequence.viewmats[t]), list(sequence.Ks[t]))
 
 
 def recorded(name: str) -> Path:
@@ -43,18 +52,22 @@ def recorded(name: str) -> Path:
 def started(
     dataset: str, frames: str, cameras: tuple[int, ...], held_out: tuple[int, ...], config: StartConfig
 ) -> Start:
-    """A recording and its scene at the first frame, made once for several settings of the tracker."""
+    """The start of a recording, made once for several settings of the tracker."""
     jax.clear_caches()  # every scene has shapes of its own, and programs fill the process's memory map
-    recording = open_recording(dataset, cameras, held_out, frames)
+    return start_of(open_recording(dataset, cameras, held_out, frames), TrackConfig(start=config))
+
+
+def start_of(recording: Recording, config: TrackConfig) -> Start:
+    """A recording and its scene at the first frame, from the mask of camera `MASK_CAMERA`."""
     draw_ahead(recording, QUIET)
     mask, frame = first_mask(recording.tracked, MASK_CAMERA, "files"), recording.tracked.frame(0)
     assert mask.labels is not None
-    scene = start_scene(frame, mask.labels, cameras.index(MASK_CAMERA), TrackConfig(start=config))
-    return Start(recording, mask, frame, scene)
+    camera = recording.tracked.camera_ids.index(MASK_CAMERA)
+    return Start(recording, mask, frame, start_scene(frame, mask.labels, camera, config))
 
 
 def tracked(start: Start, config: TrackConfig) -> Tracking:
-    """All of it followed; what stops it is raised."""
+    """The whole recording tracked; an error that ends the loop is raised."""
     tracking = follow(begin(start.scene), start.frame, start.recording.tracked, config, QUIET)
     if tracking.stopped is not None:
         raise tracking.stopped
@@ -62,7 +75,7 @@ def tracked(start: Start, config: TrackConfig) -> Tracking:
 
 
 def scored(start: Start, tracking: Tracking, every: int = 1) -> dict[str, Any]:
-    """Means over the objects that move; pictures and labels of every so-manieth frame."""
+    """Means over the objects that move; every n-th frame is compared as a picture and by its labels."""
     recording = start.recording
     values, truth = group_values(tracking, start.mask, recording), recording.tracked.truth
     scores = Scores(values, None if truth is None else truth.robot)

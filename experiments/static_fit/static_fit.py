@@ -1,4 +1,4 @@
-"""How well are held-out views of a static scene seen, minute by minute?"""
+"""How well are held-out views of a static scene rendered, minute by minute?"""
 
 import json
 from pathlib import Path
@@ -12,7 +12,7 @@ from gsjax.engine.machine import resident_mb
 from gsjax.methods.fit import FitConfig
 
 GOAL_DB = 25.0
-# fox at 270x480, the others at 320x240. The K of icl_living_room is told beside it, centres at integers.
+# fox at 270x480, the others at 320x240. The K of icl_living_room has pixel centres at integers.
 SCENES: dict[str, dict[str, Any]] = {
     "fox": {"scale": 0.25},
     "icl_living_room": {"scale": 0.5, "read": ReadOptions(K=(525.0, 525.0, 320.0, 240.0))},
@@ -21,7 +21,7 @@ SCENES: dict[str, dict[str, Any]] = {
 
 
 def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
-    """One fit, as `gsjax fit` does it."""
+    """One fit by `gsjax fit`."""
     how = SCENES[options["scene"]]
     depth_weight = 0.0 if options["scene"] == "fox" else 0.5
     config = FitConfig(steps=30_000, seed=seed, depth_weight=depth_weight)
@@ -52,7 +52,7 @@ def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
 
 
 def figure(rows: list[dict[str, Any]], path: Path) -> None:
-    """PSNR over minutes, a line a fit."""
+    """PSNR over minutes, a line for each fit."""
     from matplotlib.figure import Figure
 
     drawing = Figure(figsize=(7, 4), layout="constrained")

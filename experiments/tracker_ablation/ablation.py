@@ -1,7 +1,7 @@
 """The object-aware tracker with one of its parts switched off at a time.
 
-`tabletop` is the scene that comes with the package, frame by frame; `tabletop_0` is a recording of MuJoCo's,
-of which every third frame is taken, so that objects move far from one to the next.
+`tabletop` is the package's built-in scene, frame by frame; `tabletop_0` is a MuJoCo recording of which every
+third frame is taken, so that objects move far between frames.
 """
 
 from dataclasses import replace
@@ -13,7 +13,7 @@ import numpy as np
 from experiments.shared.recordings import recorded, scored, started, tracked
 from gsjax.methods.track import PRESETS, TrackConfig
 
-RECORDINGS = {  # with the frames that are taken
+RECORDINGS = {  # with the selected frames
     "tabletop": (lambda: "simulated:tabletop?width=240&height=180", "0:24"),
     "tabletop_0": (lambda: str(recorded("tabletop_0")), "0:60:3"),
 }
@@ -22,7 +22,7 @@ FULL = PRESETS["paper"]
 
 
 def without_alignment(config: TrackConfig) -> TrackConfig:
-    """What the paper has not: no Gauss-Newton, and no search by shifts and turns before it."""
+    """Without what the paper lacks: no Gauss-Newton, and no search over shifts and turns before it."""
     return replace(config, align=replace(config.align, iterations=0, reach=0.0, turns=()))
 
 
@@ -42,7 +42,7 @@ VARIANTS = {
 
 
 def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
-    """Track with one variant, and score as `gsjax track` does."""
+    """Track with one variant, with the scores of `gsjax track`."""
     dataset, frames = RECORDINGS[options["recording"]]
     start = started(dataset(), frames, CAMERAS, HELD_OUT, FULL.start)
     tracking = tracked(start, VARIANTS[options["variant"]])

@@ -15,8 +15,8 @@ from gsjax.methods.track import PRESETS, TrackConfig
 
 FAST = PRESETS["fast"]
 CAMERAS = (0, 1, 2)
-WARM = 3  # updates at the start that are left out: they fault their memory in
-ROUNDING = 3e-4  # by which colours differ from run to run, as on another machine
+WARM = 3  # first updates that are not timed: they fault their memory in
+ROUNDING = 3e-4  # by which colours differ between runs, as between machines
 
 
 def setting(knob: str, value: Any) -> TrackConfig:
@@ -53,21 +53,22 @@ def setting(knob: str, value: Any) -> TrackConfig:
 
 @lru_cache(maxsize=1)
 def starts(dataset: str, config: TrackConfig) -> tuple[Start, Start]:
-    """What a setting begins with, and `fast`; programs of the setting before are forgotten, for every setting
-    compiles its own, which fill the process's memory map."""
+    """The starts of a setting and of `fast`. Programs of the setting before are dropped, since each setting
+    compiles its own, which would fill the process's memory map."""
     jax.clear_caches()
     return started(dataset, ":", CAMERAS, (), config.start), started(dataset, ":", CAMERAS, (), FAST.start)
 
 
 def rounded(start: Start, seed: int) -> Start:
-    """The same but for rounding: one run of a chaotic thing says little. Seed 0 is as it is."""
+    """A start with colours changed by rounding, since single runs of a chaotic system mean little. Seed 0
+    changes nothing."""
     colors = start.scene.gaussians.sh0
     noise = ROUNDING / SH_C0 * (seed > 0) * jax.random.normal(jax.random.key(seed), colors.shape)
     return start._replace(scene=eqx.tree_at(lambda s: s.gaussians.sh0, start.scene, colors + noise))
 
 
 def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
-    """Follow a recording with one setting, and with `fast` in the same minute."""
+    """Track a recording with one setting, and with `fast` right after it."""
     config, dataset = setting(options["knob"], options["value"]), str(recorded(options["recording"]))
     start, usual = (rounded(start, seed) for start in starts(dataset, config))
     tracking, beside = tracked(start, config), tracked(usual, FAST)
@@ -125,7 +126,7 @@ def figure(rows: list[dict[str, Any]], path: Path) -> None:
 
 
 def in_one_time(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """The times that they would have taken had `fast`, which ran beside each, always taken its median."""
+    """Rows with their times normalised to the median time of `fast`, which ran right after each setting."""
     usual = {}
     for recording in {row["recording"] for row in rows}:
         beside = [row["update_ms"] / row["ratio"] for row in rows if row["recording"] == recording]

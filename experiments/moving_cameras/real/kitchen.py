@@ -1,12 +1,11 @@
 """A hand-held Kinect in a kitchen in which nothing moves: how far do tracked objects stray?
 
-The truth is that all stands still, which a tracker that does nothing gets right. So beside it stands what
-the recording is good for: the noise of a depth pixel, and how far its surfaces lie beside themselves from
-frame to frame, which is the noise of the camera's poses. The first mask is that of `PlaneOrRegionSegmenter`,
-which has no weights and knows no things. Pictures are halved to 320x240.
+In truth everything is static, which a tracker that does nothing gets right. So errors are compared with the
+accuracy of the recording: the noise of a depth pixel, and the misalignment of its surfaces from frame to
+frame, which is the noise of the camera's poses. The first mask is that of `PlaneOrRegionSegmenter`, which has
+no weights and knows no object classes. Pictures are halved to 320x240.
 """
 
-import os
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,25 +13,23 @@ from typing import Any
 import cv2
 import numpy as np
 
+from experiments.shared.recordings import recorded
 from gsjax.data import Sequence, read_seven_scenes
 from gsjax.engine.track.tracking import track
 from gsjax.methods.track import PRESETS, first_pose, start_scene
 from gsjax.perception.segmenters import PlaneOrRegionSegmenter
 
-DATA = Path(os.environ.get("GSJAX_DATA") or Path(__file__).resolve().parents[4] / "shared" / "data")
-FRAMES = 40  # of every third of the recording: 4 s
+FRAMES = 40  # the recording has every third frame of a video: 4 s
 NEAR_MM = 10.0
-MOST = 0.5  # of what the first frame showed of an object
+MOST = 0.5  # share of what the first frame showed of an object
 SAME_SURFACE_M = 0.03  # a larger difference of depth is another surface
 ENOUGH = 20  # pixels
 BLUE, ORANGE, INK, FAINT, BAND = "#0072b2", "#d55e00", "#22262b", "#6b7280", "#d5d9de"
 
 
 def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
-    """Track what the segmenter finds in the first frame, and say how far each object went."""
-    recording = DATA / "seven_scenes_kitchen"
-    if not recording.is_dir():
-        raise FileNotFoundError(f"{recording}: not there; set GSJAX_DATA to the folder that holds it")
+    """Track what the segmenter finds in the first frame, and measure how far each object strays."""
+    recording = recorded("seven_scenes_kitchen")
     sequence = halved(read_seven_scenes(recording, register=options["registered"])).select(range(FRAMES))
     config, depth = PRESETS[options["preset"]], sequence.depth(0, 0)
     mask = PlaneOrRegionSegmenter()(sequence.image(0, 0), depth, sequence.Ks[0, 0])
@@ -53,7 +50,7 @@ def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
                 its = np.isin(groups, parts)
                 strayed[t, i] = 1e3 * np.linalg.norm(means[its].mean(axis=0) - begun[its].mean(axis=0))
     noise, shifts, shown = disagreement(sequence, mask, names)
-    kept = np.cumprod(shown >= MOST, axis=0).astype(bool)  # until most of it has left the view once
+    kept = np.cumprod(shown >= MOST, axis=0).astype(bool)  # until most of it first leaves the view
     worst, while_kept = np.nanmax(strayed, axis=0), np.where(kept, strayed, np.nan)
     at_most = np.nanmax(while_kept, axis=0)
     paths = np.linalg.inv(sequence.viewmats[:, 0])[:, :3]
@@ -82,7 +79,7 @@ def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
 
 
 def halved(sequence: Sequence) -> Sequence:
-    """The sequence at half its size. Depth is that of one pixel in four; a mean of two surfaces is none."""
+    """The sequence at half its size. Depth is taken from one pixel in four, since means mix surfaces."""
     width, height = sequence.width // 2, sequence.height // 2
 
     def image(t: int, c: int) -> np.ndarray:
@@ -98,12 +95,12 @@ def halved(sequence: Sequence) -> Sequence:
 
 
 def disagreement(sequence: Sequence, mask: np.ndarray, names: list[int]) -> tuple[np.ndarray, ...]:
-    """What the depth images say of objects that stand still, by the camera's poses.
+    """Noise and misalignment of static objects in the depth images, by the camera's poses.
 
     Returns:
         noise: spread of a pixel's depth about its object's shift, mm, [T, K].
-        shifts: how far the object's surface lies nearer or farther than in the first frame, mm, [T, K].
-        shown: share of what the first frame showed of it that is in view and not hidden, [T, K].
+        shifts: distance of the object's surface from that of the first frame along the view, mm, [T, K].
+        shown: share of what the first frame showed of it that is in view and not occluded, [T, K].
     """
     depth = sequence.depth(0, 0)
     assert depth is not None
@@ -132,7 +129,7 @@ def disagreement(sequence: Sequence, mask: np.ndarray, names: list[int]) -> tupl
 
 
 def figure(rows: list[dict[str, Any]], path: Path) -> None:
-    """A panel a case: each object's distance from where it began, over time."""
+    """A panel for each case: each object's distance from its start over time."""
     from matplotlib.figure import Figure
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch

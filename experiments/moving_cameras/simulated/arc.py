@@ -1,8 +1,7 @@
 """The built-in scene, once from fixed cameras and once from cameras that sway by 6 degrees around the table.
 
-Both are tracked side by side, an update of one after an update of the other, so that whatever else the
-machine does disturbs both times alike. Labels come from the true mask of the first frame, camera poses are
-exact.
+Both are tracked side by side, with alternating updates, so that other load on the machine affects both times
+alike. Labels come from the true mask of the first frame; camera poses are exact.
 """
 
 from collections.abc import Iterator
@@ -11,21 +10,22 @@ from typing import Any
 
 import numpy as np
 
+from experiments.shared.recordings import labels_at
 from gsjax.data import Sequence
 from gsjax.data.simulated import tabletop
 from gsjax.engine.drive import Tick
 from gsjax.engine.track.results import MOVED_MM
 from gsjax.engine.track.tracking import track
 from gsjax.methods.track import PRESETS, TrackConfig, TrackedScene, first_pose, start_scene
-from gsjax.metrics.tracking import ObjectScore, score_tracks, true_labels
+from gsjax.metrics.tracking import ObjectScore, score_tracks
 
 FRAMES, WIDTH, HEIGHT, CAMERAS, MASK_CAMERA = 24, 240, 180, 2, 1
-WARM_UP = 2  # updates whose times are left out
+WARM_UP = 2  # first updates whose times are left out
 KINDS = {"fixed": False, "moving": True}
 
 
 def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
-    """Track both, and score each object's Gaussians against its true motion."""
+    """Track both scenes, and score each object's Gaussians against its true motion."""
     config = PRESETS[options["preset"]]
     recordings = [
         tabletop(seed, FRAMES, WIDTH, HEIGHT, CAMERAS, moving_cameras=moving) for moving in KINDS.values()
@@ -58,25 +58,18 @@ def started(recording: Sequence, config: TrackConfig) -> TrackedScene:
 
 
 def followed(scene: TrackedScene, recording: Sequence, config: TrackConfig) -> Iterator[Tick]:
-    """One update a frame, each when it is asked for."""
+    """One update a frame, made on demand."""
     return track(scene, recording.frame(0), (recording.frame(t) for t in range(1, FRAMES)), config)
 
 
 def score(recording: Sequence, scene: TrackedScene, ran: tuple[Tick, ...]) -> dict[str, ObjectScore]:
-    """Errors by name, of all Gaussians whose true object is known, whatever the tracker takes them for."""
+    """Errors by object, over all Gaussians whose true object is known, whatever their tracked label."""
     truth, count = recording.truth, scene.num_moving
     assert truth is not None
     background = np.asarray(scene.gaussians.means)[count:]
     poses = [first_pose(scene), *(now.result.pose for now in ran)]
     means = np.stack([np.concatenate([np.asarray(pose.means)[:count], background]) for pose in poses])
-    cameras = range(recording.num_cameras)
-    labels = true_labels(
-        means[0],
-        [recording.mask(0, c) for c in cameras],  # pyright: ignore[reportArgumentType]
-        [recording.depth(0, c) for c in cameras],  # pyright: ignore[reportArgumentType]
-        list(recording.viewmats[0]),
-        list(recording.Ks[0]),
-    )
+    labels = labels_at(recording, means[0])
     scores = score_tracks(means, labels, {int(k): truth.poses[:, i] for i, k in enumerate(truth.label_ids)})
     return dict(zip(truth.names, scores.values(), strict=True))
 
@@ -87,18 +80,18 @@ def directions(recording: Sequence) -> np.ndarray:
 
 
 COLORS = {"accurate": "#0072b2", "fast": "#d55e00"}
-MARKS = {"carton": "s", "can": "p", "ball": "^", "block": "D"}  # the block stands still
+MARKS = {"carton": "s", "can": "p", "ball": "^", "block": "D"}  # the block is static
 
 
 def figure(rows: list[dict[str, Any]], path: Path) -> None:
-    """A point an object and seed: error from moving cameras over that from fixed ones."""
+    """A point for each object and seed: error with moving cameras over error with fixed ones."""
     from matplotlib.figure import Figure
     from matplotlib.lines import Line2D
     from matplotlib.ticker import FuncFormatter
 
     drawing = Figure(figsize=(5.4, 5.2), dpi=150, layout="constrained")
     axes = drawing.subplots()
-    low, high = 0.01, 100.0  # what is less stands at the edge
+    low, high = 0.01, 100.0  # smaller errors are drawn at the edge
     axes.plot([low, high], [low, high], color="#9aa1aa", linewidth=1, zorder=1)
     axes.text(50, 72, "alike", color="#6b7280", fontsize=9, rotation=45, ha="center", va="center")
     for row in rows:
