@@ -16,7 +16,6 @@ from gsjax.methods.deform import (
     Deform,
     DeformingScene,
     Lesson,
-    batch_of,
     can_start_from,
     nodes_of,
     prompt_probabilities,
@@ -166,16 +165,6 @@ class TestLearning:
         info = jax.device_get(next(ticks).info)
         assert np.isfinite(info["loss"])
         assert not info["skipped"]
-
-    def test_a_teacher_without_numbers_changes_nothing(self, learned):
-        problem, run, *_ = learned
-        batch = batch_of(problem, run, 0)
-        batch = batch._replace(codebook=batch.codebook.at[0, 0].set(jnp.nan))
-        update = jax.jit(Deform(CONFIG).step.update)
-        after, _, info = update(run.params, run.state, batch, step=70, key=jax.random.key(0))
-        assert info["skipped"]
-        for one, other in zip(jax.tree.leaves(run.params), jax.tree.leaves(after), strict=True):
-            np.testing.assert_array_equal(one, other)
 
     def test_rates_fall_over_both_parts_of_the_learning(self, frames):
         """The optimizer begins anew with the deformation, and its rates do not."""
