@@ -4,22 +4,24 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 
 from experiments.shared.deform_regions import with_errors
 from experiments.shared.deform_truth import NAMES, Truth, built_in
 from experiments.shared.deforming import Dataset, Reconstructed, dataset, learned, summary
 from gsjax.engine.deform.data import unit_times
-from gsjax.geometry.cameras import Camera
+from gsjax.geometry.cameras import NEAR
 from gsjax.methods.deform import (
     PRESETS,
     QUESTIONS,
+    DeformResult,
     GraphConfig,
     Lesson,
+    Meaning,
     Question,
     SceneFacts,
     TemplatedAnswerer,
+    Timeline,
     parse_question,
     scene_facts,
 )
@@ -116,12 +118,13 @@ def _learned(data: Dataset, truth: Truth, wrong: float, seed: int) -> Reconstruc
 
 def _facts(data: Dataset, found: Reconstructed) -> SceneFacts:
     """Facts of all frames."""
-    seen = data.sequence
-    viewmats, Ks = (jnp.asarray(a[:, 0], jnp.float32) for a in (seen.viewmats, seen.Ks))
-    cameras = Camera(viewmats, Ks, seen.width, seen.height)
-    codes, frames = np.eye(len(NAMES), found.config.channels), range(seen.num_frames)
-    scene, moving = found.run.params, found.run.kept.moving
-    return scene_facts(scene, moving, unit_times(seen), cameras, codes, NAMES, frames)
+    seen, codes = data.sequence, np.eye(len(NAMES), found.config.channels)
+    frames, size = np.arange(seen.num_frames), (seen.width, seen.height)
+    cameras = (seen.viewmats[:, 0], seen.Ks[:, 0], size, NEAR)
+    timeline = Timeline(unit_times(seen), frames, 1.0, *cameras, np.zeros(0, int))
+    meaning = Meaning(None, tuple(NAMES), codes, np.eye(found.config.channels))
+    result = DeformResult(found.run.params, found.run.kept.moving, meaning, timeline)
+    return scene_facts(result, range(seen.num_frames))
 
 
 def _right(kind: str, answer: Any, true: Any) -> bool:

@@ -5,7 +5,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
-import jax.numpy as jnp
 import tyro
 from rich.console import Console
 from rich.table import Table
@@ -13,7 +12,6 @@ from rich.table import Table
 from gsjax.engine.deform.file import NAME, read_deformation, warn_of_partial
 from gsjax.engine.messages import Notes, stage
 from gsjax.engine.options import Common
-from gsjax.geometry.cameras import Camera
 from gsjax.methods.deform import (
     QUESTIONS,
     DeformResult,
@@ -67,7 +65,8 @@ def run(options: Options) -> int:
     asked = parse_question(options.question, result.names)
     rows = rows_of(asked, result.timeline.frame_ids.tolist())
     with stage(console, f"looking at {_in_words(result, rows)}"):
-        facts = facts_of_run(result, rows)
+        # The depth of the first frame is the unit of lengths in a scene of unknown scale.
+        facts = scene_facts(result, rows if result.timeline.metric or 0 in rows else [0, *rows])
     answer = TemplatedAnswerer()(options.question, facts)
     if options.json:
         found = {
@@ -80,24 +79,6 @@ def run(options: Options) -> int:
     else:
         print(answer.text)
     return 0
-
-
-def facts_of_run(result: DeformResult, rows: list[int]) -> SceneFacts:
-    """Facts of some of a run's frames; of the first too, where its depth is the unit of lengths.
-
-    Args:
-        result: a scene with a meaning.
-        rows: of its frames, 0 to T - 1.
-    """
-    assert result.meaning is not None
-    if not result.timeline.metric and 0 not in rows:
-        rows = [0, *rows]
-    viewmats, Ks = (jnp.asarray(a[rows], jnp.float32) for a in (result.viewmats, result.timeline.Ks))
-    cameras = Camera(viewmats, Ks, *result.timeline.size, result.timeline.near)
-    frames = result.timeline.frame_ids[rows].tolist()
-    times = result.timeline.times[rows]
-    seen = (times, cameras, result.meaning.codebook, result.names, frames)
-    return scene_facts(result.scene, result.moving, *seen, metric=result.timeline.metric)
 
 
 def _used(asked: Question, facts: SceneFacts) -> dict[str, Any]:

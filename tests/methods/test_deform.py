@@ -16,7 +16,6 @@ from gsjax.methods.deform import (
     Deform,
     DeformingScene,
     Lesson,
-    batch_of,
     can_start_from,
     nodes_of,
     prompt_probabilities,
@@ -87,17 +86,17 @@ class TestStart:
         flat = [replace(frame, depths=np.zeros_like(frame.depths)) for frame in frames]
         with pytest.raises(ValueError, match="depth: no frame has any where a pixel counts"):
             start_gaussians(flat, 0, 1.0)
-        with pytest.raises(ValueError, match="masks: in no frame does any pixel count; are they inverted"):
+        with pytest.raises(ValueError, match="masks: expected pixels that count, found none in any frame"):
             method.start([replace(frame, masks=np.zeros_like(frame.masks)) for frame in frames])
-        with pytest.raises(ValueError, match="frames: expected one picture"):
+        with pytest.raises(ValueError, match="frames: expected one image"):
             method.start([frames[0], eqx.tree_at(lambda f: f.images, frames[1], frames[1].images[:, :-2])])
         with pytest.raises(ValueError, match="codebook: expected rows of 4 numbers, found 3"):
             method.start(frames, lesson._replace(codebook=np.eye(2, 3)))
         with pytest.raises(ValueError, match="expected ids of 1 rows of the codebook, or -1, found 1 in"):
             method.start(frames, lesson._replace(codebook=CODES[:1]))
-        with pytest.raises(ValueError, match="lesson: expected ids of 2 frames, found those of 5"):
+        with pytest.raises(ValueError, match="lesson: expected ids of 2 frames, found 5"):
             method.start(frames[:2], lesson)
-        with pytest.raises(ValueError, match="frames: expected depths of"):
+        with pytest.raises(ValueError, match="frames: expected depths"):
             method.start([frames[0], eqx.tree_at(lambda f: f.depths, frames[1], frames[1].depths[:, :-2])])
         lone = np.zeros_like(frames[0].depths)
         lone[0, 20, 20] = 0.1
@@ -166,16 +165,6 @@ class TestLearning:
         info = jax.device_get(next(ticks).info)
         assert np.isfinite(info["loss"])
         assert not info["skipped"]
-
-    def test_a_teacher_without_numbers_changes_nothing(self, learned):
-        problem, run, *_ = learned
-        batch = batch_of(problem, run, 0)
-        batch = batch._replace(codebook=batch.codebook.at[0, 0].set(jnp.nan))
-        update = jax.jit(Deform(CONFIG).step.update)
-        after, _, info = update(run.params, run.state, batch, step=70, key=jax.random.key(0))
-        assert info["skipped"]
-        for one, other in zip(jax.tree.leaves(run.params), jax.tree.leaves(after), strict=True):
-            np.testing.assert_array_equal(one, other)
 
     def test_rates_fall_over_both_parts_of_the_learning(self, frames):
         """The optimizer begins anew with the deformation, and its rates do not."""

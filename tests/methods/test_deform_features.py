@@ -13,11 +13,11 @@ from gsjax.methods.deform import (
     feature_loss,
     frame_graphs,
     graph_loss,
-    graph_nodes,
     nodes_of,
     prompt_probabilities,
     start_gaussians,
 )
+from gsjax.methods.deform.nodes import far_apart
 from gsjax.scene.deformation import DeformationConfig, init_deformation
 from gsjax.scene.initialize import gaussians_from_points
 from tests.methods.tissue import CODES, CONFIG, tissue
@@ -67,7 +67,7 @@ class TestFeatureLoss:
 @pytest.fixture(scope="module")
 def graphs(frames, ids):
     gaussians = start_gaussians(frames[:1], 0, 1.0)
-    nodes = graph_nodes(gaussians.means, CONFIG.graph.nodes)
+    nodes = far_apart(gaussians.means, CONFIG.graph.nodes)
     places = np.stack([np.asarray(gaussians.means)[nodes]] * len(frames))
     return nodes, {
         kind: frame_graphs(places, nodes, frames, ids, CODES, replace(CONFIG.graph, kind=kind), 0.05)

@@ -10,7 +10,7 @@ import pytest
 from gsjax.engine.drive import drive
 from gsjax.geometry.cameras import intrinsics, look_at
 from gsjax.methods.deform import Deform, DeformConfig
-from gsjax.methods.deform.start import on_plane
+from gsjax.methods.deform.start import with_plane_depths
 from gsjax.scene.initialize import points_from_rgbd
 from tests.methods.tissue import one_frame
 
@@ -31,7 +31,7 @@ def frames():
 
 
 def test_all_frames_see_one_plane_that_the_first_faces(frames):
-    seen, facing = on_plane(frames, 1, 1.5), frames[1].cameras.viewmat[0]
+    seen, facing = with_plane_depths(frames, 1, 1.5), frames[1].cameras.viewmat[0]
     np.testing.assert_allclose(seen[1].depths, 1.5, rtol=1e-6)
     for frame in seen:
         viewmat, K = frame.cameras.viewmat[0], frame.cameras.K[0]
@@ -43,7 +43,7 @@ def test_all_frames_see_one_plane_that_the_first_faces(frames):
 def test_a_camera_that_looks_away_sees_none_of_it(frames):
     turned = np.diag([-1.0, 1.0, -1.0, 1.0]) @ frames[0].cameras.viewmat
     away = eqx.tree_at(lambda f: f.cameras.viewmat, frames[0], turned)
-    np.testing.assert_array_equal(on_plane([frames[0], away], 0, 1.0)[1].depths, 0)
+    np.testing.assert_array_equal(with_plane_depths([frames[0], away], 0, 1.0)[1].depths, 0)
 
 
 def test_a_scene_begins_there_where_the_first_pixel_counts(frames):

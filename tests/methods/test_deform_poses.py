@@ -103,7 +103,7 @@ def test_finds_where_cameras_stood(frames, askew):
     for now in drive(method, *method.start(askew)):
         assert not now.info["skipped"]
     before = corners_off(viewmats_of(askew), frames)
-    after = corners_off(now.result.viewmats, frames)
+    after = corners_off(now.result.timeline.viewmats, frames)
     assert before[1:].mean() > 0.4
     assert after.mean() < 0.5 * before.mean()
 
@@ -113,7 +113,7 @@ class TestRefining:
         twists = learned.run.params.twists
         np.testing.assert_array_equal(twists[learned.problem.first], 0)
         assert (np.abs(np.asarray(twists[1:])).max(axis=1) > 1e-4).all()
-        found, given = learned.result.viewmats, viewmats_of(askew)
+        found, given = learned.result.timeline.viewmats, viewmats_of(askew)
         np.testing.assert_allclose(found[0], given[0], atol=1e-6)
         assert (np.abs(found - given)[1:].max(axis=(1, 2)) > 1e-6).all()
 

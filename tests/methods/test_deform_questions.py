@@ -1,18 +1,23 @@
 """Questions on a deforming scene: a made-up one of known facts, what is understood, and what is not."""
 
+from dataclasses import replace
+
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gsjax.geometry.cameras import Camera, intrinsics
+from gsjax.geometry.cameras import intrinsics
 from gsjax.methods.deform import (
     QUESTIONS,
     DeformingScene,
+    DeformResult,
+    LabelledView,
+    Meaning,
     PromptedAnswerer,
-    Sight,
     TemplatedAnswerer,
-    facts_of_sights,
+    Timeline,
+    facts_of_views,
     parse_question,
     question_prompt,
     rows_of,
@@ -39,7 +44,7 @@ def pixels(columns, rows, depth):
     return depth * np.stack([x.ravel() + 0.5, y.ravel() + 0.5, ones], 1) @ np.linalg.inv(K).T
 
 
-def made_up(t: int) -> Sight:
+def made_up(t: int) -> LabelledView:
     """A wall of tissue, and a tool of 7x7 pixels (11x11 in the second frame) before it."""
     labels, depths = np.zeros((HEIGHT, WIDTH), np.int32), np.full((HEIGHT, WIDTH), DEEP)
     points = np.full((49, 3), 9.0)
@@ -49,13 +54,14 @@ def made_up(t: int) -> Sight:
         depths[labels == 1] = depth
         points = pixels(np.arange(column - 3, column + 4), np.arange(row - 3, row + 4), depth)
     labels[40, 50] = 1  # a speck
-    return Sight(labels, depths, np.eye(4), K, (pixels(np.arange(WIDTH), np.arange(HEIGHT), DEEP), points))
+    wall = pixels(np.arange(WIDTH), np.arange(HEIGHT), DEEP)
+    return LabelledView(labels, depths, np.eye(4), K, (wall, points))
 
 
 @pytest.fixture(scope="module")
 def facts():
     times = np.array([0.0, 0.25, 0.5, 1.0])
-    return facts_of_sights([made_up(t) for t in range(4)], NAMES, FRAMES, times)
+    return facts_of_views([made_up(t) for t in range(4)], NAMES, FRAMES, times)
 
 
 class TestAnswers:
@@ -111,7 +117,7 @@ class TestAnswers:
             s._replace(viewmat=over, labels=s.labels[::-1, ::-1], depths=s.depths[::-1, ::-1])
             for s in map(made_up, range(4))
         ]
-        found = facts_of_sights(turned, NAMES, FRAMES, np.linspace(0, 1, 4))
+        found = facts_of_views(turned, NAMES, FRAMES, np.linspace(0, 1, 4))
         question = "in which direction does the needle driver move between frames 12 and 13"
         assert (ask(question, facts).value, ask(question, found).value) == ("right", "left")
         assert ask("where is the needle driver in frame 11", found).value == "lower right"
@@ -120,7 +126,7 @@ class TestAnswers:
         def scaled(sight, by=7.0):
             return sight._replace(depths=by * sight.depths, points=tuple(by * p for p in sight.points))
 
-        found = facts_of_sights(
+        found = facts_of_views(
             [scaled(made_up(t)) for t in range(4)], NAMES, FRAMES, np.linspace(0, 1, 4), metric=False
         )
         answer = ask("how deep is the needle driver in frame 12", found)
@@ -246,14 +252,14 @@ def wall():
         (jnp.asarray(features, jnp.float32), jnp.full(len(points), 4.0)),
         is_leaf=lambda leaf: leaf is None,
     )
-    camera = Camera(jnp.eye(4)[None], jnp.asarray(K, jnp.float32)[None], WIDTH, HEIGHT)
-    return DeformingScene(gaussians), camera, codes
+    camera = (np.eye(4)[None], K[None], (WIDTH, HEIGHT), 0.01)
+    timeline = Timeline(np.zeros(1), np.array([10]), 1.0, *camera, np.zeros(0, int))
+    return DeformResult(DeformingScene(gaussians), None, Meaning(None, NAMES, codes, np.eye(3)), timeline)
 
 
 class TestOfAScene:
     def test_facts_are_what_is_drawn(self, wall):
-        scene, camera, codes = wall
-        found = scene_facts(scene, None, np.zeros(1), camera, codes, NAMES, (10,))
+        found = scene_facts(wall, [0])
         assert found.gaussians.tolist() == [(WIDTH + 8) * (HEIGHT + 8), 18 * 18]
         assert ask("how deep is the needle driver in frame 10", found).value == pytest.approx(80, abs=1)
         assert ask("how deep is the tissue in frame 10", found).value == pytest.approx(100, abs=1)
@@ -266,14 +272,12 @@ class TestOfAScene:
         np.testing.assert_allclose(found.centers[0, 1], (0.4, 0.4, 80), atol=1)
 
     def test_without_meaning_there_are_none(self, wall):
-        scene, camera, codes = wall
-        bare = DeformingScene(eqx.tree_at(lambda g: g.features, scene.gaussians, None))
-        with pytest.raises(
-            ValueError, match="features: expected those of 2 classes in 3 channels, found none"
-        ):
-            scene_facts(bare, None, np.zeros(1), camera, codes, NAMES, (10,))
-        with pytest.raises(ValueError, match="for each frame, found 2, 1 and 1"):
-            scene_facts(scene, None, np.zeros(2), camera, codes, NAMES, (10,))
+        bare = DeformingScene(eqx.tree_at(lambda g: g.features, wall.scene.gaussians, None))
+        for result in (replace(wall, meaning=None), replace(wall, scene=bare)):
+            with pytest.raises(ValueError, match="expected a scene whose features have a meaning"):
+                scene_facts(result, [0])
+        with pytest.raises(ValueError, match="rows: expected at least one frame"):
+            scene_facts(wall, [])
 
 
 def test_names_are_known_however_they_are_spelt():

@@ -21,7 +21,7 @@ from gsjax.methods.distill import (
     teacher_of_objects,
     with_maps,
 )
-from gsjax.methods.distill.teacher import most_rows, of_view
+from gsjax.methods.distill.teacher import max_rows, view_codebook
 from gsjax.methods.distill.update import _stretched, strip_rows
 from gsjax.rasterize.frozen import paint
 from gsjax.scene.feature_grid import FeatureGridConfig
@@ -74,9 +74,9 @@ def loss_of(config, run, batch, step=0):
 
 def test_a_view_keeps_what_it_shows_of_the_codebook_and_that_is_as_good(scene):
     teacher = objects()
-    assert most_rows(teacher) == 2
+    assert max_rows(teacher) == 2
     for v in range(3):
-        ids, book = of_view(teacher, v, 4)
+        ids, book = view_codebook(teacher, v, 4)
         assert book.shape == (4, DIMENSION)
         np.testing.assert_array_equal(ids < 0, teacher.ids[v] < 0)
         np.testing.assert_array_equal(book[ids[ids >= 0]], teacher.codebook[teacher.ids[v][ids >= 0]])
@@ -90,10 +90,10 @@ def test_a_view_keeps_what_it_shows_of_the_codebook_and_that_is_as_good(scene):
 
 def test_views_that_show_all_or_nothing_of_the_codebook_are_told_apart():
     full = teacher_of_objects([np.arange(6).reshape(2, 3)], [BOOK])
-    ids, book = of_view(full, 0, 6)
+    ids, book = view_codebook(full, 0, 6)
     np.testing.assert_allclose(book[ids], full.codebook[full.ids[0]])
     silent = full._replace(ids=[np.full((2, 3), -1)])
-    ids, book = of_view(silent, 0, 2)
+    ids, book = view_codebook(silent, 0, 2)
     assert (ids == -1).all()
     assert not book.any()
 
@@ -114,7 +114,7 @@ def test_two_teachers_are_the_mean_of_both_by_weight(scene, weight):
 
 
 def test_teachers_that_do_not_go_together_are_refused():
-    with pytest.raises(ValueError, match="expected one of objects and one of maps"):
+    with pytest.raises(ValueError, match="expected one of masks and one of maps"):
         with_maps(maps(), objects())
     other = teacher_of_maps([np.ones((9, 12, 5))] * 3, [(HEIGHT, WIDTH)] * 3)
     with pytest.raises(ValueError, match="expected features of 24 numbers as the objects have, found 5"):
@@ -249,7 +249,7 @@ def test_teachers_that_cannot_be_are_refused(masks, embeddings, says):
 
 def test_objects_that_look_the_same_are_one_thing_and_a_silent_view_is_told():
     rows = np.stack([np.zeros(4), np.eye(4)[0], np.eye(4)[1], np.eye(4)[0]]).astype(np.float32)
-    with pytest.warns(UserWarning, match="views without any mask teach nothing: 1 of 2"):
+    with pytest.warns(UserWarning, match="views without any mask are not used: 1 of 2"):
         teacher = teacher_of_objects([mask_of(0, 1, 2, 3, -1), mask_of(0, 0, 0, 0, 0)], [rows, rows])
     one, two = teacher.ids[0][0, 1], teacher.ids[0][0, 2]
     np.testing.assert_array_equal(teacher.ids[0][0], [-1, one, two, one, -1])
@@ -265,7 +265,7 @@ def test_objects_that_look_the_same_are_one_thing_and_a_silent_view_is_told():
         ([np.zeros((3, 4, 5)), np.full((3, 4, 5), np.inf)], "maps of view 1: expected numbers"),
         (
             [np.zeros((30, 40, 5)), np.zeros((40, 30, 5))],
-            "expected a picture of the shape of its view, 48x36",
+            "expected the aspect ratio of its view, 48x36",
         ),
     ],
 )

@@ -16,7 +16,7 @@ from gsjax.engine.selected import Changes
 from gsjax.geometry.cameras import Camera
 from gsjax.io.pictures import write_png
 from gsjax.io.video import VideoWriter
-from gsjax.methods.deform import DeformResult, Wanted
+from gsjax.methods.deform import DeformResult, Prompt
 from gsjax.methods.deform.query import most_likely, prompt_probabilities
 from gsjax.rasterize.plan import Plan
 from gsjax.scene.gaussians import Gaussians
@@ -58,7 +58,7 @@ def draw(
     folder: Path,
     result: DeformResult,
     pictured: Sequence[int],
-    wanted: Wanted,
+    prompt: Prompt,
     threshold: float,
     changes: Changes,
     console: Console,
@@ -70,7 +70,7 @@ def draw(
         folder: for them.
         result: the scene.
         pictured: indices of the frames.
-        wanted: what is looked for.
+        prompt: the prompt of the query.
         threshold: of the score of a Gaussian, and of a pixel.
         changes: edits of what is meant.
         console: shows progress.
@@ -82,13 +82,13 @@ def draw(
     with VideoWriter(folder / "video.mp4", _frame_rate(result)) as video:
         for seen in _frames(result, console):
             assert seen.gaussians.features is not None
-            selected = wanted.scores(seen.gaussians.features) > threshold
+            selected = prompt.scores(seen.gaussians.features) > threshold
             both = {f"frame {result.timeline.frame_ids[seen.t]}": to_uint8(seen.colors)}
             both["without it"] = _picture(hidden(seen.gaussians, selected), seen)
             video.write(in_rows(both, 2, _PANEL_HEIGHT))
             if seen.t in pictured:
                 name = f"{result.timeline.frame_ids[seen.t]:06d}"
-                mask = (np.asarray(wanted.scores(seen.features)) > threshold) & seen.there
+                mask = (np.asarray(prompt.scores(seen.features)) > threshold) & seen.there
                 write_png(folder / "masks" / f"{name}.png", np.where(mask, 255, 0).astype(np.uint8))
                 pixels[name] = int(mask.sum())
                 scenes = {"it alone": hidden(seen.gaussians, ~selected)}

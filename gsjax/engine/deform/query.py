@@ -21,7 +21,7 @@ from gsjax.engine.recording import parse_frames
 from gsjax.engine.selected import Changes, write_scenes, write_selection
 from gsjax.io.atomic import write_json, write_npz
 from gsjax.io.ply import write_ply
-from gsjax.methods.deform import DeformResult, Wanted, wanted_like, wanted_text
+from gsjax.methods.deform import DeformResult, Prompt, feature_prompt, text_prompt
 from gsjax.methods.deform.query import most_likely, region_feature
 from gsjax.scene.gaussians import Gaussians
 from gsjax.scene.render import render_with_room
@@ -128,20 +128,20 @@ def answer_deformation(
             answer = about | found | {"shares": draw_labels(new, result, shown, console), "notes": notes.all}
             write_json(new / "query.json", answer)
         return answer
-    wanted = wanted_of(result, question, t, there)
-    scores, about["query_seconds"] = _timed(lambda: wanted.scores(there.features))
-    threshold = wanted.threshold(scores, question.threshold)
+    prompt = prompt_of(result, question, t, there)
+    scores, about["query_seconds"] = _timed(lambda: prompt.scores(there.features))
+    threshold = prompt.threshold(scores, question.threshold)
     selected = scores > threshold.value
     _check_count(question, selected, scores, threshold.value, about["frame"], notes)
     with replaced_folder(folder, OF_QUERY) as new:
         every, scenes = np.arange(there.num), changes.of(there, selected)
         write_selection(new / "selection.npz", there, selected, scores, every, there.num)
         write_scenes(new, there, selected, scenes)
-        pixels = draw(new, result, shown, wanted, threshold.value, changes, console)
+        pixels = draw(new, result, shown, prompt, threshold.value, changes, console)
         means = np.asarray(there.means)[selected]
         answer = about | {
-            "meant": wanted.meant,
-            "against": wanted.against,
+            "meant": prompt.name,
+            "against": prompt.negatives,
             "threshold": threshold.value,
             "rule": threshold.rule,
             "gaussians": int(selected.sum()),
@@ -195,7 +195,7 @@ def _write_labels(
     return {"classes": counts, "colors": colors}
 
 
-def wanted_of(result: DeformResult, question: DeformQuestion, t: int, there: Gaussians) -> Wanted:
+def prompt_of(result: DeformResult, question: DeformQuestion, t: int, there: Gaussians) -> Prompt:
     """A text, a point or a box in the scene's channels.
 
     Args:
@@ -213,7 +213,7 @@ def wanted_of(result: DeformResult, question: DeformQuestion, t: int, there: Gau
         assert question.text is not None
         source = result.meaning.source
         encoder = partial(source.encoder, question.weights)
-        return wanted_text(result.meaning, question.text, question.negatives, encoder)
+        return text_prompt(result.meaning, question.text, question.negatives, encoder)
     drawn, _ = render_with_room(there, result.camera(t))
     assert drawn.features is not None
     try:
@@ -221,7 +221,7 @@ def wanted_of(result: DeformResult, question: DeformQuestion, t: int, there: Gau
     except ValueError as error:
         option = "--point" if question.box is None else "--box"
         raise ValueError(f"{option}: {error} (frame {result.timeline.frame_ids[t]})") from None
-    return wanted_like(result.meaning, feature.astype(np.float64))
+    return feature_prompt(result.meaning, feature.astype(np.float64))
 
 
 def _frame(result: DeformResult, frame: int | None) -> int:

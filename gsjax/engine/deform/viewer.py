@@ -16,7 +16,7 @@ from gsjax.engine.deform.pictures import probabilities_of
 from gsjax.engine.files import reopen
 from gsjax.engine.messages import Notes, describe
 from gsjax.engine.selected import EXTRACTED, keep_part
-from gsjax.methods.deform import DeformResult, Wanted, wanted_like, wanted_text
+from gsjax.methods.deform import DeformResult, Prompt, feature_prompt, text_prompt
 from gsjax.methods.deform.query import most_likely
 from gsjax.viz.viewer import Answer, Asking, Motion, Shots, Viewable
 
@@ -73,24 +73,24 @@ def asking_of(path: Path, result: DeformResult, weights: Path | None = None) -> 
         assert features is not None
         return features
 
-    def answer(words: str, wanted: Wanted, features: Float[jax.Array, "n c"]) -> Answer:
-        jax.block_until_ready(wanted.scores(features))  # what compiles is no answer's time
+    def answer(words: str, prompt: Prompt, features: Float[jax.Array, "n c"]) -> Answer:
+        jax.block_until_ready(prompt.scores(features))  # what compiles is no answer's time
         begun = perf_counter()
-        scores = np.asarray(wanted.scores(features))
+        scores = np.asarray(prompt.scores(features))
         seconds = perf_counter() - begun
-        return Answer(words, scores, *wanted.threshold(scores), seconds)
+        return Answer(words, scores, *prompt.threshold(scores), seconds)
 
     one_by_one, encoder = threading.Lock(), cache(lambda: meaning.source.encoder(weights))
 
     def ask(text: str, frame: int) -> Answer:
         with one_by_one:  # several pages may ask before the encoder is loaded
-            wanted = wanted_text(meaning, text, encoder=encoder)
-        return answer(text, wanted, features_in(frame))
+            prompt = text_prompt(meaning, text, encoder=encoder)
+        return answer(text, prompt, features_in(frame))
 
     def like(row: int, frame: int) -> Answer:
         features = features_in(frame)
-        wanted = wanted_like(meaning, np.asarray(features[row], np.float64))
-        return answer(f"like Gaussian {row} ({wanted.meant})", wanted, features)
+        prompt = feature_prompt(meaning, np.asarray(features[row], np.float64))
+        return answer(f"like Gaussian {row} ({prompt.name})", prompt, features)
 
     def save(selected: Bool[np.ndarray, "n"], name: str, frame: int) -> Path:
         timeline = result.timeline
@@ -112,4 +112,5 @@ def _shots(path: Path, result: DeformResult, notes: Notes) -> Shots:
     except (ValueError, OSError) as error:
         notes.warn(f"its photographs are not shown: {describe(error)}")
     sizes = np.array([result.timeline.size])
-    return Shots(("camera",), result.viewmats[:, None], result.timeline.Ks[:, None], sizes, load_image=load)
+    viewmats, Ks = result.timeline.viewmats[:, None], result.timeline.Ks[:, None]
+    return Shots(("camera",), viewmats, Ks, sizes, load_image=load)

@@ -12,17 +12,17 @@ from jaxtyping import Array, Float, Int
 
 from gsjax.geometry.cameras import Camera
 from gsjax.methods.distill import (
-    Batch,
     DistillConfig,
     FeatureField,
     Teacher,
     distill_loss,
     frozen_views,
     gaussian_cosines,
-    painted_cosines,
+    pixel_cosines,
     rendered_features,
+    view_batch,
 )
-from gsjax.methods.distill.teacher import most_rows, of_view
+from gsjax.methods.distill.teacher import max_rows
 from gsjax.metrics.segmentation import MaskOverlap
 from gsjax.optim.compiler import host_options
 from gsjax.rasterize.frozen import FrozenView, padded_view, paint_shown, rows_within, strip_of
@@ -133,13 +133,8 @@ def angle_error(config: DistillConfig) -> Callable[[FeatureField, Located | None
     loss = jax.jit(partial(distill_loss(quiet), step=0, key=None), compiler_options=host_options())
 
     def error(field: FeatureField, located: Located | None, frozen: Frozen, teacher: Teacher) -> float:
-        view, plan = frozen
-        rows = 1 << (most_rows(teacher) - 1).bit_length()  # few lengths, so few programs
-        ids, codebook = of_view(teacher, 0, rows)
-        of_pixels = None if teacher.maps is None else teacher.maps[0]
-        codebook = None if codebook is None else jnp.asarray(codebook)
-        batch = Batch(view, located, jnp.asarray(ids), codebook, of_pixels, plan)
-        return float(loss(field, batch)[1]["cos"])
+        rows = 1 << (max_rows(teacher) - 1).bit_length()  # few lengths, so few programs
+        return float(loss(field, view_batch(teacher, 0, rows, located, frozen))[1]["cos"])
 
     return error
 
@@ -179,7 +174,7 @@ def _maps(
 
     def of_strip(first):
         strip, strip_plan = strip_of(view, plan, first, rows)
-        cosines, alphas = painted_cosines(field, parts, strip, strip_plan, codes)
+        cosines, alphas = pixel_cosines(field, parts, strip, strip_plan, codes)
         shares, _ = paint_shown(strip, kinds, strip_plan)
         by_pixel = jnp.where(alphas > _OPAQUE, cosines.argmax(axis=-1), -1)
         return by_pixel, jnp.where(shares.max(axis=-1) > _OPAQUE, shares.argmax(axis=-1), -1)

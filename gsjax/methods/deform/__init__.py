@@ -1,20 +1,20 @@
-"""Scenes that deform, with meaning, as seen by an endoscope: SurstSplat and GaussianClin.
+"""Deforming scenes with semantic features, as seen by an endoscope: SurstSplat and GaussianClin.
 
 method = Deform(config)
 problem, run = method.start(frames, lesson)
 for now in drive(method, problem, run): ...
 now.result.at(0.5)
 
-config.py     what can be set; the two papers' recipes
-method.py     what the loop has to know
-start.py      the first Gaussians, from depth over time or on a plane
-poses.py      where cameras stood, where that is refined
-nodes.py      the places where the field is evaluated
+config.py     configuration, and the recipes of the two papers
+method.py     the method of the drive loop
+start.py      initial Gaussians, from the depth of all frames or on a plane
+poses.py      refined camera poses
+nodes.py      the nodes at which the field is evaluated
 graph.py      the teacher's features at nodes, and the losses on their edges
-update.py     the losses, and one step: deform, draw colours and features, compare, descend
-result.py     the scene at any time, and what is what in it
-meaning.py    what features mean, and what a text is among them
-query.py      which Gaussians a prompt means
+update.py     the losses, and one optimization step
+result.py     the scene at any time, its cameras, and queries
+meaning.py    the vocabulary of the features, and prompts
+query.py      probabilities of prompts
 facts.py      measurements of a scene
 questions.py  questions in plain English
 answers.py    their answers, from facts
@@ -27,17 +27,16 @@ from gsjax.methods.deform.config import (
     DeformRatesConfig,
     DeformWeightsConfig,
 )
-from gsjax.methods.deform.facts import SceneFacts, Sight, facts_of_sights, scene_facts
+from gsjax.methods.deform.facts import LabelledView, SceneFacts, facts_of_views, scene_facts
 from gsjax.methods.deform.graph import (
     FrameGraph,
     GraphConfig,
     frame_graphs,
     graph_loss,
-    graph_nodes,
     graph_of,
     seen_ids,
 )
-from gsjax.methods.deform.meaning import Lesson, Meaning, Wanted, counted_ids, wanted_like, wanted_text
+from gsjax.methods.deform.meaning import Lesson, Meaning, Prompt, counted_ids, feature_prompt, text_prompt
 from gsjax.methods.deform.method import Deform, Kept, Problem, batch_of, with_field
 from gsjax.methods.deform.nodes import nodes_of
 from gsjax.methods.deform.poses import refined_viewmats, times_of
@@ -69,27 +68,27 @@ __all__ = [
     "FrameGraph",
     "GraphConfig",
     "Kept",
+    "LabelledView",
     "Lesson",
     "Meaning",
     "Moving",
     "Problem",
+    "Prompt",
     "PromptedAnswerer",
     "Question",
     "QuestionType",
     "SceneFacts",
-    "Sight",
     "TemplatedAnswerer",
     "Timeline",
-    "Wanted",
     "batch_of",
     "can_start_from",
     "counted_ids",
     "deform_loss",
-    "facts_of_sights",
+    "facts_of_views",
     "feature_loss",
+    "feature_prompt",
     "frame_graphs",
     "graph_loss",
-    "graph_nodes",
     "graph_of",
     "nodes_of",
     "on_grid",
@@ -102,8 +101,7 @@ __all__ = [
     "seen_ids",
     "start_gaussians",
     "step",
+    "text_prompt",
     "times_of",
-    "wanted_like",
-    "wanted_text",
     "with_field",
 ]

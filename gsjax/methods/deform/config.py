@@ -1,4 +1,4 @@
-"""Settings of a deforming scene, and the two papers' recipes."""
+"""Configuration of a deforming scene, and the recipes of the two papers."""
 
 from dataclasses import dataclass, field
 from types import MappingProxyType
@@ -13,7 +13,7 @@ from gsjax.scene.deformation import DeformationConfig
 
 @dataclass(frozen=True)
 class DeformRatesConfig:
-    """Learning rates of Adam: the most by which a step changes a number."""
+    """Learning rates of Adam."""
 
     means: float = 1.6e-4
     """Learning rate of the centres, in radii of the scene."""
@@ -28,11 +28,12 @@ class DeformRatesConfig:
     features: float = 2.5e-3
     """Learning rate of the semantic features."""
     planes: float = 1e-2
-    """Learning rate of the values at vertices of the field's planes or voxels."""
+    """Learning rate of the vertices of the field's planes or voxels."""
     layers: float = 1e-3
     """Learning rate of the field's network."""
     twists: float = 1e-3
-    """Learning rate of the poses, where they are refined: rotations in radians, shifts in radii."""
+    """Learning rate of the poses, where they are refined: rotations in radians, translations in radii of the
+    scene."""
 
     def __post_init__(self):
         expect(self, "rates.", **dict.fromkeys(vars(self), (0, np.inf)))
@@ -45,15 +46,15 @@ class DeformWeightsConfig:
     dssim: float = 0.2
     """lambda of (1 - lambda) L1 + lambda D-SSIM (SurstSplat, eq. 13)."""
     depth: float = 1.0
-    """Weight of the difference in depth, in radii of the scene; 0: depth serves the start alone."""
+    """Weight of the depth error, in radii of the scene; 0: depth is used for initialization only."""
     feature: float = 1.0
-    """Weight of the difference in features, where there is a teacher (GaussianClin, eq. 10)."""
+    """Weight of the feature error, where there is a teacher (GaussianClin, eq. 10)."""
     plane_tv: float = 2e-4
-    """Weight of differences between neighbours on the field's planes of space (4DGS)."""
+    """Weight of the total variation of the field's spatial planes (4DGS)."""
     time_smoothness: float = 1e-3
-    """Weight of second differences over time on the field's planes of time (4DGS)."""
+    """Weight of second differences over time on the field's space-time planes (4DGS)."""
     time_sparsity: float = 1e-4
-    """Weight of the distance of the planes of time from 1, where nothing moves (4DGS)."""
+    """Weight of the distance of the space-time planes from 1, at which nothing moves (4DGS)."""
 
     def __post_init__(self):
         expect(self, "weights.", **dict.fromkeys(vars(self), (0, np.inf)))
@@ -61,31 +62,31 @@ class DeformWeightsConfig:
 
 @dataclass(frozen=True)
 class DeformConfig:
-    """How a deforming scene is reconstructed."""
+    """Configuration of the reconstruction of a deforming scene."""
 
     warmup: int = 1000
-    """Steps in which the canonical scene learns alone (GaussianClin, section A)."""
+    """Steps in which only the canonical scene is optimized (GaussianClin, section A)."""
     iterations: int = 3000
-    """Steps after these, in which scene and deformation learn together."""
+    """Steps after the warm-up, in which scene and deformation are optimized jointly."""
     start_pixels: float = 1.3
-    """Edge of the cubes that are thinned to one of the first Gaussians, in pixels."""
+    """Edge of the cubes in which the initial points are thinned to one Gaussian each, in pixels."""
     plane_depth: float = 1.0
-    """Distance from the first camera to the plane on which the scene begins without depth, in the unit of the
-    poses; it makes no difference to a camera that stands still."""
+    """Distance from the first camera to the plane on which a scene without depth is initialized, in the unit
+    of the poses; it makes no difference if the camera is static."""
     warmup_frames: Literal["first", "all"] = "first"
-    """Frames that the canonical scene learns from: the one at which it begins, or all."""
+    """Frames of the warm-up: the one that the canonical scene is initialized from, or all."""
     refine_poses: bool = False
-    """Rotate and shift the cameras of all frames but the first from their given poses."""
+    """Optimize the poses of the cameras of all frames but the first."""
     nodes: int = 2048
-    """Places at which the field is evaluated, whose values Gaussians blend; 0: it is evaluated at every
-    Gaussian, as in the papers."""
+    """Number of nodes at which the field is evaluated and whose values the Gaussians blend; 0: it is
+    evaluated at every Gaussian, as in the papers."""
     moving_share: float = 1.0
-    """Without nodes, the share of the Gaussians that go on deforming after a quarter of the steps with
-    deformation: those that moved farthest by then. The others stand still and cost the field nothing."""
+    """Without nodes, the share of the Gaussians that still deform after a quarter of the joint steps: those
+    that have moved farthest by then. The field is no longer evaluated at the others."""
     optimizer: Literal["adam", "adamw"] = "adam"
-    """Adam, or AdamW, which also shrinks all numbers by 1e-5 of a rate."""
+    """Adam, or AdamW with a weight decay of 1e-5."""
     schedule: Literal["exponential", "cosine"] = "exponential"
-    """How rates fall over the steps: to a tenth, or along a cosine to nothing."""
+    """Decay of the learning rates over the steps: exponentially to a tenth, or along a cosine to zero."""
     deformation: DeformationConfig = field(default_factory=DeformationConfig)
     rates: DeformRatesConfig = field(default_factory=DeformRatesConfig)
     weights: DeformWeightsConfig = field(default_factory=DeformWeightsConfig)
@@ -93,7 +94,7 @@ class DeformConfig:
     channels: int = 16
     """Channels of a Gaussian's feature, where there is a teacher."""
     seed: int = 0
-    """Seed of the first values and of the order of frames."""
+    """Seed of the initial values and of the order of frames."""
 
     def __post_init__(self):
         expect(
@@ -108,7 +109,7 @@ class DeformConfig:
         )
         if self.nodes and self.moving_share < 1:
             raise ValueError(
-                f"moving_share: expected 1 with nodes, of which there are few, found {self.moving_share}; "
+                f"moving_share: expected 1 where the field is evaluated at nodes, found {self.moving_share}; "
                 "set nodes to 0"
             )
 

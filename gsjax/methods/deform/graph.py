@@ -1,10 +1,10 @@
-"""The graph over a scene that moves: the teacher's features at nodes, and the losses that tie the scene's
-features to them.
+"""The graph over a moving scene: the teacher's features at nodes, and losses between them and the scene's
+features.
 
-Nodes are Gaussians far from each other, the same in all frames, for the scene is one and moves. In a frame a
-node is valid if the frame shows it: it falls on a pixel that counts, at the depth that is seen there.
-A step has the graph of its frame and of those around it. Where all frames are known it is made once, on the
-host (`frame_graphs`); where they come one by one, within the step (`seen_ids`, `graph_of`).
+Nodes are Gaussians far from each other, the same in all frames. A node is valid in a frame if it is visible
+there: it projects to a pixel that counts, at the depth of that pixel. A step has the graph of its frame and
+the frames around it. If all frames are known, it is made once, on the host (`frame_graphs`); if they arrive
+one by one, within the step (`seen_ids`, `graph_of`).
 """
 
 from collections.abc import Sequence
@@ -17,7 +17,6 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from gsjax.geometry.cameras import Camera, pixels_of, project
-from gsjax.geometry.sampling import farthest_points
 from gsjax.losses.edges import (
     Edges,
     Matching,
@@ -33,18 +32,18 @@ from gsjax.methods.deform.start import known_depth
 from gsjax.methods.settings import expect
 from gsjax.scene.frame import Frame
 
-_NEAR = 0.05  # share of the depth by which what is seen may lie before or behind a node
+_NEAR = 0.05  # relative difference in depth between a node and its pixel, for it to be visible there
 
 
 @dataclass(frozen=True)
 class GraphConfig:
-    """Nodes, edges, and weights of the losses; the defaults are SurstSplat's (section 3)."""
+    """Nodes, edges and loss weights of the graph; the defaults are SurstSplat's (section 3)."""
 
     kind: Literal["matching", "similarity", "none"] = "matching"
     """SurstSplat's node and structure losses (eqs. 11 and 12), GaussianClin's similar pairs (eq. 8), or no
     graph."""
     after: float = 0.5
-    """Share of the steps with deformation before the graph is made, which needs to know how nodes move."""
+    """Share of the joint steps after which the graph is made, from the nodes' motion so far."""
     nodes: int = 256
     """Number of nodes."""
     neighbors: int = 8
@@ -52,19 +51,19 @@ class GraphConfig:
     matches: int = 4
     """Edges from a node to each other frame of the window."""
     window: int = 2
-    """Frames to either side."""
+    """Number of frames on either side of a step's frame."""
     tau_x: float = 0.1
-    """Distance over which edges lose weight (SurstSplat, eq. 8), in radii of the scene."""
+    """Length scale of the edges' weights (SurstSplat, eq. 8), in radii of the scene."""
     tau_t: float = 0.5
-    """Time over which edges lose weight, as a share of the window."""
+    """Time scale of the edges' weights, as a share of the window."""
     node: float = 0.1
     """Weight of SurstSplat's node loss."""
     structure: float = 0.1
     """Weight of SurstSplat's structure loss."""
     spatial: float = 0.1
-    """Weight of GaussianClin's pairs within a frame."""
+    """Weight of GaussianClin's loss on pairs within a frame."""
     temporal: float = 0.1
-    """Weight of GaussianClin's pairs across frames."""
+    """Weight of GaussianClin's loss on pairs across frames."""
 
     def __post_init__(self):
         expect(
@@ -82,16 +81,16 @@ class GraphConfig:
 
 
 class FrameGraph(NamedTuple):
-    """The graph of a frame and of those around it, T of them.
+    """The graph of a frame and those around it, T in all.
 
     Attributes:
         nodes: rows of the Gaussians that are nodes.
-        times: of the frames, 0 to 1.
-        teacher: its features at nodes, in the scene's channels.
+        times: times of the frames, 0 to 1.
+        teacher: the teacher's features at nodes, in the scene's channels.
         valid: where it has one.
-        edges: of each kind, spatial and temporal together for a matching, else one after the other.
-        wanted: the teacher's affinities of edges; None without a matching.
-        weights: of edges; None without a matching.
+        edges: spatial and temporal edges; for a matching, the union of both.
+        affinities: the teacher's affinities of edges; None without a matching.
+        weights: weights of edges; None without a matching.
     """
 
     nodes: Int[Array, "n"]
@@ -99,7 +98,7 @@ class FrameGraph(NamedTuple):
     teacher: Float[Array, "T n c"]
     valid: Bool[Array, "T n"]
     edges: tuple[Edges, ...]
-    wanted: Float[Array, "T n e"] | None
+    affinities: Float[Array, "T n e"] | None
     weights: Float[Array, "T n e"] | None
 
 
@@ -115,13 +114,12 @@ def frame_graphs(
     """The graph of each frame.
 
     Args:
-        places: of nodes, deformed as in each frame, metres.
+        places: deformed positions of the nodes in each frame, metres.
         nodes: rows of the Gaussians that are nodes.
-        frames: of one camera each, over time.
-        ids: row of the codebook of each of the teacher's pixels, for each frame; -1 for none.
-        codebook: the teacher's features, in the scene's channels.
-        config: of the graph.
-        radius: of the scene, metres.
+        frames: frames of one camera over time.
+        ids, codebook: the teacher's labels, as in `Lesson`.
+        config: configuration of the graph.
+        radius: radius of the scene, metres.
     """
     labelled = [_labelled(*one, codebook) for one in zip(places, frames, ids, strict=True)]
     teacher, valid = (np.stack(column) for column in zip(*labelled, strict=True))
@@ -150,10 +148,10 @@ def graph_of(
     """The graph of T frames; a pure function of its arrays.
 
     Args:
-        config: of the graph.
-        radius: of the scene, metres.
+        config: configuration of the graph.
+        radius: radius of the scene, metres.
         nodes, times, teacher, valid: as in `FrameGraph`.
-        places: of nodes in each frame, metres.
+        places: positions of the nodes in each frame, metres.
     """
     if config.kind == "similarity":
         edges = (
@@ -163,10 +161,10 @@ def graph_of(
         return FrameGraph(nodes, times, teacher, valid, edges, None, None)
     both = spatial_edges(places, config.neighbors, valid)
     both |= temporal_edges(teacher, config.matches, config.window, valid, _MATCHING)
-    wanted = edge_affinities(teacher, both, valid, _MATCHING)
+    affinities = edge_affinities(teacher, both, valid, _MATCHING)
     span = jnp.maximum(times[-1] - times[0], 1e-6)
     weights = edge_weights(places, teacher, times, both, config.tau_x * radius, config.tau_t * span)
-    return FrameGraph(nodes, times, teacher, valid, (both,), wanted, weights)
+    return FrameGraph(nodes, times, teacher, valid, (both,), affinities, weights)
 
 
 def seen_ids(
@@ -175,14 +173,15 @@ def seen_ids(
     ids: Int[Array, "C h w"],
     depths: Float[Array, "C height width"],
 ) -> Int[Array, "n"]:
-    """The row of the codebook that the teacher gives each place, in the first of C cameras that sees it; -1
-    where none does. A pure function of its arrays, for within a step; `frame_graphs` does it on the host.
+    """The teacher's label of each place in the first of C cameras that sees it; -1 where none does. A pure
+    function of its arrays, for use within a step; on the host, `frame_graphs` does the same.
 
     Args:
-        places: metres.
-        cameras: that look at them, viewmat [C,4,4] and K [C,3,3].
-        ids: of the teacher's pixels, a grid of any size over each picture; -1 for none.
-        depths: what is seen, metres; 0 where unknown, and there nothing hides a place.
+        places: positions, metres.
+        cameras: viewmat [C,4,4] and K [C,3,3].
+        ids: row of the codebook of each of the teacher's pixels, a grid of any size over each image; -1 for
+            none.
+        depths: depths of the images, metres; 0 where unknown, where nothing occludes a place.
     """
     (high, wide), (height, width) = ids.shape[1:], depths.shape[1:]
 
@@ -199,34 +198,27 @@ def seen_ids(
     return jnp.take_along_axis(found, jnp.argmax(found >= 0, axis=0)[None], axis=0)[0]
 
 
-def graph_nodes(means: Float[Array, "n 3"], count: int) -> Int[np.ndarray, "count"]:
-    """Rows of Gaussians that lie far from each other."""
-    sample = jax.jit(farthest_points, static_argnums=1)(means, min(count, len(means)))
-    return np.asarray(sample.indices)[np.asarray(sample.valid)]
-
-
 def graph_loss(
     features: Float[Array, "N c"] | Float[Array, "T n c"], graph: FrameGraph, config: GraphConfig
 ) -> dict[str, Array]:
-    """Losses on the nodes' features, by name; each times its weight.
+    """Weighted losses on the nodes' features, by name.
 
     Args:
-        features: of all Gaussians, the same at all times; or of the nodes at the graph's times, where they
-            change (`features_at`).
-        graph: of a frame.
-        config: of the graph.
+        features: features of all Gaussians, constant over time; or of the nodes at the graph's times.
+        graph: graph of a frame.
+        config: configuration of the graph.
     """
     ours = features
     if features.ndim == 2:
         one = features[graph.nodes]
         ours = jnp.broadcast_to(one, (len(graph.times), *one.shape))
     if config.kind == "matching":
-        assert graph.wanted is not None
+        assert graph.affinities is not None
         (edges,) = graph.edges
         return {
             "node": config.node * node_loss(ours, graph.teacher, graph.valid),
             "structure": config.structure
-            * structure_loss(ours, graph.wanted, edges, graph.weights, graph.valid, _MATCHING),
+            * structure_loss(ours, graph.affinities, edges, graph.weights, graph.valid, _MATCHING),
         }
     spatial, temporal = graph.edges
     return {
@@ -235,7 +227,7 @@ def graph_loss(
     }
 
 
-_MATCHING = Matching(derivative="implicit")  # rows are off by 3e-7 at this temperature
+_MATCHING = Matching(derivative="implicit")  # row sums are off by 3e-7 at this temperature
 
 
 def _labelled(
@@ -244,8 +236,7 @@ def _labelled(
     ids: Int[np.ndarray, "h w"],
     codebook: Float[np.ndarray, "k c"],
 ) -> tuple[Float[np.ndarray, "n c"], Bool[np.ndarray, "n"]]:
-    """The teacher's features at places in a frame, and where it has one of them and not of what is before or
-    behind them."""
+    """The teacher's features at places in a frame, and where it has one and the place is visible."""
     camera = frame.cameras
     column, row, z, inside = pixels_of(places, camera.viewmat[0], camera.K[0], camera.width, camera.height)
     depth = known_depth(frame)[row, column]

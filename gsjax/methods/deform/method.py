@@ -1,4 +1,4 @@
-"""The reconstruction as one value: the next frame, when the field opens, what moves, and the graph."""
+"""The method of the drive loop: frames, warm-up, deformation field, moving Gaussians and the graph."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -13,12 +13,12 @@ from jaxtyping import Array, Float, Int
 from gsjax.geometry.cameras import on_device
 from gsjax.losses.extra import ExtraLosses, named_losses
 from gsjax.methods.deform.config import DeformConfig
-from gsjax.methods.deform.graph import FrameGraph, frame_graphs, graph_nodes
+from gsjax.methods.deform.graph import FrameGraph, frame_graphs
 from gsjax.methods.deform.meaning import Lesson, counted_ids
-from gsjax.methods.deform.nodes import nodes_of
-from gsjax.methods.deform.poses import refined_frames, refined_viewmats, times_of
+from gsjax.methods.deform.nodes import far_apart, nodes_of
+from gsjax.methods.deform.poses import refined_viewmats, times_of
 from gsjax.methods.deform.result import DeformResult, Timeline, timeline_of
-from gsjax.methods.deform.start import can_start_from, known_depth, on_plane, start_gaussians
+from gsjax.methods.deform.start import can_start_from, known_depth, start_gaussians, with_plane_depths
 from gsjax.methods.deform.update import Batch, DeformingScene, Moving, deform_step
 from gsjax.methods.sampling import shuffled_index
 from gsjax.optim.method import Run
@@ -30,25 +30,25 @@ from gsjax.scene.gaussians import Gaussians, cull_invalid
 from gsjax.scene.render import plan_render
 
 PLAN = "view"
-"""The name in `Run.plans` of the plan that frames are drawn with."""
-_OUTSIDE = 0.005  # of the Gaussians, that may lie beyond either end of an axis
-_GATE_AFTER = 0.25  # of the steps with deformation: until then all may move
-_THIN = 0.2  # radii: a scene is taken to reach this far along an axis at least, as a plane does not
-_MARGIN = 0.05  # of the field's box around the scene, as a share of its edges: what moves stays inside
+"""Name in `Run.plans` of the plan that frames are rendered with."""
+_OUTSIDE = 0.005  # share of the Gaussians that may lie outside of the field's box at either end of an axis
+_GATE_AFTER = 0.25  # share of the joint steps in which all Gaussians may move
+_LEAST_EDGE = 0.2  # radii; least extent along an axis, for a flat scene
+_MARGIN = 0.05  # of the field's box around the scene, relative to its edges
 
 
 class Problem(NamedTuple):
-    """What does not change during a reconstruction.
+    """The constants of a reconstruction.
 
     Attributes:
-        frames: what a camera saw, on the host.
+        frames: training frames, on the host.
         lesson: the teacher's labels of them; None without a teacher.
         seen: the same frames on the device.
-        ids: the teacher's ids of pixels that count, on the device; None without.
-        codebook: of the teacher, on the device; None without.
-        first: index of the frame that the canonical scene is like.
-        radius: of the scene, metres; the unit of rates.
-        bounds: of the deformation field, around the first Gaussians, metres.
+        ids: the teacher's ids where pixels count, on the device; None without a teacher.
+        codebook: codebook of the teacher, on the device; None without.
+        first: index of the frame that the canonical scene is initialized from.
+        radius: radius of the scene, metres; the unit of learning rates.
+        bounds: box of the deformation field, around the initial Gaussians, metres.
         timeline: the frames of the whole recording, for the result.
     """
 
@@ -64,11 +64,11 @@ class Problem(NamedTuple):
 
 
 class Kept(NamedTuple):
-    """What steps are given as it is, and `Deform.between` replaces.
+    """Inputs of the steps that `Deform.between` replaces now and then.
 
     Attributes:
         moving: where the field is evaluated.
-        graphs: of each frame; None before they are made, and without.
+        graphs: graph of each frame; None before they are made, and without a graph.
     """
 
     moving: Moving = None
@@ -77,12 +77,12 @@ class Kept(NamedTuple):
 
 @dataclass(frozen=True)
 class Deform:
-    """A scene that deforms, from what one camera saw (`gsjax.optim.method.Method`): the canonical scene
-    alone, then with its deformation.
+    """Reconstruction of a deforming scene from one camera (`gsjax.optim.method.Method`): the canonical scene
+    alone, then jointly with its deformation.
 
     Attributes:
-        config: how it is learned.
-        extra_losses: custom losses `loss(scene, rendered, frame)`, whose scene is a `DeformingScene`; see
+        config: configuration of the reconstruction.
+        extra_losses: custom losses `loss(scene, rendered, frame)` of a `DeformingScene`; see
             `gsjax.losses.extra`. `info["extra"]` has their values.
     """
 
@@ -104,18 +104,18 @@ class Deform:
         """A reconstruction before its first step.
 
         Args:
-            frames: what one camera saw over time, all of one size, on the host. Where none has depth, the
-                scene begins on a plane.
+            frames: frames of one camera over time, all of one size, on the host. If none has depth, the scene
+                is initialized on a plane.
             lesson: a teacher's labels of these frames, with codes of `config.channels` numbers.
-            first: index of the frame that the canonical scene is like (default: the first with depth where a
-                pixel counts, or where one counts if none has depth).
-            gaussians: canonical scene to begin with, less what cannot be drawn (default: made of depth, or on
-                the plane).
-            timeline: frames of the whole recording, for the result (default: that of `frames`).
+            first: index of the frame that the canonical scene is initialized from (default: the first that it
+                can be, `can_start_from`).
+            gaussians: initial canonical Gaussians; invalid ones are removed (default: from depth, or on the
+                plane).
+            timeline: frames of the whole recording, for the result (default: `frames`).
 
         Raises:
-            ValueError: frames differ in size, no pixel counts, depth is nowhere known, or the teacher's ids
-                are not in its codebook.
+            ValueError: frames differ in size, no pixel counts, no depth is known, or the teacher's labels do
+                not fit.
         """
         config = self.config
         _check(frames, config, lesson)
@@ -123,22 +123,22 @@ class Deform:
             first = next((i for i, frame in enumerate(frames) if can_start_from(frame, frames)), 0)
         if gaussians is None:
             flat = all(frame.depths is None for frame in frames)
-            begun_with = on_plane(frames, first, config.plane_depth) if flat else frames
-            gaussians = start_gaussians(begun_with, first, config.start_pixels)
+            posed = with_plane_depths(frames, first, config.plane_depth) if flat else frames
+            gaussians = start_gaussians(posed, first, config.start_pixels)
         scene = _first_scene(gaussians, config, len(frames), lesson is not None)
         means = np.asarray(scene.gaussians.means)
         middle = np.median(means, axis=0)
         radius = float(np.quantile(np.linalg.norm(means - middle, axis=1), 0.9))
         if not radius > 0:
-            raise ValueError("depth: expected a scene of some extent, found all of its points at one place")
+            raise ValueError("depth: expected a scene of some extent, found all of its points in one place")
         low, high = np.quantile(means.astype(np.float64), (_OUTSIDE, 1 - _OUTSIDE), axis=0)
-        room = _MARGIN * np.maximum(high - low, _THIN * radius)
+        room = _MARGIN * np.maximum(high - low, _LEAST_EDGE * radius)
         bounds = np.stack([low - room, high + room])
-        seen, ids, codebook = [frame_on_device(frame) for frame in frames], None, None
+        seen, ids, codebook = [_on_device(frame) for frame in frames], None, None
         if lesson is not None:
-            pairs = zip(frames, lesson.ids, strict=True)
-            masks_and_ids = ((None if f.masks is None else f.masks[0], one) for f, one in pairs)
-            ids = [jnp.asarray(counted_ids(one, mask), jnp.int32) for mask, one in masks_and_ids]
+            masks = [None if frame.masks is None else frame.masks[0] for frame in frames]
+            counted = map(counted_ids, lesson.ids, masks)
+            ids = [jnp.asarray(one, jnp.int32) for one in counted]
             codebook = jnp.asarray(lesson.codebook, jnp.result_type(float))
         timeline = timeline_of(frames) if timeline is None else timeline
         problem = Problem(frames, lesson, seen, ids, codebook, first, radius, bounds, timeline)
@@ -151,26 +151,29 @@ class Deform:
         return deform_step(self.config, self.extra_losses)
 
     def total(self, problem: Problem) -> int:
-        """Steps of the warm-up, and those after it."""
+        """Number of steps, those of the warm-up and the joint ones."""
         return self.config.warmup + self.config.iterations
 
     def between(self, problem: Problem, run: Run, progress: float) -> Run:
-        """Opens the field after the warm-up, chooses the Gaussians that go on moving, and makes the graph.
+        """Adds the field after the warm-up, selects the Gaussians that keep moving, and makes the graph.
         Arguments as for `Method.between`."""
         config, step = self.config, run.step
+        gate, graph = (
+            config.warmup + round(share * config.iterations) for share in (_GATE_AFTER, config.graph.after)
+        )
         if step == config.warmup and run.params.field is None:
             scene, moving = with_field(config, problem, run.params)
             run = run.having(params=scene, state=self.step.init(scene), kept=Kept(moving))
         moving, graphs = run.kept
-        if step == _gate_from(config) and config.moving_share < 1 and moving is None:
-            moving = farthest_moved(run.params, problem.seen, config.moving_share)
-        if step == _graph_from(config) and graphs is None:
+        if step == gate and config.moving_share < 1 and moving is None:
+            moving = _farthest_moved(run.params, problem.seen, config.moving_share)
+        if step == graph and graphs is None:
             graphs = _graphs(config, problem, run.params, moving)
         return run.having(kept=Kept(moving, graphs))
 
     def batch(self, problem: Problem, run: Run, progress: float) -> tuple[Batch, tuple[str, ...]]:
-        """The frame whose turn it is: in the warm-up perhaps always the first; else all of them in a random
-        order, and then in another. Arguments as for `Method.batch`."""
+        """The next frame: the initial one in the warm-up (`config.warmup_frames`); else all in random order,
+        shuffled again for each pass. Arguments as for `Method.batch`."""
         if run.step < self.config.warmup and self.config.warmup_frames == "first":
             i = problem.first
         else:
@@ -178,7 +181,7 @@ class Deform:
         return batch_of(problem, run, i), (PLAN,)
 
     def result(self, problem: Problem, run: Run) -> DeformResult:
-        """The scene over time. Its arrays are those of the run: copy what is to be kept."""
+        """The scene over time. It shares the arrays of the run, which later steps may donate."""
         scene, meaning = run.params, None if problem.lesson is None else problem.lesson.meaning
         timeline = problem.timeline
         if scene.twists is not None:
@@ -191,11 +194,11 @@ class Deform:
 
 
 def batch_of(problem: Problem, run: Run, i: int) -> Batch:
-    """What a step on one frame is given.
+    """The input of a step on one frame.
 
     Args:
         problem: from `Deform.start`.
-        run: before the step.
+        run: the run before the step.
         i: index of the frame.
     """
     view = None
@@ -210,12 +213,12 @@ def batch_of(problem: Problem, run: Run, i: int) -> Batch:
 def with_field(
     config: DeformConfig, problem: Problem, scene: DeformingScene
 ) -> tuple[DeformingScene, Moving]:
-    """The scene with a field that moves nothing yet, and where the field is evaluated.
+    """The scene with an initial field, which is the identity, and where the field is evaluated.
 
     Args:
-        config: of the reconstruction.
+        config: configuration of the reconstruction.
         problem: from `Deform.start`.
-        scene: canonical.
+        scene: canonical scene.
     """
     gaussians = scene.gaussians
     size = 0 if gaussians.features is None else gaussians.features.shape[1]
@@ -225,23 +228,17 @@ def with_field(
     return DeformingScene(gaussians, field, scene.twists), moving
 
 
-def farthest_moved(scene: DeformingScene, frames: Sequence[Frame], share: float) -> Int[Array, "M"]:
-    """Rows of the Gaussians that are farthest from where the canonical scene has them, at any frame's time.
-
-    Args:
-        scene: canonical, and how it deforms.
-        frames: on the device.
-        share: of the Gaussians, 0 to 1.
-    """
+def _farthest_moved(scene: DeformingScene, frames: Sequence[Frame], share: float) -> Int[Array, "M"]:
+    """Rows of the share of the Gaussians with the largest displacement in any frame."""
     at = jax.jit(lambda scene, time: jnp.linalg.norm(scene.at(time).means - scene.gaussians.means, axis=-1))
     farthest = np.max([np.asarray(at(scene, frame.time)) for frame in frames], axis=0)
     order = np.argsort(-farthest, kind="stable")
     return jnp.asarray(np.sort(order[: max(1, round(share * len(farthest)))]), jnp.int32)
 
 
-def frame_on_device(frame: Frame) -> Frame:
-    """A frame of one camera on the device, with depth where it is known and counts, and a mask in any case:
-    each kind is a program of its own."""
+def _on_device(frame: Frame) -> Frame:
+    """A frame of one camera on the device, with depth where it is known and counts, and always with a mask
+    and a time, so that one program is compiled for all."""
     dtype = jnp.result_type(float)
     masks = np.ones(frame.images.shape[:3], bool) if frame.masks is None else frame.masks
     depths = None if frame.depths is None else jnp.asarray(known_depth(frame), dtype)[None]
@@ -249,36 +246,30 @@ def frame_on_device(frame: Frame) -> Frame:
     return Frame(jnp.asarray(frame.images), depths, on_device(frame.cameras), jnp.asarray(masks), time)
 
 
-def _graph_from(config: DeformConfig) -> int:
-    """The step before which the graph is made."""
-    return config.warmup + round(config.graph.after * config.iterations)
-
-
-def _gate_from(config: DeformConfig) -> int:
-    """The step before which the Gaussians that go on moving are chosen."""
-    return config.warmup + round(_GATE_AFTER * config.iterations)
-
-
 def _graphs(
     config: DeformConfig, problem: Problem, scene: DeformingScene, moving: Moving
 ) -> list[FrameGraph] | None:
-    """The graph of each frame, with nodes where the scene has them now."""
+    """The graph of each frame, from the present positions of the nodes and the present poses."""
     if config.graph.kind == "none" or problem.lesson is None:
         return None
-    nodes = graph_nodes(scene.gaussians.means, config.graph.nodes)
+    nodes = far_apart(scene.gaussians.means, config.graph.nodes)
     at = jax.jit(lambda scene, time: scene.at(time, moving).means[nodes])
     places = np.stack([np.asarray(at(scene, frame.time)) for frame in problem.seen])
     frames, (ids, codebook, _) = problem.frames, problem.lesson
     if scene.twists is not None:
-        frames = refined_frames(frames, scene.twists, problem.radius)
+        given, times = np.stack([frame.cameras.viewmat for frame in frames]), times_of(frames)
+        refined = refined_viewmats(given, times, scene.twists, times, problem.radius)
+        pairs = zip(frames, refined, strict=True)
+        frames = [eqx.tree_at(lambda f: f.cameras.viewmat, frame, viewmat) for frame, viewmat in pairs]
     return frame_graphs(places, nodes, frames, ids, codebook, config.graph, problem.radius)
 
 
 def _first_scene(gaussians: Gaussians, config: DeformConfig, frames: int, is_taught: bool) -> DeformingScene:
-    """Copies of the Gaussians that can be drawn, for steps give buffers away; features and twists are 0."""
+    """The scene of copies of the valid Gaussians, as steps donate their buffers, with zero features and
+    twists."""
     gaussians, _ = cull_invalid(gaussians)
     if not gaussians.num:
-        raise ValueError("gaussians: expected some that can be drawn, found none")
+        raise ValueError("gaussians: expected some that are valid, found none")
     twists = jnp.zeros((frames, 6)) if config.refine_poses else None
     scene = DeformingScene(jax.tree.map(jnp.array, gaussians), None, twists)
     if not is_taught:
@@ -288,7 +279,7 @@ def _first_scene(gaussians: Gaussians, config: DeformConfig, frames: int, is_tau
 
 
 def _plan_for_all(gaussians: Gaussians, frames: Sequence[Frame]) -> Plan:
-    """A plan for the scene in all cameras."""
+    """A plan that holds the scene in every camera."""
     cameras = [frame.cameras for frame in frames]
     viewmats, Ks = (jnp.concatenate([getattr(c, name) for c in cameras]) for name in ("viewmat", "K"))
     together = replace(cameras[0], viewmat=viewmats, K=Ks)
@@ -302,25 +293,25 @@ def _check(frames: Sequence[Frame], config: DeformConfig, lesson: Lesson | None)
     for i, frame in enumerate(frames):
         if frame.images.shape != shape or len(frame.images) != 1:
             raise ValueError(
-                f"frames: expected one picture {shape[1:]} as the first, found {frame.images.shape} in {i}"
+                f"frames: expected one image {shape[1:]} like the first, found {frame.images.shape} in {i}"
             )
         for name in ("masks", "depths"):
             value = getattr(frame, name)
             if value is not None and value.shape != shape[:3]:
                 raise ValueError(
-                    f"frames: expected {name} of {shape[:3]} pixels like pictures, found {value.shape} in {i}"
+                    f"frames: expected {name} {shape[:3]} like images, found {value.shape} in frame {i}"
                 )
     if not any(frame.masks is None or frame.masks.any() for frame in frames):
-        raise ValueError("masks: in no frame does any pixel count; are they inverted?")
+        raise ValueError("masks: expected pixels that count, found none in any frame; are masks inverted?")
     if lesson is None:
         return
     if len(lesson.ids) != len(frames):
-        raise ValueError(f"lesson: expected ids of {len(frames)} frames, found those of {len(lesson.ids)}")
+        raise ValueError(f"lesson: expected ids of {len(frames)} frames, found {len(lesson.ids)}")
     for i, ids in enumerate(lesson.ids):
         if ids.max(initial=-1) >= len(lesson.codebook):
             raise ValueError(
                 f"lesson: expected ids of {len(lesson.codebook)} rows of the codebook, or -1, found "
-                f"{ids.max()} in {i}"
+                f"{ids.max()} in frame {i}"
             )
     if lesson.codebook.shape[1] != config.channels:
         raise ValueError(

@@ -1,9 +1,7 @@
-"""Where a reconstruction found that the camera stood, at the frames it learned from and between them. On the
-host."""
+"""Refined camera poses, at the training frames and between them. On the host."""
 
 from collections.abc import Sequence
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -20,16 +18,17 @@ def refined_viewmats(
     learned: Float[np.ndarray, "frames"],
     radius: float,
 ) -> Float[np.ndarray, "T C 4 4"]:
-    """View matrices at any times, by the twists of the frames that were learned from: another frame has what
-    lies between those of its neighbours in time, as errors of an arm that holds a camera change slowly; one
-    before or after all of them has that of the nearest. Nothing of its picture is used.
+    """View matrices at any times, from the twists of the training frames: interpolated linearly between
+    neighbours in time, as the pose errors of a robot arm change slowly, and constant beyond the ends. The
+    images of other frames are not used.
 
     Args:
-        viewmats: as given; camera 0 is the one that is learned from, and the others move along with it.
-        times: of these, 0 to 1.
-        twists: of the frames that were learned from.
-        learned: times of these frames.
-        radius: of the scene, the unit of shifts.
+        viewmats: given view matrices of C cameras; camera 0 is the training camera, and the others keep their
+            pose relative to it.
+        times: their times, 0 to 1.
+        twists: twists of the training frames, as in `DeformingScene`.
+        learned: times of the training frames, 0 to 1.
+        radius: radius of the scene, the unit of translations.
     """
     order = np.argsort(learned)
     rows = np.asarray(twists, np.float64)[order]
@@ -41,22 +40,6 @@ def refined_viewmats(
     return (viewmats @ np.linalg.inv(viewmats[:, :1])) @ first
 
 
-def refined_frames(frames: Sequence[Frame], twists: Float[Array, "frames 6"], radius: float) -> list[Frame]:
-    """Frames of one camera each, from where they were found to be.
-
-    Args:
-        frames: as they were given.
-        twists: of each frame.
-        radius: of the scene, the unit of shifts.
-    """
-    given, times = np.stack([frame.cameras.viewmat for frame in frames]), times_of(frames)
-    found = refined_viewmats(given, times, twists, times, radius)
-    return [
-        eqx.tree_at(lambda f: f.cameras.viewmat, frame, viewmat)
-        for frame, viewmat in zip(frames, found, strict=True)
-    ]
-
-
 def times_of(frames: Sequence[Frame]) -> Float[np.ndarray, "frames"]:
-    """When frames were seen, 0 to 1; 0 for those that do not say."""
+    """Times of frames, 0 to 1; 0 for a frame without a time."""
     return np.array([0.0 if frame.time is None else float(frame.time) for frame in frames])

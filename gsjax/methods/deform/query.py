@@ -1,6 +1,4 @@
-"""Gaussians of a deforming scene that a prompt means (SurstSplat, section 2.4; GaussianClin, section 3.4)."""
-
-from typing import NamedTuple
+"""Gaussians of a deforming scene that match a prompt (SurstSplat, section 2.4; GaussianClin, section 3.4)."""
 
 import jax
 import jax.numpy as jnp
@@ -8,41 +6,28 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 _LEAST_NORM = 1e-6
-_LITTLE = 0.5  # of a pixel's light that the scene must send, on average
-
-
-class Prompt(NamedTuple):
-    """A prompt and its alternatives.
-
-    Attributes:
-        vectors: in the scene's channels, a row a candidate.
-        row: of the prompt.
-    """
-
-    vectors: Float[np.ndarray, "k c"]
-    row: int
+_LEAST_ALPHA = 0.5  # mean alpha below which a region shows nothing of the scene
 
 
 def prompt_probabilities(
     features: Float[Array, "*n c"], prompts: Float[Array, "k c"], temperature: float = 0.1
 ) -> Float[Array, "*n k"]:
-    """P(prompt | Gaussian), or of a pixel: a softmax over prompts of cosines (SurstSplat, eqs. 16 and 17).
+    """P(prompt | Gaussian or pixel): the softmax over prompts of cosines (SurstSplat, eqs. 16 and 17).
 
-    The papers have no temperature, and so for cosines of 1 and 0 a probability of 0.73 at most. What has no
-    length is as likely each of them.
+    The papers have no temperature: with cosines of 1 and 0, their probability is at most 0.73. All prompts
+    are equally likely for a feature of length 0.
 
     Args:
-        features: of Gaussians, or rendered.
-        prompts: the candidates, in the features' channels; a point's or a box's
-            is the mean of the features rendered there.
-        temperature: of the softmax.
+        features: features of Gaussians, or rendered ones.
+        prompts: the candidates, in the channels of the features.
+        temperature: temperature of the softmax.
     """
     return jax.nn.softmax(prompt_cosines(features, _directions(prompts)) / temperature, axis=-1)
 
 
 def prompt_cosines(features: Float[Array, "*n c"], directions: Float[Array, "k c"]) -> Float[Array, "*n k"]:
-    """Cosines of features, whatever their length, and vectors that have length 1 in the space that they come
-    from; 0 for features without length."""
+    """Cosines of features of any length and vectors of length 1 in the source's space; 0 for features of
+    length 0."""
     return _directions(features) @ directions.T
 
 
@@ -53,7 +38,7 @@ def _directions(features: Float[Array, "*n c"]) -> Float[Array, "*n c"]:
 
 
 def most_likely(probabilities: Float[np.ndarray, "*n k"]) -> Int[np.ndarray, "*n"]:
-    """The most likely row; -1 where all are as likely."""
+    """The index of the most likely prompt; -1 where all are equally likely."""
     if probabilities.shape[-1] == 1:
         return np.zeros(probabilities.shape[:-1], int)
     apart = probabilities.max(axis=-1) > probabilities.min(axis=-1)
@@ -65,15 +50,15 @@ def region_feature(
     alphas: Float[np.ndarray, "height width"],
     box: tuple[float, float, float, float],
 ) -> Float[np.ndarray, "c"]:
-    """The mean of the features rendered in a box; of the pixel, where both of its corners lie in one.
+    """The mean of the features rendered in a box; of one pixel, where both corners lie in it.
 
     Args:
-        drawn: features, composited as colours are.
-        alphas: of the picture.
-        box: x0, y0, x1, y1 in pixels; those that it touches count.
+        drawn: features, composited like colours.
+        alphas: rendered alphas.
+        box: x0, y0, x1, y1 in pixels; every pixel that it touches counts.
 
     Raises:
-        ValueError: it does not lie in the picture, or there is nothing of the scene in it.
+        ValueError: the box does not lie in the image, or shows nothing of the scene.
     """
     height, width = alphas.shape
     x0, y0, x1, y1 = box
@@ -83,19 +68,10 @@ def region_feature(
             found += f" to {x1:g},{y1:g}"
             corners = ", the first corner left of and above the second"
         raise ValueError(
-            f"expected 0 <= X < {width} and 0 <= Y < {height}, pixels as they were learned{corners}, "
+            f"expected 0 <= X < {width} and 0 <= Y < {height}, pixels of the training images{corners}, "
             f"found {found}"
         )
     region = np.s_[int(y0) : int(y1) + 1, int(x0) : int(x1) + 1]
-    if alphas[region].mean() < _LITTLE:
+    if alphas[region].mean() < _LEAST_ALPHA:
         raise ValueError("expected something of the scene, found nothing there")
     return drawn[region].mean(axis=(0, 1))
-
-
-def like_feature(feature: Float[np.ndarray, "c"], codebook: Float[np.ndarray, "k c"]) -> Prompt:
-    """A prompt for what has a feature, in place of the code that is the most like it; the other codes are its
-    alternatives."""
-    probabilities = np.asarray(prompt_probabilities(jnp.asarray(feature), jnp.asarray(codebook)))
-    row, vectors = int(probabilities.argmax()), np.array(codebook)
-    vectors[row] = feature
-    return Prompt(vectors, row)

@@ -1,4 +1,4 @@
-"""Questions on a deforming scene in plain English: the ten types that templates parse."""
+"""Questions on a deforming scene in plain English: ten types, parsed by templates."""
 
 import re
 from collections.abc import Sequence
@@ -12,14 +12,14 @@ STILL = 1.0
 
 
 class QuestionType(NamedTuple):
-    """A type of question that templates parse.
+    """A type of question.
 
     Attributes:
-        name: of the type.
-        example: with X and Y for things, F and G for frames.
+        name: name of the type.
+        example: an example, with X and Y for things, F and G for frames.
         gives: the kind of value, and its unit.
         frames: number of frames that the question names.
-        forms: of the question without its frames and articles; x and y are things.
+        forms: regular expressions of the question without frames and articles; groups x and y are things.
     """
 
     name: str
@@ -137,7 +137,7 @@ _ARTICLES = re.compile(r"\b(?:the|a|an|any)\b")
 _FRAMES = re.compile(
     r"(?:\b(?:in|at|on|from|between|and|to|until)\s+)?\bframes?\s+(\d+)(?:\s+(?:and|to|until)\s+(\d+)\b)?"
 )
-_ALIKE = {"appear": "first seen", "closest": "nearest"}  # events that go by two names
+_SYNONYMS = {"appear": "first seen", "closest": "nearest"}  # of events
 
 
 @dataclass(frozen=True)
@@ -146,9 +146,9 @@ class Question:
 
     Attributes:
         kind: name of its type.
-        things: rows of the classes that it is about.
-        frames: numbers of the frames that it names.
-        event: of a `when` question.
+        things: rows of the classes in question.
+        frames: the recording's numbers of the frames in question.
+        event: the event of a `when` question.
     """
 
     kind: str
@@ -158,15 +158,15 @@ class Question:
 
 
 def parse_question(text: str, names: Sequence[str]) -> Question:
-    """A question, parsed.
+    """Parse a question.
 
     Args:
-        text: in plain English; capitals, articles, plurals and the place of the frames do not matter.
-        names: of classes.
+        text: the question; case, articles, plurals and the position of the frames do not matter.
+        names: names of the classes.
 
     Raises:
-        ValueError: no template fits, and which there are; it names no thing of these, the same one twice, or
-            not as many frames as such a question has.
+        ValueError: no template matches, or the question names an unknown thing, the same one twice, or the
+            wrong number of frames.
     """
     plain = " ".join(re.sub(r"[?!.,;:\"]", " ", text.lower()).split())
     frames = tuple(int(number) for found in _FRAMES.findall(plain) for number in found if number)
@@ -178,14 +178,14 @@ def parse_question(text: str, names: Sequence[str]) -> Question:
             if found is None:
                 continue
             parts = found.groupdict()
-            called = [parts[name] for name in ("x", "y") if parts.get(name)]
-            things = [_thing(one, names) for one in called]
+            spoken = [parts[name] for name in ("x", "y") if parts.get(name)]
+            things = [_thing(words, names) for words in spoken]
             if None in things:
-                unknown = unknown or called[things.index(None)]
+                unknown = unknown or spoken[things.index(None)]
                 continue
             _check(kind, text, things, frames)
             event = parts.get("event", "")
-            return Question(kind.name, tuple(things), frames, _ALIKE.get(event, event))
+            return Question(kind.name, tuple(things), frames, _SYNONYMS.get(event, event))
     known = ", ".join(names)
     if unknown is not None:
         raise ValueError(f"{text!r}: expected things of this scene, found {unknown!r}; there are: {known}")
@@ -196,16 +196,15 @@ def parse_question(text: str, names: Sequence[str]) -> Question:
 
 
 def plain_words(text: str) -> str:
-    """Words in small letters, one space between them, and no articles: "The suturing-needle" is a suturing
-    needle."""
+    """Lower-case words without articles, separated by spaces: "The suturing-needle" is a suturing needle."""
     return " ".join(_ARTICLES.sub(" ", " ".join(re.findall(r"[^\W_]+", text.lower()))).split())
 
 
-def _thing(called: str, names: Sequence[str]) -> int | None:
-    """The row of the class that is called so; None if there is none."""
+def _thing(words: str, names: Sequence[str]) -> int | None:
+    """The row of the class of this name, also in the plural; None if there is none."""
     for row, name in enumerate(names):
         plain = plain_words(name)
-        if called in (plain, f"{plain}s", f"{plain}es"):
+        if words in (plain, f"{plain}s", f"{plain}es"):
             return row
     return None
 
@@ -214,15 +213,15 @@ def _check(kind: QuestionType, text: str, things: Sequence[int | None], frames: 
     if len(things) == 2 and things[0] == things[1]:
         raise ValueError(f"{text!r}: expected two things, found the same one twice")
     if len(frames) != kind.frames:
-        wanted = ("no frame", "a frame", "two frames")[kind.frames]
-        raise ValueError(f"{text!r}: expected {wanted}, found {len(frames) or 'none'}; as in: {kind.example}")
+        count = ("no frame", "a frame", "two frames")[kind.frames]
+        raise ValueError(f"{text!r}: expected {count}, found {len(frames) or 'none'}; as in: {kind.example}")
 
 
 def rows_of(question: Question, frames: Sequence[int]) -> list[int]:
-    """Rows of the frames that a question is about: those it names, or all.
+    """Rows of the frames in question: those it names, else all.
 
     Raises:
-        ValueError: it names one that the recording has not.
+        ValueError: the recording lacks one of them.
     """
     places = {int(number): row for row, number in enumerate(frames)}
     for number in question.frames:

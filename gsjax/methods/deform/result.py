@@ -1,4 +1,4 @@
-"""What a reconstruction is for: the scene at any time, from where it was seen, and what is what in it."""
+"""The result of a reconstruction: the scene at any time, its cameras, and queries."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from gsjax.geometry.cameras import Camera
-from gsjax.methods.deform.meaning import Meaning, wanted_text
+from gsjax.methods.deform.meaning import Meaning, text_prompt
 from gsjax.methods.deform.poses import times_of
 from gsjax.methods.deform.query import prompt_probabilities
 from gsjax.methods.deform.update import DeformingScene, Moving
@@ -20,18 +20,19 @@ from gsjax.scene.gaussians import Gaussians
 
 
 class Timeline(NamedTuple):
-    """The frames of a recording: when each was taken, and by which camera.
+    """Times and cameras of the frames of a recording.
 
     Attributes:
-        times: of the frames, 0 to 1.
-        frame_ids: the recording's own numbers of the frames.
-        seconds: how long the recording lasts.
-        viewmats: of the camera that is learned from, in each frame: world to camera, OpenCV axes.
+        times: times of the frames, 0 to 1.
+        frame_ids: the recording's numbers of the frames.
+        seconds: duration of the recording.
+        viewmats: view matrices of the training camera in each frame: world to camera, OpenCV axes; refined
+            if poses were.
         Ks: its intrinsics, pixels.
-        size: width and height of its pictures, pixels.
-        near: what is nearer to it is not drawn, metres.
-        held_out: indices of the frames that nothing is learned from.
-        metric: whether lengths are metres.
+        size: width and height of its images, pixels.
+        near: distance of its near plane, metres.
+        held_out: indices of the held-out frames.
+        metric: whether the unit of length is the metre.
     """
 
     times: Float[np.ndarray, "T"]
@@ -46,8 +47,7 @@ class Timeline(NamedTuple):
 
 
 def timeline_of(frames: Sequence[Frame]) -> Timeline:
-    """The timeline of frames of which nothing else is known: they are numbered from 0 and last a second, and
-    lengths are metres where any of them has depth."""
+    """The timeline of frames alone: numbered from 0, one second long, and metric where any has depth."""
     camera = frames[0].cameras
     viewmats, Ks = (
         np.concatenate([np.asarray(getattr(frame.cameras, name), np.float64) for frame in frames])
@@ -60,13 +60,13 @@ def timeline_of(frames: Sequence[Frame]) -> Timeline:
 
 @dataclass(frozen=True, eq=False)
 class DeformResult:
-    """A deforming scene, as it lies in deformation.npz (`gsjax.engine.deform.file`).
+    """A deforming scene, the content of deformation.npz (`gsjax.engine.deform.file`).
 
     Attributes:
-        scene: canonical Gaussians, and the field that moves them; None of a scene that stands still.
+        scene: canonical Gaussians and their deformation field.
         moving: where the field is evaluated: at nodes, at some Gaussians, or at all.
-        meaning: what features mean; None without.
-        timeline: the frames of the recording, with the camera's poses as they were refined.
+        meaning: meaning of the features; None without.
+        timeline: the frames of the recording.
     """
 
     scene: DeformingScene
@@ -76,20 +76,17 @@ class DeformResult:
 
     def at(self, time: float) -> Gaussians:
         """The scene at a time, 0 to 1."""
-        return _at(self.scene, self.moving, jnp.asarray(time, jnp.float32))
+        return _at(self.scene, jnp.asarray(time, jnp.float32), self.moving)
 
     def features_at(self, times: Sequence[float] | Float[np.ndarray, "T"]) -> Float[Array, "T n c"]:
-        """Features of all Gaussians at some times.
-
-        Args:
-            times: 0 to 1.
+        """Features of all Gaussians at some times, 0 to 1.
 
         Raises:
             ValueError: the scene has no features.
         """
         self._expect_features()
         rows = jnp.arange(self.scene.gaussians.num)
-        return _features_at(self.scene, self.moving, jnp.asarray(times, jnp.float32), rows)
+        return _features_at(self.scene, jnp.asarray(times, jnp.float32), rows, self.moving)
 
     def query(
         self,
@@ -99,24 +96,22 @@ class DeformResult:
         negatives: tuple[str, ...] | None = None,
         encoder: Callable[[], LanguageEncoder] | None = None,
     ) -> Float[Array, "n"]:
-        """Scores of Gaussians for a text, at a time; see `Wanted.scores`.
+        """Scores of Gaussians for a text, at a time; see `Prompt.scores`.
 
         Args:
-            text: one of `names`, or what the encoder of the features reads.
-            time: 0 to 1; of no matter unless features change over time.
-            negatives: texts that it is held against (default: the encoder's own). Of no use for names.
-            encoder: loads the encoder that reads texts (default: that of the features).
+            text: one of `names`, or a text for the encoder of the features.
+            time: 0 to 1; irrelevant unless features change over time.
+            negatives, encoder: as for `text_prompt`.
 
         Raises:
-            ValueError: the scene has no features with a meaning, no class has the name, or nobody reads texts
-                in these features' space.
-            FileNotFoundError: weights of the encoder are not there.
+            ValueError: the scene has no features with a meaning, or as for `text_prompt`.
+            FileNotFoundError: the encoder's weights are missing.
         """
         meaning = self._expect_features()
-        return wanted_text(meaning, text, negatives, encoder).scores(self.features_at([time])[0])
+        return text_prompt(meaning, text, negatives, encoder).scores(self.features_at([time])[0])
 
     def probabilities(self, time: float = 0.0) -> Float[Array, "n names"]:
-        """How likely each Gaussian is each of `names` at a time, 0 to 1; see `prompt_probabilities`.
+        """Probability of each of `names` for each Gaussian at a time, 0 to 1; see `prompt_probabilities`.
 
         Raises:
             ValueError: the scene has no features with a meaning.
@@ -132,18 +127,13 @@ class DeformResult:
         return Camera(viewmat, K, *timeline.size, timeline.near)
 
     @property
-    def viewmats(self) -> Float[np.ndarray, "T 4 4"]:
-        """World to camera in each frame of the recording, OpenCV axes; refined where poses were."""
-        return self.timeline.viewmats
-
-    @property
     def names(self) -> tuple[str, ...]:
-        """Names of what features tell apart; none without."""
+        """Names of the features' codebook; none without a meaning."""
         return () if self.meaning is None else self.meaning.names
 
     @property
     def meaning_changes(self) -> bool:
-        """Whether features are not the same at all times."""
+        """Whether features change over time."""
         return self.scene.field is not None and self.scene.field.config.feature
 
     def _expect_features(self) -> Meaning:
@@ -155,13 +145,4 @@ class DeformResult:
         return self.meaning
 
 
-@jax.jit
-def _at(scene: DeformingScene, moving: Moving, time: Float[Array, ""]) -> Gaussians:
-    return scene.at(time, moving)
-
-
-@jax.jit
-def _features_at(
-    scene: DeformingScene, moving: Moving, times: Float[Array, "T"], rows: Int[Array, "n"]
-) -> Float[Array, "T n c"]:
-    return scene.features_at(times, rows, moving)
+_at, _features_at = jax.jit(DeformingScene.at), jax.jit(DeformingScene.features_at)

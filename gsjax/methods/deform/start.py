@@ -1,4 +1,4 @@
-"""The first Gaussians of a deforming scene: depth over time where no tool is, or a plane. On the host."""
+"""Initial Gaussians of a deforming scene, from the depth of all frames or on a plane. On the host."""
 
 from collections.abc import Sequence
 
@@ -13,37 +13,36 @@ from gsjax.scene.frame import Frame
 from gsjax.scene.gaussians import Gaussians
 from gsjax.scene.initialize import gaussians_from_points, points_from_rgbd
 
-_BEHIND = 0.06  # of the depth: farther behind what is seen lies what that hides, not what has moved
-_NEAR_PX = 2.0  # a point of another frame that is nearer than this to a Gaussian adds nothing to it
+_BEHIND = 0.06  # relative depth behind a surface beyond which a point was occluded, and has not just moved
+_NEAR_PX = 2.0  # a point of another frame nearer than this to the points so far adds nothing
 
 
 def start_gaussians(frames: Sequence[Frame], first: int, pixels: float) -> Gaussians:
-    """Gaussians on what the first frame shows, and, from the other frames, on what it does not: there lay a
-    tool that is left out, it lay behind something, or outside.
+    """Gaussians on the surfaces that the first frame shows, and, from the other frames, on those that it does
+    not: masked out, occluded, or outside the image.
 
-    A point of another frame is new if it falls where the first frame shows nothing, or far behind what it
-    shows, and none of those before lies within two pixels of it; so what has moved in the meantime is not
-    doubled.
+    A point of another frame is new if it projects to a pixel of the first frame without known depth, or lies
+    far behind that depth, and no earlier point lies within two pixels of it. So surfaces that have moved are
+    not duplicated.
 
     Args:
-        frames: of one camera each, over time; pixels outside their masks do not count.
-        first: index of the frame that the canonical scene is like.
-        pixels: edge of the cubes that are thinned to one Gaussian, in pixels.
+        frames: frames of one camera over time; pixels outside their masks do not count.
+        first: index of the frame that the canonical scene is initialized from.
+        pixels: edge of the cubes in which points are thinned to one Gaussian, in pixels.
 
     Raises:
         ValueError: no frame has depth where a pixel counts.
     """
     order = [first, *(i for i in range(len(frames)) if i != first)]
     points, colors = np.zeros((0, 3), np.float32), np.zeros((0, 3), np.float32)
-    pixel = 0.0
+    pixel = 0.0  # its width at the median depth, metres
     for i in order:
         frame = frames[i]
-        known = known_depth(frame)
+        known, viewmat, K = known_depth(frame), frame.cameras.viewmat[0], frame.cameras.K[0]
         if not known.any():
             continue
         if pixel == 0.0:
-            pixel = float(np.median(known[known > 0])) / frame.cameras.K[0, 0, 0]
-        viewmat, K = frame.cameras.viewmat[0], frame.cameras.K[0]
+            pixel = float(np.median(known[known > 0])) / K[0, 0]
         some, shades = points_from_rgbd(frame.images[0], known, viewmat, K)
         if len(points):
             new = _unseen(some, frames[first])
@@ -54,52 +53,52 @@ def start_gaussians(frames: Sequence[Frame], first: int, pixels: float) -> Gauss
         points, colors = np.concatenate([points, some[kept]]), np.concatenate([colors, shades[kept]])
     if not len(points):
         raise ValueError(
-            "depth: no frame has any where a pixel counts; are masks inverted, or is depth all 0?"
+            "depth: no frame has any where a pixel counts; are masks inverted, or are all depths 0?"
         )
     return gaussians_from_points(points, colors)
 
 
 def can_start_from(frame: Frame, frames: Sequence[Frame]) -> bool:
-    """Whether a scene can begin with one of the frames: a pixel counts, and has depth where any frame has."""
+    """Whether a scene can be initialized from a frame: a pixel counts, and has depth if any frame does."""
     if all(one.depths is None for one in frames):
         return frame.masks is None or bool(frame.masks.any())
     return bool(known_depth(frame).any())
 
 
-def on_plane(frames: Sequence[Frame], first: int, depth: float) -> list[Frame]:
-    """The frames as if all that they saw were painted on a plane that the first one faces: something to begin
-    with where depth is not known.
+def with_plane_depths(frames: Sequence[Frame], first: int, depth: float) -> list[Frame]:
+    """The frames with the depths of a plane parallel to the image of the first one, to initialize a scene of
+    unknown depth.
 
     Args:
-        frames: of one camera each, over time.
+        frames: frames of one camera over time.
         first: index of the frame that faces the plane.
-        depth: how far before it the plane lies, in the unit of the poses.
+        depth: distance of the plane from that camera, in the unit of the poses.
     """
     facing = frames[first].cameras.viewmat[0]
     normal = facing[2, :3]  # n . x = offset in the world
     offset = depth - facing[2, 3]
 
-    def painted(frame: Frame) -> Frame:
+    def of_plane(frame: Frame) -> Frame:
         camera = frame.cameras
         columns, rows = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
         rays = np.stack([columns, rows, np.ones_like(rows)], axis=-1) @ np.linalg.inv(camera.K[0]).T
         rotation, shift = camera.viewmat[0, :3, :3], camera.viewmat[0, :3, 3]
-        towards = rays @ (rotation @ normal)  # how much nearer the plane a ray comes per unit of depth
+        towards = rays @ (rotation @ normal)  # approach to the plane per unit of depth
         away = offset + (rotation.T @ shift) @ normal
         reached = np.where(np.abs(towards) > 1e-6, away / np.where(towards == 0, 1.0, towards), 0.0)
         depths = np.maximum(reached, 0.0).astype(np.float32)[None]
         return eqx.tree_at(lambda f: f.depths, frame, depths, is_leaf=lambda leaf: leaf is None)
 
-    return [painted(frame) for frame in frames]
+    return [of_plane(frame) for frame in frames]
 
 
 def known_depth(frame: Frame) -> Float[np.ndarray, "h w"]:
-    """Depth of a frame of one camera where it is known and counts, else 0."""
+    """Depths of a frame of one camera where they are known and count, else 0, metres."""
     return frame.known_depths[0].astype(np.float32)
 
 
 def _unseen(points: Float[np.ndarray, "n 3"], frame: Frame) -> Bool[np.ndarray, "n"]:
-    """Which points fall outside of a frame, where it does not count or has no depth, or far behind that."""
+    """Which points project outside the frame or to a pixel without known depth, or lie far behind it."""
     known, camera = known_depth(frame), frame.cameras
     at = pixels_of(points, camera.viewmat[0], camera.K[0], camera.width, camera.height)
     before = known[at.rows, at.columns]

@@ -1,4 +1,4 @@
-"""One step of a deforming scene: deform, draw colours and features in one pass, compare, descend."""
+"""One optimization step of a deforming scene: deform, render colours and features in one pass, compare."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -24,17 +24,17 @@ from gsjax.scene.render import render
 from gsjax.scene.time_encodings import HexPlane
 
 _FINAL_RATE = 0.1
-_DECAY = 1e-5  # of AdamW (SurstSplat, section 3)
+_WEIGHT_DECAY = 1e-5  # of AdamW (SurstSplat, section 3)
 
 
 class DeformingScene(eqx.Module):
-    """What trains.
+    """The trained parameters.
 
     Attributes:
-        gaussians: canonical; features are semantic.
-        field: what moves them; None in the warm-up, and of a static scene.
-        twists: of each frame's camera, a turn (radians) and a shift (radii of the scene), in the world's
-            axes; None: cameras stand as given.
+        gaussians: canonical Gaussians, whose features are semantic.
+        field: deformation field; None in the warm-up, and for a static scene.
+        twists: rotation (radians) and translation (radii of the scene) of each frame's camera, along the
+            world's axes; None if poses are not refined.
     """
 
     gaussians: Gaussians
@@ -57,12 +57,12 @@ class DeformingScene(eqx.Module):
     def features_at(
         self, times: Float[Array, "T"], rows: Int[Array, "n"], moving: "Moving" = None
     ) -> Float[Array, "T n c"]:
-        """Features of some Gaussians at some times, as in `at`.
+        """Features of some Gaussians at some times, as those of `at`.
 
         Args:
             times: 0 to 1.
-            rows: of the Gaussians.
-            moving: which of them move, as for `at`.
+            rows: rows of the Gaussians.
+            moving: as for `at`.
         """
         if moving is None or isinstance(moving, Nodes):
             return features_at(self.gaussians, self.field, times, rows, moving)
@@ -76,18 +76,17 @@ Moving = Nodes | Int[Array, "M"] | None
 
 
 class Batch(NamedTuple):
-    """What a step is given.
+    """The input of a step.
 
     Attributes:
-        frame: of one camera, RGB in bytes, with the mask of the pixels that count and its time.
-        view: row of the scene's twists that is the camera's; -1 for the camera that stands as given. None
-            where none is refined.
+        frame: frame of one camera, with a mask and a time.
+        view: row of the camera's twist; -1 for a camera that is not refined. None if no poses are.
         ids: row of the codebook of each of the teacher's pixels, -1 for none; None without a teacher.
         codebook: the teacher's features, in the scene's channels.
         moving: where the field is evaluated.
-        graph: of the frame and those around it; None without.
-        radius: of the scene, the unit in which means and cameras move and depth counts.
-        plan: to draw with.
+        graph: graph of the frame and those around it; None without.
+        radius: radius of the scene, the unit of learning rates and of the depth error.
+        plan: plan for rendering.
     """
 
     frame: Frame
@@ -102,13 +101,12 @@ class Batch(NamedTuple):
 
 def deform_loss(config: DeformConfig, extra_losses: ExtraLosses = ()) -> Callable:
     """`loss(scene, batch, *, step, key)`: L1 and D-SSIM of the pixels that count (SurstSplat, eq. 13), depth,
-    features against the teacher's (GaussianClin, eq. 10), the graph (`graph_loss`), and smoothness of the
-    field's planes (4DGS).
+    features (GaussianClin, eq. 10), the graph (`graph_loss`), and smoothness of the field's planes (4DGS).
 
     Args:
-        config: its weights.
-        extra_losses: given the `DeformingScene`, with its Gaussians where they are at this time, how it was
-            drawn, and the frame; what does not count is drawn as photographed.
+        config: configuration, with the weights.
+        extra_losses: custom losses of the `DeformingScene` with its Gaussians deformed to this time, the
+            rendered view, in which pixels that do not count are those of the photograph, and the frame.
     """
     weights = config.weights
 
@@ -119,7 +117,7 @@ def deform_loss(config: DeformConfig, extra_losses: ExtraLosses = ()) -> Callabl
         there, camera = scene.at(jnp.asarray(frame.time), batch.moving), _refined_camera(scene, batch)
         drawn = render(there, camera, batch.plan)
         target = frame.colors
-        # What does not count is as it was photographed: no slope, no edge.
+        # Pixels that do not count are the photograph's: they add neither a gradient nor an edge.
         image = jnp.where(frame.masks[..., None], drawn.colors, target)
         counts = frame.masks.astype(image.dtype)
         area = jnp.maximum(counts.mean(), 1e-6)
@@ -156,7 +154,7 @@ def deform_loss(config: DeformConfig, extra_losses: ExtraLosses = ()) -> Callabl
 
 
 def _refined_camera(scene: DeformingScene, batch: Batch) -> Camera:
-    """The frame's camera, refined where cameras are."""
+    """The camera of the frame, refined if poses are."""
     camera = batch.frame.cameras
     if scene.twists is None or batch.view is None:
         return camera
@@ -167,13 +165,13 @@ def _refined_camera(scene: DeformingScene, batch: Batch) -> Camera:
 def feature_loss(
     drawn: Float[Array, "height width c"], codebook: Float[Array, "k c"], ids: Int[Array, "h w"]
 ) -> Float[Array, ""]:
-    """|F_t - F_s|_1, a mean over channels and the teacher's pixels, to whose grid F_s is brought bilinearly
+    """Mean of |F_t - F_s| over channels and the teacher's pixels, with F_s resized to the teacher's grid
     (GaussianClin, eq. 10).
 
     Args:
-        drawn: F_t, the scene's features.
+        drawn: F_s, the rendered features.
         codebook: the teacher's features.
-        ids: row of the codebook of each of the teacher's pixels; -1 where it has none.
+        ids: row of the codebook of each of the teacher's pixels; -1 for none.
     """
     known = (ids >= 0).astype(drawn.dtype)
     off = jnp.abs(on_grid(drawn, ids.shape) - codebook[jnp.maximum(ids, 0)])
@@ -181,27 +179,27 @@ def feature_loss(
 
 
 def on_grid(drawn: Float[Array, "height width c"], shape: tuple[int, int]) -> Float[Array, "h w c"]:
-    """Rendered features brought to the teacher's grid, bilinearly; to a coarser one by a triangle as wide as
-    its cells are, or most pixels would learn nothing."""
+    """Rendered features resized bilinearly to the teacher's grid; antialiased for a coarser one, as most
+    pixels would get no gradient otherwise."""
     return jax.image.resize(drawn, (*shape, drawn.shape[2]), "linear", antialias=True)
 
 
 def deform_step(config: DeformConfig, extra_losses: ExtraLosses = ()) -> Step:
     """Adam or AdamW on a `DeformingScene`.
 
-    `batch` is a `Batch`; `key` and `step` are not used, for rates fall with the optimizer's own count of
-    steps. `info` has `psnr` and each loss by its name beside what every step reports.
+    `batch` is a `Batch`; `key` and `step` are unused, as the rates decay with the optimizer's own count of
+    steps. `info` has `psnr` and each loss by name beside what every step reports.
 
     Args:
-        config: of the reconstruction.
+        config: configuration of the reconstruction.
         extra_losses: custom losses (`gsjax.losses.extra`) beside those of the method.
     """
     named_losses(extra_losses)
     total = max(1, config.warmup + config.iterations)
     if config.schedule == "cosine":
-        fall = optax.cosine_decay_schedule(1.0, total)
+        decay = optax.cosine_decay_schedule(1.0, total)
     else:
-        fall = optax.exponential_decay(1.0, total, _FINAL_RATE)
+        decay = optax.exponential_decay(1.0, total, _FINAL_RATE)
     settings = vars(config.rates)
     loss = deform_loss(config, extra_losses)
 
@@ -218,16 +216,14 @@ def deform_step(config: DeformConfig, extra_losses: ExtraLosses = ()) -> Step:
             rates["layers"] = settings["layers"]
         if scene.twists is not None:
             rates["twists"] = settings["twists"]
-        made = 0 if scene.field is None else config.warmup  # by the optimizer before this one
-        falling = {name: _falling(rate, fall, made) for name, rate in rates.items()}
-        decay = _DECAY if config.optimizer == "adamw" else 0.0
-        return gradient_step(loss, per_field_adam(falling, decay=decay))
+        before = 0 if scene.field is None else config.warmup  # steps of the warm-up's own optimizer
+        schedules = {
+            name: lambda count, rate=rate: rate * decay(count + before) for name, rate in rates.items()
+        }
+        weight_decay = _WEIGHT_DECAY if config.optimizer == "adamw" else 0.0
+        return gradient_step(loss, per_field_adam(schedules, decay=weight_decay))
 
     def update(params: DeformingScene, state, batch: Batch, *, step, key):
         return of(params, batch.radius).update(params, state, batch, step=step, key=key)
 
     return Step(lambda params: of(params, 1.0).init(params), update)
-
-
-def _falling(rate: Any, fall: Callable, made: int) -> Callable:
-    return lambda count: rate * fall(count + made)

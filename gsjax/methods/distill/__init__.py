@@ -1,4 +1,4 @@
-"""A semantic field for a static scene, which answers queries in 3D (FD-3DGS).
+"""A semantic feature field of a static scene, queried in 3D (FD-3DGS).
 
 teacher = teacher_of_objects(masks, embeddings)
 method = Distill(config)
@@ -6,12 +6,15 @@ problem, run = method.start(gaussians, cameras, teacher)
 for now in drive(method, problem, run): ...
 scores = now.result.scores(vectors)
 
-config.py   what can be set                 update.py  the loss, and one step
-teacher.py  features of pixels to learn     method.py  what the loop has to know
-field.py    hash grid and convolution       result.py  the field with its queries
+config.py   configuration
+teacher.py  target features of pixels
+field.py    hash grid and convolution
+update.py   the loss, and one optimization step
+method.py   the method of the drive loop
+result.py   the field with its queries
 query.py    scores of Gaussians and pixels
-inverse.py  from the teacher's channels back to the field's
-votes.py    labels by majority, the baseline
+inverse.py  a learned inverse of the convolution
+votes.py    labels by majority vote, the baseline
 """
 
 from gsjax.methods.distill.config import DistillConfig, DistillRatesConfig, DistillWeightsConfig
@@ -23,13 +26,12 @@ from gsjax.methods.distill.field import (
     init_field,
     rendered_features,
 )
-from gsjax.methods.distill.inverse import learned_inverse, pseudo_inverse
-from gsjax.methods.distill.method import Distill, Problem, frozen_views
+from gsjax.methods.distill.inverse import learned_inverse
+from gsjax.methods.distill.method import Distill, Problem, frozen_views, view_batch
 from gsjax.methods.distill.query import (
     Threshold,
     back_projected_cosines,
     gaussian_cosines,
-    painted_cosines,
     pixel_cosines,
     pixel_features,
     pixel_mask,
@@ -65,11 +67,9 @@ __all__ = [
     "label_votes",
     "learned_inverse",
     "majority_labels",
-    "painted_cosines",
     "pixel_cosines",
     "pixel_features",
     "pixel_mask",
-    "pseudo_inverse",
     "relevancy",
     "rendered_features",
     "selection_mask",
@@ -77,5 +77,6 @@ __all__ = [
     "teacher_of_maps",
     "teacher_of_objects",
     "threshold_for",
+    "view_batch",
     "with_maps",
 ]

@@ -1,4 +1,4 @@
-"""Settings of a feature field; the defaults are those of FD-3DGS, section 4, where it gives them."""
+"""Configuration of a feature field; the defaults are those of FD-3DGS, section 4, where it states them."""
 
 from dataclasses import dataclass, field
 from typing import Literal
@@ -13,8 +13,8 @@ POOLS = (1, 2, 4, 8)
 
 @dataclass(frozen=True)
 class DistillRatesConfig:
-    """Learning rates of Adam, which fall to a tenth over the iterations. The paper gives none: at 0.4 times
-    these small things are learned later, at three times these training diverges."""
+    """Learning rates of Adam, which decay to a tenth over the iterations. The paper states none: at 0.4 times
+    these, small objects are learned later; at three times these, training diverges."""
 
     table: float = 2.5e-2
     """Learning rate of the entries of the hash grid, or of the vectors per Gaussian."""
@@ -24,7 +24,7 @@ class DistillRatesConfig:
     """Learning rate of the 1x1 convolution to the teacher's channels."""
 
     def __post_init__(self):
-        expect(self, "rates.", table=(0, np.inf), layers=(0, np.inf), lift=(0, np.inf))
+        expect(self, "rates.", **dict.fromkeys(vars(self), (0, np.inf)))
 
 
 @dataclass(frozen=True)
@@ -32,28 +32,28 @@ class DistillWeightsConfig:
     """Weights of the losses (FD-3DGS, eq. 8)."""
 
     rec: float = 1000.0
-    """Weight of the squared difference, a mean over the teacher's channels."""
+    """Weight of the squared error, a mean over the teacher's channels."""
     cos: float = 1.0
     """Weight of 1 - cosine."""
     contrast: float = 1.0
-    """Weight of the contrast: pixels of one thing are pulled together, those of different things apart."""
+    """Weight of the contrastive loss: pixels of one object attract, pixels of different objects repel."""
     tv: float = 1.0
-    """Weight of the total variation: differences between neighbouring pixels."""
+    """Weight of the total variation between neighbouring pixels."""
     map: float = 1.0
-    """Weight of a pixel of a map relative to one of a mask, where there are both."""
+    """Weight of a pixel of a map relative to a pixel of a mask, for a teacher with both."""
 
     def __post_init__(self):
-        expect(self, "weights.", **dict.fromkeys(("rec", "cos", "contrast", "tv", "map"), (0, np.inf)))
+        expect(self, "weights.", **dict.fromkeys(vars(self), (0, np.inf)))
 
 
 @dataclass(frozen=True)
 class DistillConfig:
-    """Settings of a distillation."""
+    """Configuration of a distillation."""
 
     iterations: int = 1500
     """Number of steps, of one view each."""
     channels: int = 256
-    """Channels of a Gaussian's feature; the convolution takes them to the teacher's channels."""
+    """Channels of a Gaussian's feature; the convolution maps them to the teacher's channels."""
     encoding: Literal["grid", "table"] = "grid"
     """A hash grid over the scene, or a separate vector for each Gaussian (table)."""
     grid: FeatureGridConfig = field(default_factory=FeatureGridConfig)
@@ -63,18 +63,18 @@ class DistillConfig:
     weights: DistillWeightsConfig = field(default_factory=DistillWeightsConfig)
     """Weights of the losses."""
     contrast_after: float = 800 / 1500
-    """Share of the iterations after which the contrast is on; earlier it would scatter the features."""
+    """Share of the iterations after which the contrastive loss is added; earlier it would scatter features."""
     contrast_gamma: float = 1.0
-    """Gamma of the contrast's kernel exp(-gamma |A - B|^2)."""
+    """Gamma of the contrastive kernel exp(-gamma |A - B|^2)."""
     contrast_pool: int = 4
-    """Edge of the contrast's max-pooling windows, pixels: 1, 2, 4 or 8."""
+    """Edge of the max-pooling windows of the contrastive loss, pixels: 1, 2, 4 or 8."""
     contrast_patch: int = 32
-    """Edge of the patch of windows in a step, 64 at most: each window is compared with each."""
+    """Edge of the patch of windows in a step, 64 at most: all pairs of windows are compared."""
     strip_megabytes: float = 256.0
-    """Memory of a strip of features. Larger images are drawn strip by strip, with the same result, and once
-    more in the backward pass."""
+    """Memory of a strip of features. Larger images are rendered strip by strip, with the same result, and
+    again in the backward pass."""
     seed: int = 0
-    """Seed of the first values, the order of views, and the patches."""
+    """Seed of the initial values, the order of views, and the patches."""
 
     def __post_init__(self):
         expect(

@@ -1,13 +1,13 @@
-"""The field itself: a feature for each place, and the convolution that turns it into the teacher's channels
-(FD-3DGS, section 3.3).
+"""The field: a feature for each position, and the convolution to the teacher's channels (FD-3DGS, section
+3.3).
 
 The last layer of the network is linear, and so is rendering. With h_i the input of that layer at Gaussian i,
 f_i = A h_i + b, and alpha the rendered alpha,
 
     F' = sum_i w_i f_i = A (sum_i w_i h_i) + alpha b,
 
-so h is rendered, with 128 channels by default, and not f with 256. The result is the same, and so is
-everything that is linear in F' after it.
+so h with 128 channels (by default) is rendered instead of f with 256. The result is the same, and so is
+everything that is linear in F'.
 """
 
 from typing import NamedTuple
@@ -23,11 +23,11 @@ from gsjax.scene.feature_grid import FeatureGrid, Located, init_feature_grid, lo
 
 _MARGIN = 0.02  # of the box beyond the outermost Gaussians, as a share of its size
 _OUTLIERS = 0.01  # share of the Gaussians that may lie far out on either side of an axis
-_FAR_OUT = 0.5  # how far the box reaches beyond all others, as a share of their size
+_FAR_OUT = 0.5  # how far the box extends beyond the others, as a share of their extent
 
 
 class FeatureField(eqx.Module):
-    """Features of a scene's places or Gaussians, and the convolution that turns them into the teacher's.
+    """Features of positions or Gaussians of a scene, and the convolution to the teacher's channels.
 
     Attributes:
         encoding: a grid over the scene with `channels` outputs, or a vector for each Gaussian.
@@ -49,11 +49,11 @@ class FeatureField(eqx.Module):
 
 
 class RenderedFeatures(NamedTuple):
-    """What is rendered of a field, and the linear map from there to its channels.
+    """The features that are rendered for a field, and the linear map to its channels.
 
     Attributes:
         values: h of each Gaussian.
-        head: [A b], so that F' = head (sum w h, alpha); None where h is f.
+        head: [A b], so that F' = head (sum w h, alpha); None if h is f.
     """
 
     values: Float[Array, "n hidden"]
@@ -77,13 +77,13 @@ class RenderedFeatures(NamedTuple):
 def init_field(
     key: PRNGKeyArray, config: DistillConfig, means: Float[Array, "n 3"], dimension: int
 ) -> tuple[FeatureField, Located | None]:
-    """A field before training, and where the Gaussians lie in its grid.
+    """An untrained field, and the locations of the Gaussians in its grid.
 
     Args:
-        key: random key for the first values.
-        config: sizes of the field.
-        means: centres of the scene's Gaussians, metres. The grid covers the box of those that are finite; the
-            few that lie far outside have the features of its surface.
+        key: random key for the initial values.
+        config: configuration of the field.
+        means: centres of the scene's Gaussians, metres. The grid covers the box of the finite ones; outliers
+            have the features of its surface.
         dimension: number of channels of the teacher's features, D.
 
     Raises:
@@ -107,7 +107,7 @@ def init_field(
 
 
 def _box(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "2 3"]:
-    """The box around all points but a few outliers, which would make the cells much larger for all others."""
+    """The bounding box without a few outliers, which would make the cells much larger for all others."""
     low, high = np.quantile(points, [_OUTLIERS, 1 - _OUTLIERS], axis=0).astype(np.float32)
     room = _FAR_OUT * max((high - low).max(), 1e-3)
     return np.stack([np.maximum(points.min(0), low - room), np.minimum(points.max(0), high + room)])
@@ -116,11 +116,11 @@ def _box(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "2 3"]:
 def rendered_features(
     field: FeatureField, located: Located | None, rows: Int[Array, "some"] | None = None
 ) -> RenderedFeatures:
-    """What to render of a field, for all Gaussians or some.
+    """The features to render for a field, for all Gaussians or some.
 
     Args:
-        field: of all Gaussians.
-        located: where they lie in its grid; None for a vector per Gaussian.
+        field: the field of all Gaussians.
+        located: their locations in its grid; None for a vector per Gaussian.
         rows: indices of Gaussians (default: all).
     """
     if not isinstance(field.encoding, FeatureGrid):
@@ -142,11 +142,10 @@ def features_of(field: FeatureField, located: Located | None) -> Float[Array, "n
 def active_table(
     field: FeatureField, located: Located | None
 ) -> tuple[FeatureField, Located | None, Int[np.ndarray, "active"] | None]:
-    """The field with only those entries of its table that surround a Gaussian; where the Gaussians lie in
-    it; and which entries these are. The latter two are None for a vector per Gaussian.
+    """The field with only the entries of its table that surround a Gaussian; the locations of the Gaussians
+    in it; and the indices of these entries. The latter two are None for a vector per Gaussian.
 
-    The other entries get no gradient, and Adam does not change what never had one; a fine grid has millions
-    of them. On the host.
+    The other entries, millions in a fine grid, get no gradient, so Adam would not change them. On the host.
     """
     if not isinstance(field.encoding, FeatureGrid):
         return field, None, None
@@ -158,8 +157,7 @@ def active_table(
 
 
 def full_table(field: FeatureField, rows: Int[np.ndarray, "active"] | None) -> FeatureField:
-    """The inverse of `active_table`: the field for any place. Entries that surround no Gaussian of the scene
-    are 0."""
+    """The inverse of `active_table`: the field at any position. Entries that surround no Gaussian are 0."""
     if rows is None or not isinstance(field.encoding, FeatureGrid):
         return field
     table = field.encoding.table
@@ -170,27 +168,26 @@ def full_table(field: FeatureField, rows: Int[np.ndarray, "active"] | None) -> F
 def at_means(
     field: FeatureField, rows: Int[np.ndarray, "active"] | None, means: Float[Array, "n 3"]
 ) -> tuple[FeatureField, Located | None]:
-    """The field of an `active_table`, and where Gaussians lie in it, which need not be those that it was
-    trained with. On the host.
+    """The field of an `active_table`, and the locations of any Gaussians in it. On the host.
 
     Args:
-        field: with the active entries of its table.
-        rows: which entries these are; None for a vector per Gaussian.
+        field: the field with the active entries of its table.
+        rows: indices of these entries; None for a vector per Gaussian.
         means: centres of the Gaussians, metres.
 
     Raises:
-        ValueError: the field has a vector for each Gaussian, and there are more or fewer of them.
+        ValueError: the field has a vector for each Gaussian, and their number differs.
     """
     if not isinstance(field.encoding, FeatureGrid):
         count = len(field.encoding)
         if count != len(means):
-            raise ValueError(f"this field has a vector for each of {count} Gaussians, found {len(means)}")
+            raise ValueError(f"means: expected {count} Gaussians, as this field has vectors, found {len(means)}")
         return field, None
     assert rows is not None
     located = locate(field.encoding, means)
     indices = np.asarray(located.indices)
     place = np.minimum(np.searchsorted(rows, indices), len(rows) - 1)
-    # An entry that surrounds no Gaussian of the scene was never trained: the row of zeros at the end.
+    # An entry that surrounds no training Gaussian is the row of zeros at the end.
     place = np.where(rows[place] == indices, place, len(rows))
     table = field.encoding.table
     table = jnp.concatenate([table, jnp.zeros((1, table.shape[1]), table.dtype)])

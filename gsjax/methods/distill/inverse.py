@@ -1,8 +1,8 @@
-"""The way back from the teacher's channels to the field's (FD-3DGS, eq. 9): the pseudo-inverse, or one
-learned with the cycle loss (`gsjax.losses.features.cycle_error`).
+"""The map from the teacher's channels back to the field's, learned with the cycle loss (FD-3DGS, eq. 9;
+`gsjax.losses.features.cycle_error`). The alternative is the pseudo-inverse, `jnp.linalg.pinv`.
 
-With W fixed, as in the paper, and F = W F'_low, the second term of the loss is 0. What remains is linear
-regression in L1 on the features that occur, so the learned inverse need not be an inverse elsewhere.
+With W fixed, as in the paper, and F = W F'_low, the second term of the loss is 0. What remains is linear L1
+regression on the features that occur, so the learned map need not be an inverse elsewhere.
 """
 
 from functools import partial
@@ -17,11 +17,6 @@ from gsjax.losses.features import cycle_error
 _RATE = 3e-3
 
 
-def pseudo_inverse(lift: Float[Array, "d channels"]) -> Float[Array, "channels d"]:
-    """The Moore-Penrose inverse, by singular values."""
-    return jnp.linalg.pinv(lift)
-
-
 @partial(jax.jit, static_argnames=("iterations", "batch"))
 def learned_inverse(
     lift: Float[Array, "d channels"],
@@ -30,12 +25,12 @@ def learned_inverse(
     iterations: int = 500,
     batch: int = 2048,
 ) -> tuple[Float[Array, "channels d"], Float[Array, "iterations"]]:
-    """An inverse of a fixed convolution, by Adam on the cycle loss; and the loss over the iterations.
+    """An inverse of a fixed convolution, trained with Adam on the cycle loss; and the loss of each step.
 
     Args:
         lift: the convolution, W.
-        features: features F'_low of pixels or of Gaussians.
-        key: one key, of shape [], for the first values and the batches.
+        features: features F'_low of pixels or Gaussians.
+        key: one key, of shape [], for the initial values and the batches.
         iterations: number of steps.
         batch: number of features in a step.
     """

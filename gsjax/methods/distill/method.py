@@ -1,4 +1,4 @@
-"""The distillation as one value: which views teach, which is next, and what comes of it."""
+"""The method of the drive loop: views with their teacher, and the field that they train."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -13,25 +13,25 @@ from gsjax.geometry.cameras import Camera
 from gsjax.methods.distill.config import DistillConfig
 from gsjax.methods.distill.field import active_table, init_field
 from gsjax.methods.distill.result import DistillResult
-from gsjax.methods.distill.teacher import Teacher, most_rows, of_view
+from gsjax.methods.distill.teacher import Teacher, max_rows, view_codebook
 from gsjax.methods.distill.update import Batch, distill_step
 from gsjax.methods.sampling import shuffled_index
 from gsjax.optim.method import Run
 from gsjax.optim.step import Step
 from gsjax.rasterize.frozen import FrozenView, freeze_views
 from gsjax.rasterize.plan import Plan
+from gsjax.scene.feature_grid import Located
 from gsjax.scene.gaussians import Gaussians
 
 
 class Problem(NamedTuple):
-    """What does not change during a distillation.
+    """The constants of a distillation.
 
     Attributes:
-        views: a batch for each view that teaches something.
-        rows: entries of the grid's table that train; None without a grid.
+        views: a batch for each view with known pixels.
+        rows: indices of the grid's entries that are trained; None without a grid.
         means: centres of the scene's Gaussians, metres.
-        source: the encoder of the teacher's features; see `DistillResult`.
-        scene: the scene, as far as it is known; see `DistillResult`.
+        source, scene: as in `DistillResult`.
     """
 
     views: list[Batch]
@@ -43,10 +43,10 @@ class Problem(NamedTuple):
 
 @dataclass(frozen=True)
 class Distill:
-    """A semantic field for a static scene (`gsjax.optim.method.Method`).
+    """Distillation of a semantic field of a static scene (`gsjax.optim.method.Method`).
 
     Attributes:
-        config: settings of the field and its training.
+        config: configuration of the field and its training.
     """
 
     config: DistillConfig = field(default_factory=DistillConfig)
@@ -64,28 +64,25 @@ class Distill:
         """A distillation before its first step.
 
         Args:
-            gaussians: the scene, which does not change.
+            gaussians: the scene, which stays fixed.
             cameras: one for each view, viewmat [4,4] and K [3,3], of any sizes.
-            teacher: of the same views.
-            rasterize_mode: "antialiased" for a scene that was fitted with it.
-            source: the encoder of the teacher's features; see `DistillResult`.
-            scene: what is known of the scene; see `DistillResult`.
+            teacher: target features of the same views.
+            rasterize_mode: "classic" or "antialiased", as the scene was fitted.
+            source, scene: as in `DistillResult`.
 
         Raises:
-            ValueError: the teacher has other views, or of other sizes, or no Gaussian has a finite centre.
+            ValueError: the teacher's views differ in number or size, or no Gaussian has a finite centre.
         """
         _check(cameras, teacher)
         config = self.config
         found, located = init_field(jax.random.key(config.seed), config, gaussians.means, teacher.dimension)
         found, located, rows = active_table(found, located)
-        most, views = most_rows(teacher), []
-        for v, (view, plan) in enumerate(frozen_views(gaussians, cameras, rasterize_mode)):
-            if teacher.maps is None and not (teacher.ids[v] >= 0).any():
-                continue  # it teaches nothing
-            ids, codebook = of_view(teacher, v, most)
-            codebook = None if codebook is None else jnp.asarray(codebook)
-            of_pixels = None if teacher.maps is None else teacher.maps[v]
-            views.append(Batch(view, located, jnp.asarray(ids), codebook, of_pixels, plan))
+        most = max_rows(teacher)
+        views = [
+            view_batch(teacher, v, most, located, frozen)
+            for v, frozen in enumerate(frozen_views(gaussians, cameras, rasterize_mode))
+            if teacher.maps is not None or (teacher.ids[v] >= 0).any()
+        ]
         about = {"num_gaussians": gaussians.num, "rasterize_mode": rasterize_mode} | dict(scene or {})
         problem = Problem(views, rows, jnp.asarray(gaussians.means), source, about)
         return problem, Run(found, self.step.init(found))
@@ -96,30 +93,48 @@ class Distill:
         return distill_step(self.config)
 
     def total(self, problem: Problem) -> int:
-        """The iterations of the configuration."""
+        """Number of steps, `config.iterations`."""
         return self.config.iterations
 
     def between(self, problem: Problem, run: Run, progress: float) -> Run:
-        """The run as it is: shapes never change, and views are frozen. Arguments as for `Method.between`."""
+        """The run unchanged, as shapes are constant and views frozen. Arguments as for `Method.between`."""
         return run
 
     def batch(self, problem: Problem, run: Run, progress: float) -> tuple[Batch, tuple[str, ...]]:
-        """The view whose turn it is, which has its own plan. Arguments as for `Method.batch`."""
+        """The next view, in shuffled order, with its own plan. Arguments as for `Method.batch`."""
         return problem.views[shuffled_index(self.config.seed, run.step, len(problem.views))], ()
 
     def result(self, problem: Problem, run: Run) -> DistillResult:
-        """The field. Its arrays are those of the run: copy what is to be kept."""
+        """The field. It shares the arrays of the run, which later steps may donate."""
         return DistillResult(run.params, problem.rows, problem.source, problem.scene, problem.means)
+
+
+def view_batch(
+    teacher: Teacher, v: int, rows: int, located: Located | None, frozen: tuple[FrozenView, Plan]
+) -> Batch:
+    """The input of a step on one view.
+
+    Args:
+        teacher: teacher of all views.
+        v: index of the view.
+        rows: number of rows to pad its codebook to, at least `max_rows`.
+        located: locations of the Gaussians in the grid; None without one.
+        frozen: the scene in the view's camera, and its plan.
+    """
+    (view, plan), (ids, codebook) = frozen, view_codebook(teacher, v, rows)
+    codebook = None if codebook is None else jnp.asarray(codebook)
+    pixels = None if teacher.maps is None else teacher.maps[v]
+    return Batch(view, located, jnp.asarray(ids), codebook, pixels, plan)
 
 
 def frozen_views(
     gaussians: Gaussians, cameras: Sequence[Camera], rasterize_mode: str = "classic"
 ) -> list[tuple[FrozenView, Plan]]:
-    """The scene in each camera. Views of one size share their plan and the lengths of their lists.
+    """The frozen scene in each camera. Views of one size share their plan and the lengths of their lists.
 
     Args:
         gaussians: the scene.
-        cameras: of the views.
+        cameras: cameras of the views.
         rasterize_mode: "classic" or "antialiased", as the scene was fitted.
     """
     sizes = sorted({(camera.width, camera.height, camera.near) for camera in cameras})
@@ -138,12 +153,12 @@ def frozen_views(
 
 def _check(cameras: Sequence[Camera], teacher: Teacher) -> None:
     if len(cameras) != len(teacher.ids):
-        raise ValueError(f"teacher: expected that of {len(cameras)} views, found {len(teacher.ids)}")
+        raise ValueError(f"teacher: expected ids of {len(cameras)} views, found {len(teacher.ids)}")
     if teacher.maps is not None and len(teacher.maps) != len(cameras):
         raise ValueError(f"teacher: expected maps of {len(cameras)} views, found {len(teacher.maps)}")
     for v, (camera, ids) in enumerate(zip(cameras, teacher.ids, strict=True)):
         if ids.shape != (camera.height, camera.width):
             raise ValueError(
-                f"teacher: expected {camera.width}x{camera.height} pixels of view {v} like its camera, found "
+                f"teacher: expected {camera.width}x{camera.height} pixels in view {v} like its camera, found "
                 f"{ids.shape[1]}x{ids.shape[0]}"
             )

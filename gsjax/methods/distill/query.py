@@ -1,12 +1,11 @@
 """Scores of a query: per Gaussian, directly in 3D, or per pixel of a view (FD-3DGS, section 3.5).
 
-The score is the cosine; the quotient that the paper prints, F'.q / |F'.q|, is +-1. It is exact in 3D as in
-2D: W f_i is compared with q, through W^T q and W^T W. The paper's way back, an inverse of the convolution
-that takes q to the field's own channels, is there for comparison: the pseudo-inverse, or a learned one
-(`gsjax.methods.distill.inverse`).
+The score is the cosine, as the paper's printed quotient F'.q / |F'.q| is always +-1. It is exact in 3D as in
+2D: W f_i is compared with q, through W^T q and W^T W. The paper's own method, which maps q back to the
+field's channels by an inverse of the convolution, is there for comparison (`back_projected_cosines`).
 
-Against negatives a score is the share of the query in a softmax of two, with the negative that takes most of
-it (Kerr et al. 2023, "LERF", section 3.4): 1/2 where both fit equally well.
+With negatives, the score is the query's smallest share in a softmax with one negative (Kerr et al. 2023,
+"LERF", section 3.4): 1/2 where both match equally.
 """
 
 from typing import NamedTuple
@@ -23,13 +22,13 @@ from gsjax.scene.feature_grid import Located
 
 TEMPERATURE = 0.1
 EVEN = 0.5
-"""The threshold against negatives: the query fits better than each of them."""
+"""The threshold with negatives: the query matches better than each of them."""
 _LEAST_NORM = 1e-12
-_OPAQUE = 0.5  # a pixel to which the scene sends less of its light shows nothing
+_LEAST_ALPHA = 0.5  # below which a pixel shows nothing of the scene
 
 
 class Threshold(NamedTuple):
-    """Score above which something is selected, and the rule that it comes from."""
+    """The score above which Gaussians are selected, and the rule that it comes from."""
 
     value: float
     rule: str
@@ -38,44 +37,26 @@ class Threshold(NamedTuple):
 def gaussian_cosines(
     field: FeatureField, located: Located | None, queries: Float[Array, "q d"]
 ) -> Float[Array, "n q"]:
-    """cos(W f_i, q) of each Gaussian and query, exactly; 0 where one of them has no length.
+    """cos(W f_i, q) of each Gaussian and query, exactly; 0 where one of them has length 0.
 
     Args:
-        field: of all Gaussians.
-        located: where they lie in its grid; None for a vector per Gaussian.
+        field: the field of all Gaussians.
+        located: their locations in its grid; None for a vector per Gaussian.
         queries: vectors in the teacher's channels.
     """
     parts = rendered_features(field, located)
-    rendered = parts.joined(parts.values, jnp.ones(len(parts.values), parts.values.dtype))
-    return _cosines(rendered, parts.lifted(field.lift), queries)
+    return _cosines(_of_gaussians(parts), parts.lifted(field.lift), queries)
 
 
 def pixel_cosines(
-    field: FeatureField,
-    located: Located | None,
-    view: FrozenView,
-    plan: Plan,
-    queries: Float[Array, "q d"],
+    field: FeatureField, parts: RenderedFeatures, view: FrozenView, plan: Plan, queries: Float[Array, "q d"]
 ) -> tuple[Float[Array, "height width q"], Float[Array, "height width"]]:
     """cos(W F', q) of each pixel and query, and the alphas of the view.
 
     Args:
-        field, located: as for `gaussian_cosines`.
-        view, plan: from `gsjax.rasterize.frozen.freeze_views`.
-        queries: vectors in the teacher's channels.
-    """
-    return painted_cosines(field, rendered_features(field, located, view.rows), view, plan, queries)
-
-
-def painted_cosines(
-    field: FeatureField, parts: RenderedFeatures, view: FrozenView, plan: Plan, queries: Float[Array, "q d"]
-) -> tuple[Float[Array, "height width q"], Float[Array, "height width"]]:
-    """`pixel_cosines` with given rendered features of the view's Gaussians, for several strips of it, say.
-
-    Args:
-        field: of all Gaussians.
-        parts: from `rendered_features`, with the rows of the view.
-        view, plan: the view, or a strip of it.
+        field: the field of all Gaussians.
+        parts: `rendered_features` of the view's Gaussians, `view.rows`.
+        view, plan: a view from `gsjax.rasterize.frozen.freeze_views`, or a strip of it.
         queries: vectors in the teacher's channels.
     """
     image, alphas = paint_shown(view, parts.values, plan)
@@ -105,25 +86,24 @@ def back_projected_cosines(
     queries: Float[Array, "q d"],
     inverse: Float[Array, "channels d"],
 ) -> Float[Array, "n q"]:
-    """cos(f_i, W' q) with an inverse W' of the convolution, in the field's own channels (the paper's).
+    """cos(f_i, W' q) with an inverse W' of the convolution, in the field's channels, as in the paper.
 
     Args:
         field, located: as for `gaussian_cosines`.
         queries: vectors in the teacher's channels.
-        inverse: W', for example from `learned_inverse`.
+        inverse: W', from `learned_inverse` or `jnp.linalg.pinv`.
     """
     parts = rendered_features(field, located)
-    rendered = parts.joined(parts.values, jnp.ones(len(parts.values), parts.values.dtype))
-    features = parts.channels_of(rendered)
+    features = parts.channels_of(_of_gaussians(parts))
     back = jnp.matmul(queries, inverse.T, precision="highest")
     return jnp.matmul(_normalised(features), _normalised(back).T, precision="highest")
 
 
 def relevancy(cosines: Float[Array, "*n q"], temperature: float = TEMPERATURE) -> Float[Array, "*n"]:
-    """The first query's score: its cosine where it is alone, else its least share against one of the others.
+    """The score of the first query: its cosine without negatives, else its smallest share against one.
 
     Args:
-        cosines: those of the query, then those of negatives.
+        cosines: cosines of the query, then those of negatives.
         temperature: difference of cosines at which the shares are e : 1.
     """
     if cosines.shape[-1] == 1:
@@ -135,11 +115,11 @@ def relevancy(cosines: Float[Array, "*n q"], temperature: float = TEMPERATURE) -
 def threshold_for(
     scores: Float[np.ndarray, "n"], against_negatives: bool, given: float | None = None
 ) -> Threshold:
-    """The given threshold; 1/2 against negatives; else Otsu's, which divides the scores into two classes with
+    """The given threshold; else 1/2 with negatives; else Otsu's, which splits the scores into two classes of
     the least variance within each. On the host.
 
     Args:
-        scores: of Gaussians.
+        scores: scores of Gaussians.
         against_negatives: whether the scores are shares against negatives.
         given: threshold to use (default: by the rules above).
     """
@@ -150,28 +130,33 @@ def threshold_for(
     scores = scores[np.isfinite(scores)]
     if not len(scores) or scores.max() - scores.min() < 1e-6:
         return Threshold(float("inf"), "Otsu; all scores are alike")
-    from skimage.filters import threshold_otsu  # slow to import
+    from skimage.filters import threshold_otsu  # slow to import; see tests/test_import.py
 
     return Threshold(float(threshold_otsu(scores)), "Otsu")
 
 
 def selection_mask(view: FrozenView, plan: Plan, selected: Bool[Array, "n"]) -> Bool[Array, "height width"]:
-    """Where selected Gaussians send more than half of a pixel's light; others in front of them hide them."""
+    """Where selected Gaussians contribute more than half of a pixel's light, with occlusion by the others."""
     share, _ = paint(view, selected.astype(view.opacities.dtype)[:, None], plan)
-    return share[..., 0] > _OPAQUE
+    return share[..., 0] > _LEAST_ALPHA
 
 
 def pixel_mask(
     scores: Float[Array, "height width"], alphas: Float[Array, "height width"], threshold: float
 ) -> Bool[Array, "height width"]:
-    """Where a view's own scores are above the threshold, and the scene sends more than half of the light.
+    """Where the scores of pixels are above the threshold, and their alphas above 1/2.
 
     Args:
-        scores: of pixels.
-        alphas: of the same pixels.
+        scores: scores of pixels.
+        alphas: their alphas.
         threshold: score above which a pixel is selected.
     """
-    return (scores > threshold) & (alphas > _OPAQUE)
+    return (scores > threshold) & (alphas > _LEAST_ALPHA)
+
+
+def _of_gaussians(parts: RenderedFeatures) -> Float[Array, "n r"]:
+    """The rendered features of pixels that would show one Gaussian each."""
+    return parts.joined(parts.values, jnp.ones(len(parts.values), parts.values.dtype))
 
 
 def _cosines(

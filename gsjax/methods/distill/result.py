@@ -1,4 +1,4 @@
-"""What a distillation is for: a field that answers queries about the Gaussians of its scene."""
+"""The result of a distillation: a field that scores the Gaussians of its scene for queries."""
 
 import json
 import os
@@ -20,21 +20,21 @@ from gsjax.scene.feature_grid import FeatureGrid, Located
 
 FORMAT = 1
 """Format of field.npz."""
-_UNKNOWN = {"kind": "files", "names": {}, "weights": None}  # a source of which nothing is known
+_UNKNOWN = {"kind": "files", "names": {}, "weights": None}  # an unknown source
 
 
 @dataclass(frozen=True, eq=False)
 class DistillResult:
-    """A feature field, apart from its scene but for where the Gaussians are.
+    """A feature field, and the centres of the Gaussians of its scene.
 
     Attributes:
-        field: the field; of a grid, the entries that were trained.
-        rows: which entries of the grid these are; None for a vector per Gaussian.
-        source: the encoder of the teacher's features, by which texts are read
-            (`gsjax.engine.distill.source.Source`); None where it is not known.
-        scene: the scene that the field was distilled for, as far as it is known: `file`, `sha256`,
-            `num_gaussians`, `rasterize_mode` and the options that chose its `photographs`.
-        means: centres of the Gaussians to score, metres; None before the scene is there.
+        field: the field; for a grid, with the trained entries only.
+        rows: indices of these entries; None for a vector per Gaussian.
+        source: source of the teacher's features, with the encoder of texts in their space
+            (`gsjax.engine.distill.source.Source`); None if unknown.
+        scene: the scene of the field, as far as it is known: `file`, `sha256`, `num_gaussians`,
+            `rasterize_mode` and the options that selected its `photographs`.
+        means: centres of the Gaussians to score, metres; None before the scene is loaded.
     """
 
     field: FeatureField
@@ -45,7 +45,7 @@ class DistillResult:
 
     @cached_property
     def placed(self) -> tuple[FeatureField, Located | None]:
-        """The field and where the Gaussians at `means` lie in it, as `gaussian_cosines` takes them.
+        """The field and the locations of the Gaussians in it, as `gaussian_cosines` takes them.
 
         Raises:
             ValueError: there are no means, or as for `at`.
@@ -55,28 +55,28 @@ class DistillResult:
         return self.at(self.means)
 
     def at(self, means: Float[Array, "n 3"]) -> tuple[FeatureField, Located | None]:
-        """The field and where other Gaussians lie in it.
+        """The field and the locations of other Gaussians in it.
 
         Args:
             means: centres of the Gaussians, metres.
 
         Raises:
-            ValueError: the field has a vector for each Gaussian, and there are more or fewer of them.
+            ValueError: the field has a vector for each Gaussian, and their number differs.
         """
         return at_means(self.field, self.rows, means)
 
     def features(self) -> Float[Array, "n channels"]:
-        """The field's feature of each Gaussian; `field.lift` takes it to the teacher's channels."""
+        """The field's feature of each Gaussian; `field.lift` maps it to the teacher's channels."""
         return features_of(*self.placed)
 
     def cosines(self, vectors: Float[ArrayLike, "q d"]) -> Float[Array, "n q"]:
-        """Cosine of each Gaussian's feature and each vector in the teacher's channels.
+        """Cosines of the features of Gaussians and vectors in the teacher's channels.
 
         Args:
-            vectors: for example what an encoder makes of texts.
+            vectors: vectors, such as the embeddings of texts.
 
         Raises:
-            ValueError: the vectors have another number of channels than the teacher's features.
+            ValueError: the vectors' number of channels is not the teacher's.
         """
         return _cosines(*self.placed, self._queries(vectors))
 
@@ -84,7 +84,7 @@ class DistillResult:
         """Score of each Gaussian for the first vector, against the others (`relevancy`).
 
         Args:
-            vectors: the vector of the query, then those of negatives, in the teacher's channels.
+            vectors: the query, then negatives, in the teacher's channels.
 
         Raises:
             ValueError: as for `cosines`.
@@ -98,17 +98,17 @@ class DistillResult:
         negatives: tuple[str, ...] | None = None,
         encoder: LanguageEncoder | None = None,
     ) -> Float[Array, "n"]:
-        """Score of each Gaussian for a text: the cosine, or the least share against one of the negatives,
-        which is above 1/2 where the text fits better than each of them.
+        """Score of each Gaussian for a text: the cosine, or the smallest share against one of the negatives,
+        which is above 1/2 where the text matches better than each of them.
 
         Args:
-            text: what is looked for: "red can".
-            negatives: texts to compare with (default: those of the source; none where it is not known).
-            encoder: reads texts in the space of the teacher's features (default: that of the source).
+            text: the text, such as "red can".
+            negatives: texts to compare with (default: those of the source; none if it is unknown).
+            encoder: encoder of texts in the space of the teacher's features (default: that of the source).
 
         Raises:
-            ValueError: the encoder is not known, does not read the text, or made other features.
-            FileNotFoundError: the encoder's weights are not there.
+            ValueError: the encoder is unknown, does not read the text, or has another dimension.
+            FileNotFoundError: the encoder's weights are missing.
         """
         return self.scores(self.text_vectors(text, negatives, encoder)[0])
 
@@ -118,7 +118,7 @@ class DistillResult:
         negatives: tuple[str, ...] | None = None,
         encoder: LanguageEncoder | None = None,
     ) -> tuple[Float[np.ndarray, "q d"], tuple[str, ...]]:
-        """The vectors of a text and of negatives, as `scores` takes them, and the negatives.
+        """The vectors of a text and negatives, as `scores` takes them, and the negatives.
 
         Args:
             text, negatives, encoder: as for `query`.
@@ -129,25 +129,15 @@ class DistillResult:
         if encoder is None and self.source is None:
             raise ValueError(
                 "encoder: expected one that reads texts in the space of this field's features, found none, "
-                "and the source of the features is not known; give one, or use `scores`"
+                "and the source of the features is unknown; pass one, or use `scores`"
             )
         reader: LanguageEncoder = self.source.encoder() if encoder is None else encoder
-        if negatives is not None:
-            against = tuple(negatives)
-        else:
-            against: tuple[str, ...] = () if self.source is None else tuple(self.source.negatives(text))
-        return np.stack([reader.embed_text(one) for one in (text, *against)]), against
+        if negatives is None:
+            negatives = () if self.source is None else tuple(self.source.negatives(text))
+        return np.stack([reader.embed_text(one) for one in (text, *negatives)]), tuple(negatives)
 
     def write(self, path: str | os.PathLike) -> None:
-        """Write field.npz, which `gsjax query` and `gsjax view` read beside the scene.
-
-        Args:
-            path: the file.
-        """
-        with open(path, "wb") as stream:
-            np.savez_compressed(stream, **self._arrays())
-
-    def _arrays(self) -> dict[str, np.ndarray]:
+        """Write field.npz, which `gsjax query` and `gsjax view` read beside the scene."""
         encoding = self.field.encoding
         source = _UNKNOWN if self.source is None else self.source.plain()
         about: dict[str, Any] = {"format": FORMAT, "source": source, "scene": dict(self.scene)}
@@ -165,21 +155,20 @@ class DistillResult:
                 arrays |= {f"weight_{i}": np.asarray(layer.weight), f"bias_{i}": np.asarray(layer.bias)}
         else:
             arrays["vectors"] = np.asarray(encoding)
-        return arrays | {"about": np.array(json.dumps(about))}
+        with open(path, "wb") as stream:
+            np.savez_compressed(stream, **arrays, about=np.array(json.dumps(about)))
 
     def _queries(self, vectors: Float[ArrayLike, "q d"]) -> Float[Array, "q d"]:
         queries = jnp.asarray(vectors, self.field.lift.dtype)
         if queries.shape[1] != self.field.dimension:
             raise ValueError(
                 f"expected a query of {self.field.dimension} numbers like this field's features, found "
-                f"{queries.shape[1]}: it is of another encoder (--weights)"
+                f"{queries.shape[1]}: it comes from another encoder (--weights)"
             )
         return queries
 
 
-@jax.jit
-def _cosines(field, located, queries):
-    return gaussian_cosines(field, located, queries)
+_cosines = jax.jit(gaussian_cosines)
 
 
 @jax.jit

@@ -1,5 +1,5 @@
-"""The features that pixels are to have: masks with an embedding each (FD-3DGS, section 3.2), or a feature a
-pixel. On the host.
+"""Target features of pixels: masks with an embedding each (FD-3DGS, section 3.2), or dense feature maps. On
+the host.
 """
 
 import warnings
@@ -9,23 +9,22 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-# Shapes are in the docstrings: the functions check them, with better messages than annotations would give.
+# Shapes are in the docstrings: the functions check them, with clearer messages than annotations give.
 
 UNKNOWN_ID = -1
 
 
 class Teacher(NamedTuple):
-    """Features of the pixels of V views.
+    """Target features of the pixels of V views.
 
     Attributes:
-        ids: row of the codebook of each pixel, [H,W] a view; -1 where unknown. Pixels with the same id are of
-            one thing, for the contrast; without a codebook that is all they mean.
-        codebook: the distinct embeddings, [K, D]; None where there are maps only.
-        maps: a feature a pixel of a picture of any size, [h,w,D] a view, stretched over the view; None where
-            there are none.
+        ids: row of the codebook of each pixel, [H,W] per view; -1 where unknown. Pixels with the same id show
+            the same object, for the contrastive loss; without a codebook, ids serve for that alone.
+        codebook: the distinct embeddings, [K, D]; None for a teacher of maps only.
+        maps: feature maps of any resolution, [h,w,D] per view, stretched over the view; None without.
 
-    Embeddings and features of maps are scaled to a mean length of 1: cosines do not depend on their length,
-    but the speed of training would.
+    Embeddings and maps are scaled to a mean length of 1: cosines do not depend on their length, but the speed
+    of training would.
     """
 
     ids: list[np.ndarray]
@@ -42,18 +41,18 @@ class Teacher(NamedTuple):
 
 
 def teacher_of_objects(masks: Sequence[np.ndarray], embeddings: Sequence[np.ndarray]) -> Teacher:
-    """A teacher whose pixels have the embedding of the object whose mask they lie in.
+    """A teacher of masks: each pixel has the embedding of the object whose mask contains it.
 
-    Objects with the same embedding are one thing, within a view and across views.
+    Objects with equal embeddings are one object, within a view and across views.
 
     Args:
         masks: labels of each view, integers [H,W], 0 to n; negative where unknown.
-        embeddings: embeddings of the labels 0 to n of each view, [n+1, D]; a row of zeros for a label that is
-            unknown.
+        embeddings: embeddings of the labels 0 to n of each view, [n+1, D]; a row of zeros for an unknown
+            label.
 
     Raises:
-        ValueError: there is no view, or a label has no embedding; dimensions differ; numbers are not finite;
-            or no label of any view is known.
+        ValueError: there is no view, a label has no embedding, dimensions differ, numbers are not finite, or
+            no label of any view is known.
     """
     if len(masks) != len(embeddings):
         raise ValueError(f"embeddings: expected those of {len(masks)} views, found {len(embeddings)}")
@@ -79,12 +78,12 @@ def teacher_of_objects(masks: Sequence[np.ndarray], embeddings: Sequence[np.ndar
     codebook, place = np.unique(np.concatenate(embeddings).astype(np.float32), axis=0, return_inverse=True)
     known = np.abs(codebook).max(axis=1, initial=0) > 0
     rows = np.where(known, np.cumsum(known) - 1, UNKNOWN_ID)[place.reshape(-1)]
-    begins = np.cumsum([0, *(len(e) for e in embeddings)])
+    starts = np.cumsum([0, *(len(e) for e in embeddings)])
     ids = [
-        np.append(rows, UNKNOWN_ID)[np.where(mask >= 0, begin + mask, len(rows))].astype(np.int32)
-        for mask, begin in zip(masks, begins[:-1], strict=True)
+        np.append(rows, UNKNOWN_ID)[np.where(mask >= 0, start + mask, len(rows))].astype(np.int32)
+        for mask, start in zip(masks, starts[:-1], strict=True)
     ]
-    _warn_of_silence(ids)
+    _warn_of_empty_views(ids)
     return Teacher(ids, codebook[known] / _mean_length([codebook[known]]))
 
 
@@ -93,15 +92,16 @@ def teacher_of_maps(
     sizes: Sequence[tuple[int, int]],
     ids: Sequence[np.ndarray] | None = None,
 ) -> Teacher:
-    """A teacher with a feature for each pixel.
+    """A teacher of dense feature maps.
 
     Args:
-        maps: [h,w,D] of each view, of any size.
+        maps: feature map of each view, [h,w,D], of any resolution.
         sizes: (height, width) of each view.
-        ids: [H,W] of each view, equal for pixels of one thing (default: no contrast).
+        ids: object of each pixel, [H,W] per view (default: no contrastive loss).
 
     Raises:
-        ValueError: dimensions differ, numbers are not finite, or a map has not the shape of its view.
+        ValueError: dimensions differ, numbers are not finite, or the aspect ratio of a map is not that of its
+            view.
     """
     if len(maps) != len(sizes) or not len(maps):
         raise ValueError(f"maps: expected those of {len(sizes)} views, found {len(maps)}")
@@ -112,10 +112,10 @@ def teacher_of_maps(
         if not np.isfinite(one).all():
             raise ValueError(f"maps of view {v}: expected numbers, found NaN or infinity")
         stretch = (one.shape[1] / one.shape[0]) / (width / height)
-        # A grid of square patches leaves up to one of them at the far side of each axis.
+        # A grid of square patches may omit up to one of them at the end of each axis.
         if abs(np.log(stretch)) > np.log(1 + 1.5 / min(one.shape[:2])):
             raise ValueError(
-                f"maps of view {v}: expected a picture of the shape of its view, {width}x{height}, found "
+                f"maps of view {v}: expected the aspect ratio of its view, {width}x{height}, found "
                 f"{one.shape[1]}x{one.shape[0]}"
             )
     if ids is None:
@@ -126,9 +126,9 @@ def teacher_of_maps(
 
 
 def with_maps(objects: Teacher, dense: Teacher) -> Teacher:
-    """A teacher with both the embeddings of objects and maps.
+    """A teacher with masks and maps.
 
-    The maps also give features to what lies in no mask. Their weight relative to the masks is
+    The maps also cover pixels outside of the masks. Their weight relative to the masks is
     `DistillWeightsConfig.map`.
 
     Args:
@@ -136,10 +136,10 @@ def with_maps(objects: Teacher, dense: Teacher) -> Teacher:
         dense: a teacher of maps, of the same views, by the same encoder.
 
     Raises:
-        ValueError: views or dimensions differ, or a teacher is of the other kind.
+        ValueError: views or dimensions differ, or a teacher is of the wrong kind.
     """
     if objects.codebook is None or dense.maps is None:
-        raise ValueError("teachers: expected one of objects and one of maps, found others")
+        raise ValueError("teachers: expected one of masks and one of maps, found others")
     if len(objects.ids) != len(dense.maps):
         raise ValueError(f"dense: expected maps of {len(objects.ids)} views, found {len(dense.maps)}")
     if objects.dimension != dense.dimension:
@@ -150,12 +150,12 @@ def with_maps(objects: Teacher, dense: Teacher) -> Teacher:
     return objects._replace(maps=dense.maps)
 
 
-def of_view(teacher: Teacher, v: int, rows: int) -> tuple[np.ndarray, np.ndarray | None]:
-    """Ids of a view as rows of its own small codebook, and this, padded with zeros; the ids as they are, and
-    None, where there are maps only.
+def view_codebook(teacher: Teacher, v: int, rows: int) -> tuple[np.ndarray, np.ndarray | None]:
+    """The ids [H,W] of a view as rows of its own codebook, and this codebook, [rows, D], padded with zeros;
+    for a teacher of maps only, its ids unchanged, and None.
 
     Args:
-        teacher: of all views.
+        teacher: teacher of all views.
         v: index of the view.
         rows: number of rows to pad to.
     """
@@ -169,8 +169,8 @@ def of_view(teacher: Teacher, v: int, rows: int) -> tuple[np.ndarray, np.ndarray
     return (place.reshape(ids.shape) - unknown).astype(np.int32), book
 
 
-def most_rows(teacher: Teacher) -> int:
-    """The largest number of rows of the codebook that any view shows, at least 1."""
+def max_rows(teacher: Teacher) -> int:
+    """The largest number of rows of the codebook in any view, at least 1."""
     return max(1, *(len(np.unique(ids[ids >= 0])) for ids in teacher.ids))
 
 
@@ -180,13 +180,13 @@ def _mean_length(features: Sequence[np.ndarray]) -> np.float32:
     return np.float32(np.concatenate(lengths).mean() or 1.0)
 
 
-def _warn_of_silence(ids: list[np.ndarray]) -> None:
-    silent = [v for v, one in enumerate(ids) if not (one >= 0).any()]
-    if len(silent) == len(ids):
+def _warn_of_empty_views(ids: list[np.ndarray]) -> None:
+    empty = [v for v, one in enumerate(ids) if not (one >= 0).any()]
+    if len(empty) == len(ids):
         raise ValueError("masks: expected some in at least one view, found none that has an embedding")
-    if silent:
-        some = ", ".join(map(str, silent[:8])) + (", ..." if len(silent) > 8 else "")
-        warnings.warn(f"views without any mask teach nothing: {some} of {len(ids)}", stacklevel=3)
+    if empty:
+        some = ", ".join(map(str, empty[:8])) + (", ..." if len(empty) > 8 else "")
+        warnings.warn(f"views without any mask are not used: {some} of {len(ids)}", stacklevel=3)
 
 
 def _kind(array) -> str:

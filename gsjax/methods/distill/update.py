@@ -1,4 +1,4 @@
-"""One step of a distillation: draw the features of a view, compare them with its teacher, descend
+"""One optimization step of a distillation: render the features of a view and compare them with its teacher
 (FD-3DGS, section 3.4).
 """
 
@@ -22,7 +22,7 @@ from gsjax.losses.features import (
 from gsjax.losses.regularization import total_variation
 from gsjax.methods.distill.config import DistillConfig
 from gsjax.methods.distill.field import FeatureField, RenderedFeatures, rendered_features
-from gsjax.optim.step import Step, gradient_step
+from gsjax.optim.step import Step, gradient_step, per_field_adam
 from gsjax.rasterize.frozen import FrozenView, paint_shown, rows_within, strip_of
 from gsjax.rasterize.plan import Plan
 from gsjax.scene.feature_grid import Located
@@ -31,16 +31,15 @@ _FINAL_RATE = 0.1
 
 
 class Batch(NamedTuple):
-    """A view and the teacher's features of it.
+    """A view and its teacher.
 
     Attributes:
         view: the static scene in the view's camera.
-        located: where its Gaussians lie in the grid; None without one.
-        ids: row of the codebook that each pixel shows, or which thing; -1 where unknown.
-        codebook: the teacher's features that occur in this view; None where there are maps only.
-        map: the teacher's feature of each pixel, of any size; None where there is none. It stays on the host
-            until its step.
-        plan: the capacity of the view, which never grows: the view is frozen.
+        located: locations of its Gaussians in the grid; None without one.
+        ids: row of the codebook, or object, of each pixel; -1 where unknown.
+        codebook: the teacher's features in this view; None for a teacher of maps only.
+        map: the teacher's feature map, of any resolution; None without. It stays on the host until its step.
+        plan: plan of the view, which never grows, as the view is frozen.
     """
 
     view: FrozenView
@@ -52,7 +51,7 @@ class Batch(NamedTuple):
 
 
 class _Sums(NamedTuple):
-    """Losses summed over the pixels of a strip, and the number of pixels that have a teacher."""
+    """Losses summed over the pixels of a strip, and the (weighted) number of pixels with a teacher."""
 
     rec: Float[Array, ""]
     cos: Float[Array, ""]
@@ -63,34 +62,25 @@ class _Sums(NamedTuple):
 def distill_step(config: DistillConfig) -> Step:
     """Adam on a `FeatureField`.
 
-    `batch` is a `Batch`; `step` says when the contrast begins, and `key` chooses its patch. `info` has each
-    loss by name, unweighted, beside what every step reports.
+    `batch` is a `Batch`; `step` determines when the contrastive loss begins, and `key` selects its patch.
+    `info` has each loss by name, unweighted, beside what every step reports.
 
     Args:
-        config: of the distillation.
+        config: configuration of the distillation.
     """
-    rates = config.rates
-    fall = optax.exponential_decay(1.0, config.iterations, _FINAL_RATE)
-
-    def label(field: FeatureField):
-        def of(path, _):
-            names = [getattr(key, "name", None) for key in path]
-            return "lift" if "lift" in names else "layers" if "layers" in names else "table"
-
-        return jax.tree_util.tree_map_with_path(of, field)
-
-    def adam(rate: float):
-        return optax.adam(lambda i: rate * fall(i), eps=1e-15)
-
-    adams = {"table": adam(rates.table), "layers": adam(rates.layers), "lift": adam(rates.lift)}
-    return gradient_step(distill_loss(config), optax.multi_transform(adams, label))
+    rates, decay = config.rates, optax.exponential_decay(1.0, config.iterations, _FINAL_RATE)
+    by_field = {"encoding": rates.table, "layers": rates.layers, "lift": rates.lift}
+    if config.encoding == "table":  # without a network
+        del by_field["layers"]
+    schedules = {name: lambda count, rate=rate: rate * decay(count) for name, rate in by_field.items()}
+    return gradient_step(distill_loss(config), per_field_adam(schedules))
 
 
 def distill_loss(config: DistillConfig) -> Callable:
     """`loss(field, batch, *, step, key)` of one view (FD-3DGS, eq. 8).
 
     Args:
-        config: weights and the contrast's settings.
+        config: configuration, with the weights.
     """
     weights, edge = config.weights, config.contrast_pool
 
@@ -119,12 +109,12 @@ def distill_loss(config: DistillConfig) -> Callable:
 
 
 def strip_rows(config: DistillConfig, hidden: int, batch: Batch) -> int:
-    """Number of rows of tiles in a strip, within the memory that the configuration allows.
+    """Number of rows of tiles in a strip, within `config.strip_megabytes`.
 
     Args:
-        config: with the megabytes of a strip.
+        config: configuration of the distillation.
         hidden: number of rendered channels.
-        batch: of one view.
+        batch: batch of one view.
     """
     numbers = hidden + config.channels
     numbers += 0 if batch.codebook is None else len(batch.codebook)
@@ -135,12 +125,12 @@ def strip_rows(config: DistillConfig, hidden: int, batch: Batch) -> int:
 def _drawn(
     field: FeatureField, batch: Batch, corner: Any, config: DistillConfig
 ) -> tuple[_Sums, Float[Array, "h_ patch channels"] | None]:
-    """The losses of a view, and pooled features of the columns from which the contrast takes its patch.
+    """The losses of a view, and pooled features of the columns of the contrastive loss's patch.
 
-    The image is processed strip by strip. A strip does not keep its pixels and is drawn once more in the
+    The image is processed strip by strip. The pixels of a strip are not kept but rendered again in the
     backward pass, so the memory is that of one strip.
     """
-    # Only for Gaussians that the view shows: those behind others need no features.
+    # Only for visible Gaussians: occluded ones need no features.
     parts, plan = rendered_features(field, batch.located, batch.view.rows), batch.plan
     rows = strip_rows(config, parts.values.shape[1], batch)
     strips = -(-plan.tiles_y // rows)
@@ -171,13 +161,12 @@ def _strip(
     corner: Any,
     config: DistillConfig,
 ):
-    """The last row of a strip, its sums, and pooled features of some of its columns."""
+    """The last row of a strip, its sums, and pooled features of the patch's columns."""
     plan, weights = batch.plan, config.weights
     high = rows * plan.tile_size
     view, strip_plan = strip_of(batch.view, plan, number * rows, rows)
     image, alphas = paint_shown(view, parts.values, strip_plan)
-    # Pixels on one axis: XLA:CPU takes ten times as long for a matmul over two axes, as in the gradient of
-    # the weights.
+    # Pixels on one axis: for two, XLA:CPU takes ten times as long for the gradient of the weights.
     alphas = alphas.ravel()
     rendered = parts.joined(image.reshape(len(alphas), -1), alphas)
     inside = number * high + jnp.arange(high) < plan.height
@@ -206,10 +195,10 @@ def _teacher_sums(
     alphas,
     first_row,
     inside,
-    beside_masks: float,
+    map_weight: float,
 ) -> _Sums:
-    """How far a strip's pixels, on one axis, are from the teacher's features. A pixel of a map has the weight
-    `beside_masks` where there are masks too."""
+    """Errors of a strip's pixels, on one axis, to the teacher's features. A pixel of a map has the weight
+    `map_weight` if there are masks too."""
     lifted = parts.lifted(field.lift)
     zero = jnp.zeros((), rendered.dtype)
     rec, cos, pixels = zero, zero, zero
@@ -223,7 +212,7 @@ def _teacher_sums(
         wanted = _stretched(jnp.asarray(batch.map), first_row, len(inside), batch.plan)
         like = likeness_to_map(rendered, lifted, wanted.reshape(len(alphas), -1))
         known = jnp.repeat(inside, batch.plan.width)
-        weight = jnp.where(known, 1.0 if batch.codebook is None else beside_masks, 0.0)
+        weight = jnp.where(known, 1.0 if batch.codebook is None else map_weight, 0.0)
         rec += (weight * feature_error(like, alphas, field.dimension)).sum()
         cos += (weight * cosine_error(like)).sum()
         pixels += weight.sum()
@@ -233,7 +222,7 @@ def _teacher_sums(
 def _stretched(
     teacher: Float[Array, "h w d"], first: Int[Array, ""] | int, rows: int, plan: Plan
 ) -> Float[Array, "rows width d"]:
-    """Rows of a teacher's map at the size of the view, interpolated linearly between its pixel centres."""
+    """Rows of a teacher's map resized bilinearly to the view."""
     high, wide = teacher.shape[:2]
 
     def places(centres, have: int, want: int):
@@ -254,7 +243,7 @@ def _patch_shape(shape: tuple[int, ...], config: DistillConfig) -> tuple[int, in
 
 
 def _corner(key: Any, shape: tuple[int, ...], config: DistillConfig) -> tuple[Int[Array, ""], Int[Array, ""]]:
-    """The first window, down and across, of the patch that the key chooses."""
+    """The first window, down and across, of a random patch."""
     (first, second), size = jax.random.split(key), _patch_shape(shape, config)
     down, across = (side // config.contrast_pool - some for side, some in zip(shape, size, strict=True))
     return jax.random.randint(first, (), 0, down + 1), jax.random.randint(second, (), 0, across + 1)
@@ -263,7 +252,7 @@ def _corner(key: Any, shape: tuple[int, ...], config: DistillConfig) -> tuple[In
 def _contrast(
     columns: Float[Array, "h patch channels"], ids: Int[Array, "h w"], corner: Any, config: DistillConfig
 ) -> Float[Array, ""]:
-    """The contrast within a patch of pooled features; `columns` are those of the patch, in all rows."""
+    """The contrastive loss of a patch of pooled features; `columns` are its columns, in all rows."""
     high, wide = min(config.contrast_patch, ids.shape[0]), columns.shape[1]
     patch = jax.lax.dynamic_slice_in_dim(columns, corner[0], high)
     seen = jax.lax.dynamic_slice(ids, corner, (high, wide))

@@ -1,7 +1,7 @@
-"""Labels of pixels lifted to Gaussians by majority: the baseline of a field, and the simplest way of lifting.
+"""Labels of pixels lifted to Gaussians by majority vote: the baseline of a field.
 
-A pixel's vote for a Gaussian is the share of its light that the Gaussian sends. So the votes of a view are
-the gradient of sum over pixels p of F(p)[label of p] with respect to the Gaussians' values, in which F is
+A pixel votes for a Gaussian with the weight of the Gaussian in the pixel. So the votes of a view are the
+gradient of the sum over pixels p of F(p)[label of p] with respect to the Gaussians' values, in which F is
 linear.
 """
 
@@ -21,7 +21,7 @@ from gsjax.rasterize.plan import Plan
 def label_votes(
     view: FrozenView, plan: Plan, ids: Int[Array, "height width"], count: int
 ) -> Float[Array, "seen count"]:
-    """How much light each Gaussian that a view shows, `view.rows`, sends to the pixels of each label.
+    """Total weight of each visible Gaussian, `view.rows`, in the pixels of each label.
 
     Args:
         view, plan: the frozen view and its plan.
@@ -37,8 +37,7 @@ def label_votes(
 def majority_labels(
     views: Sequence[tuple[FrozenView, Plan]], ids: Sequence[np.ndarray], count: int, num: int
 ) -> Int[np.ndarray, "n"]:
-    """The label with most votes over all views, for each of `num` Gaussians; -1 for one that sends no light
-    to a pixel with a label.
+    """The label with most votes over all views, for each of `num` Gaussians; -1 for one without votes.
 
     Args:
         views: frozen views with their plans.

@@ -25,12 +25,7 @@ from gsjax.engine.viewables import open_viewable
 from gsjax.io.ply import read_ply, write_ply
 from gsjax.io.video import read_video_frames
 from gsjax.methods.deform import Deform, DeformConfig, Kept, with_field
-from gsjax.methods.deform.query import (
-    like_feature,
-    most_likely,
-    prompt_probabilities,
-    region_feature,
-)
+from gsjax.methods.deform.query import most_likely, region_feature
 from gsjax.scene.deformation import DeformationConfig
 from tests.cli.deform.test_command import SCENE
 
@@ -65,7 +60,7 @@ def taught(tmp_path_factory):
 
 def in_corner(stored, t):
     """Which Gaussians lie in the lower left quarter of a frame's picture."""
-    viewmat, K = stored.viewmats[t], stored.timeline.Ks[t]
+    viewmat, K = stored.timeline.viewmats[t], stored.timeline.Ks[t]
     local = np.asarray(stored.at(stored.timeline.times[t]).means) @ viewmat[:3, :3].T + viewmat[:3, 3]
     x, y = (local @ K.T)[:, :2].T / local[:, 2]
     return (x < 32) & (y > 26)
@@ -146,7 +141,7 @@ def test_without_a_prompt_all_are_named(gsjax, run):
 @pytest.mark.parametrize(
     ("told", "words"),
     [
-        (("scalpel",), "no class 'scalpel'; this scene knows names alone, and there are: tissue, tool"),
+        (("scalpel",), "no class 'scalpel'; this scene can be queried by its names only: tissue, tool"),
         (("tool", "--point", "3,3"), "at most one of TEXT, --point and --box"),
         (("--point", "64,3"), "--point: expected 0 <= X < 64 and 0 <= Y < 52"),
         (("--box", "9,9,3,3"), "--box: expected"),
@@ -196,7 +191,7 @@ def test_a_run_is_seen_over_time_and_asked(run):
     np.testing.assert_array_equal(scene.at(7).means, stored.at(stored.timeline.times[7]).means)
     assert [scene.name_of(int(np.flatnonzero(rows)[0])) for rows in (corner, ~corner)] == ["tool", "tissue"]
     np.testing.assert_array_equal(scene.shots.load_image(3, 0), open_sequence(SCENE).image(3, 0))
-    np.testing.assert_array_equal(scene.shots.viewmats[3, 0], stored.viewmats[3])
+    np.testing.assert_array_equal(scene.shots.viewmats[3, 0], stored.timeline.viewmats[3])
     for found in (asking.ask("tool", 4), asking.like(int(np.flatnonzero(corner)[0]), 4)):
         np.testing.assert_array_equal(found.scores > found.threshold, corner)
     with pytest.raises(ValueError, match="no class 'spoon'"):
@@ -243,15 +238,9 @@ def test_features_that_change_are_those_of_the_frame(run):
     assert asked(run)["gaussians"] == scene.num
 
 
-def test_a_prompt_of_a_feature_is_told_apart_from_the_other_names():
-    rng = np.random.default_rng(0)
-    codebook = np.linalg.qr(rng.normal(size=(6, 6)))[0][:3]
-    prompt = like_feature(0.2 * (codebook[2] + 0.4 * codebook[0]), codebook)
-    assert prompt.row == 2
-    np.testing.assert_array_equal(prompt.vectors[:2], codebook[:2])
-    said = np.asarray(prompt_probabilities(jnp.asarray(codebook), jnp.asarray(prompt.vectors)))
-    np.testing.assert_array_equal(most_likely(said), [0, 1, 2])
-    np.testing.assert_array_equal(most_likely(np.full((2, 3), 1 / 3)), [-1, -1])
+def test_nothing_is_most_likely_where_all_are_equally_likely():
+    likely = np.array([[0.2, 0.8], [0.6, 0.4], [0.5, 0.5]])
+    np.testing.assert_array_equal(most_likely(likely), [1, 0, -1])
 
 
 def test_a_region_is_the_mean_of_its_pixels():

@@ -22,7 +22,7 @@ from gsjax.engine.deform.teacher import GROUPS, basis_of, groups_of
 from gsjax.engine.distill.choice import TeacherChoice
 from gsjax.engine.distill.source import Source
 from gsjax.engine.messages import Notes
-from gsjax.methods.deform import Deform, DeformConfig, Meaning, counted_ids, wanted_like, wanted_text
+from gsjax.methods.deform import Deform, DeformConfig, Meaning, counted_ids, feature_prompt, text_prompt
 from tests.cli.deform.test_command import SCENE, SMALL
 from tests.perception.test_foundation import clip_folder, needs_foundation  # noqa: F401
 
@@ -153,19 +153,19 @@ def test_files_that_do_not_fit(files, tmp_path):
 
 
 def test_the_closed_vocabulary_teaches_and_reads(tmp_path):
-    """Tissue is pink and the tool grey; who asks for a colour finds the Gaussians of it."""
+    """Tissue is pink and the tool grey; a colour's name finds the Gaussians of that colour."""
     data, said = data_of("closed", tmp_path, 16)
     assert "no foundation model" in said
-    wanted = wanted_text(data.meaning, "grey")
-    scores = np.asarray(wanted.scores(jnp.asarray(data.lesson.codebook, jnp.float32)))
-    threshold = wanted.threshold(scores)
+    prompt = text_prompt(data.meaning, "grey")
+    scores = np.asarray(prompt.scores(jnp.asarray(data.lesson.codebook, jnp.float32)))
+    threshold = prompt.threshold(scores)
     assert threshold.rule == "the encoder's own"
     ids, mask = data.labels(0).ids, open_sequence(SCENE).mask(0, 0)
     assert (scores[ids[mask > 0]] > threshold.value).all()
     assert (scores[ids[mask == 0]] < threshold.value).all()
     with pytest.raises(ValueError, match="--weights"):
         data.meaning.source.encoder(Path("x"))
-    assert wanted_text(data.meaning, "Group 2").meant == "group 2"  # its names are its own
+    assert text_prompt(data.meaning, "Group 2").name == "group 2"  # its names are its own
     assert "or one of: group 1, group 2" in data.meaning.hint()
 
 
@@ -239,18 +239,18 @@ def test_clip_teaches_and_reads(tmp_path, request, monkeypatch):
 def test_classes_are_named_and_nothing_else():
     names = ("tissue", "tool")
     meaning = Meaning(Source("classes", dict(enumerate(names, 1))), names, np.eye(2), np.eye(5, 2))
-    assert wanted_text(meaning, "Tool").row == 1
+    assert text_prompt(meaning, "Tool").row == 1
     with pytest.raises(ValueError, match="--negatives: a name is held against the other names"):
-        wanted_text(meaning, "tool", ("x",))
+        text_prompt(meaning, "tool", ("x",))
     with pytest.raises(ValueError, match="no class 'forceps'"):
-        wanted_text(meaning, "forceps")
+        text_prompt(meaning, "forceps")
 
 
 def test_a_place_is_told_apart_from_the_other_names():
     meaning = Meaning(Source("files"), ("a", "b"), np.eye(2), np.eye(5, 2))
-    wanted = wanted_like(meaning, np.array([0.1, 0.9]))
-    assert (wanted.meant, wanted.against) == ("b", ("a",))
-    scores = np.asarray(wanted.scores(jnp.array([[1.0, 0], [0.1, 0.9], [0, 0]])))
+    prompt = feature_prompt(meaning, np.array([0.1, 0.9]))
+    assert (prompt.name, prompt.negatives) == ("b", ("a",))
+    scores = np.asarray(prompt.scores(jnp.array([[1.0, 0], [0.1, 0.9], [0, 0]])))
     assert scores[1] > 0.99 > 0.5 > scores[0]
     np.testing.assert_allclose(scores[2], 0.5)
 
@@ -259,9 +259,9 @@ def test_what_was_asked_for_is_meant_however_alike_the_names_are():
     """Groups of CLIP's features, say, whose cosines are 0.9: a share among all of eight would be 0.28."""
     codebook = np.sqrt(0.9) * np.eye(9)[[0] * 8] + np.sqrt(0.1) * np.eye(9)[1:]
     names = tuple(f"group {n}" for n in range(1, 9))
-    wanted = wanted_like(Meaning(Source("files"), names, codebook, np.eye(9)), 0.3 * codebook[4])
-    scores = np.asarray(wanted.scores(jnp.asarray(codebook)))
-    assert wanted.threshold(scores).value == 0.5
+    prompt = feature_prompt(Meaning(Source("files"), names, codebook, np.eye(9)), 0.3 * codebook[4])
+    scores = np.asarray(prompt.scores(jnp.asarray(codebook)))
+    assert prompt.threshold(scores).value == 0.5
     np.testing.assert_array_equal(np.flatnonzero(scores > 0.5), [4])
 
 

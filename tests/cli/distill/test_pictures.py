@@ -65,15 +65,16 @@ def test_classes_of_a_picture_are_found_strip_by_strip(scene, monkeypatch):
     K = jnp.array([[40.0, 0, 20], [0, 40.0, 30], [0, 0, 1]])
     frozen = frozen_views(gaussians, [Camera(jnp.eye(4).at[2, 3].set(3.0), K, 40, 60)])[0]
 
-    def told(view, plan, first, count):
+    def recorded(view, plan, first, count):
         rows.append(count)
         return strip_of(view, plan, first, count)
 
-    monkeypatch.setattr(field_scores, "strip_of", told)
+    monkeypatch.setattr(field_scores, "strip_of", recorded)
     asked = (field, located, frozen, codes, classes_of(field, located, codes))
     whole, strips = class_maps(*asked), class_maps(*asked, strip_megabytes=0.1)
     assert rows == [frozen[1].tiles_y, 3] == [8, 3]
-    cosines, alphas = jax.jit(lambda: pixel_cosines(field, located, *frozen, jnp.asarray(codes)))()
+    parts = rendered_features(field, located, frozen[0].rows)
+    cosines, alphas = jax.jit(lambda: pixel_cosines(field, parts, *frozen, jnp.asarray(codes)))()
     np.testing.assert_array_equal(whole[0], np.where(alphas > 0.5, cosines.argmax(-1), -1))
     for one, other in zip(whole, strips, strict=True):
         np.testing.assert_array_equal(one, other)
