@@ -10,13 +10,13 @@ from rich.table import Table as Grid
 
 from gsjax.engine.distill.scene import FieldScene
 from gsjax.engine.distill.scores import ClassScores, Frozen, angle_error, class_maps, classes_of, one_by_one
-from gsjax.engine.distill.teacher import Teaching
 from gsjax.engine.ending import print_grid
 from gsjax.engine.folder import RunFolder
 from gsjax.engine.machine import in_words
 from gsjax.engine.messages import Notes, describe
 from gsjax.engine.report import Media, Table, write_report
 from gsjax.engine.scores import mean_scores
+from gsjax.engine.teaching.teaching import Teaching
 from gsjax.io.pictures import write_png
 from gsjax.methods.distill import DistillConfig, DistillResult, FeatureField, rendered_features
 from gsjax.rasterize.frozen import paint

@@ -25,7 +25,7 @@ class Meaning:
 
     Attributes:
         source: what made the features that were learned, which knows the encoder that reads texts in their
-            space (`gsjax.engine.distill.source.Source`).
+            space (`gsjax.engine.teaching.source.Source`).
         names: of what the features tell apart: classes, or groups of features that are alike.
         codebook: the feature of each name.
         basis: orthonormal columns that bring the source's vectors of D numbers into the scene's channels.

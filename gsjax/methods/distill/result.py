@@ -31,7 +31,7 @@ class DistillResult:
         field: the field; of a grid, the entries that were trained.
         rows: which entries of the grid these are; None for a vector per Gaussian.
         source: the encoder of the teacher's features, by which texts are read
-            (`gsjax.engine.distill.source.Source`); None where it is not known.
+            (`gsjax.engine.teaching.source.Source`); None where it is not known.
         scene: the scene that the field was distilled for, as far as it is known: `file`, `sha256`,
             `num_gaussians`, `rasterize_mode` and the options that chose its `photographs`.
         means: centres of the Gaussians to score, metres; None before the scene is there.

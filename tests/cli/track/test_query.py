@@ -11,7 +11,7 @@ import yaml
 
 from gsjax.cli import main
 from gsjax.cli.grasp import draw_grasp
-from gsjax.engine.distill.source import Source
+from gsjax.engine.teaching.source import Source
 from gsjax.io.video import read_video_frames
 from gsjax.methods.grasping import Grasp, Gripper
 from gsjax.perception.codebook import ClassCodebook
