@@ -1,7 +1,7 @@
 """`gsjax distill`: a semantic field for a static scene, which `gsjax query` queries."""
 
-from gsjax.engine.distill.cache import cache_folder
 from gsjax.engine.distill.run import Options, run
+from gsjax.engine.teaching.cache import cache_folder
 
 HELP = (
     " As in `gsjax distill RUN`, or, for the scene of another program, `gsjax distill scene.ply --images "

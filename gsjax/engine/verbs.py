@@ -27,7 +27,7 @@ from gsjax.methods.protocols import Segmenter
 from gsjax.scene.gaussians import Gaussians
 
 if TYPE_CHECKING:
-    from gsjax.engine.distill.choice import TeacherChoice
+    from gsjax.engine.teaching.choice import TeacherChoice
 else:
     TeacherChoice = Any  # slow to import, as all that finds a teacher is
 
@@ -141,7 +141,7 @@ def distill(
         DataError: a photograph or its masks cannot be read.
         FileNotFoundError: weights or feature files are not there.
     """
-    from gsjax.engine.distill.teacher import teacher_for
+    from gsjax.engine.teaching.teaching import teacher_for
 
     method = Distill(DistillConfig() if config is None else config)
     teacher, source = teacher_for(photographs, teacher)

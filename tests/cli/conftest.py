@@ -14,10 +14,10 @@ from gsjax.cli import main
 from gsjax.data import open_sequence, write_panoptic
 from gsjax.data.simulated import tabletop
 from gsjax.engine.distill.scene import SceneOptions
-from gsjax.engine.distill.source import Source
 from gsjax.engine.drive import Tick
 from gsjax.engine.folder import RunFolder, plain
 from gsjax.engine.records import digest
+from gsjax.engine.teaching.source import Source
 from gsjax.engine.track import loop, run
 from gsjax.geometry.cameras import OPENGL_TO_OPENCV
 from gsjax.methods.distill import DistillResult, FeatureField

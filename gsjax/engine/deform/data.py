@@ -1,8 +1,8 @@
-"""What `gsjax deform` learns from: frames of one camera, the pixels that count, and names of mask values."""
+"""The data of `gsjax deform`: frames of one camera, the pixels that count, and names of mask values."""
 
 import hashlib
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import jax
@@ -13,15 +13,17 @@ from rich.progress import track
 
 from gsjax.data import Sequence
 from gsjax.data.tool_masks import TISSUE, is_tool
-from gsjax.engine.deform.teacher import ClassTeacher, EncodedTeacher, Labels, labels_of, teaching_of
-from gsjax.engine.distill.choice import TeacherChoice
+from gsjax.engine.deform.teacher import Labels, Taught, as_photographs, taught_by_classes, taught_by_features
 from gsjax.engine.messages import Notes
+from gsjax.engine.teaching.cache import FeatureCache
+from gsjax.engine.teaching.choice import NO_TEACHER, TeacherChoice
+from gsjax.engine.teaching.teaching import Teaching
 from gsjax.geometry.cameras import Camera
 from gsjax.methods.deform import Lesson, Meaning, Timeline, can_start_from, counted_ids
 from gsjax.scene.frame import Frame
 
 Tools = Literal["leave-out", "draw"]
-_OF_CLASSES = ("auto", "classes")
+_WITHOUT_ENCODER = ("auto", "classes", NO_TEACHER)
 _SHOWN = 0.005  # of a picture: a class that has less of it hardly shows
 
 
@@ -34,9 +36,7 @@ class DeformData:
         train: indices of frames to learn from.
         test: indices of frames that are held out.
         frames: what the camera saw in the former.
-        lesson: a teacher's labels of these; None without a teacher.
-        held_out: the teacher's labels of frames in `test`.
-        taught: digest of what the teacher teaches, in hexadecimal.
+        taught: what the teacher says about the frames; None without a teacher.
         tool_values: mask values that are tools; those with names of tools where there is none.
     """
 
@@ -44,9 +44,7 @@ class DeformData:
     train: list[int]
     test: list[int]
     frames: list[Frame]
-    lesson: Lesson | None = None
-    held_out: Mapping[int, Labels] = field(default_factory=dict)
-    taught: str = ""
+    taught: Taught | None = None
     tool_values: tuple[int, ...] = ()
 
     @property
@@ -55,8 +53,13 @@ class DeformData:
         return unit_times(self.sequence)
 
     @property
+    def lesson(self) -> Lesson | None:
+        """The teacher's labels of the frames to learn from; None without a teacher."""
+        return None if self.taught is None else self.taught.lesson
+
+    @property
     def meaning(self) -> Meaning | None:
-        """What features are to mean; None without a teacher."""
+        """The meaning of features; None without a teacher."""
         return None if self.lesson is None else self.lesson.meaning
 
     @property
@@ -81,7 +84,7 @@ class DeformData:
 
     def digest(self) -> str:
         """Digest of all that is learned from, in hexadecimal."""
-        found = hashlib.sha256(self.taught.encode())
+        found = hashlib.sha256(b"" if self.taught is None else self.taught.digest.encode())
         ids = () if self.lesson is None else self.lesson.ids
         for value in jax.tree.leaves((self.frames, list(ids))):
             found.update(np.ascontiguousarray(value).tobytes())
@@ -89,8 +92,10 @@ class DeformData:
 
     def labels(self, t: int) -> Labels | None:
         """The teacher's labels of a frame; None where it has none."""
-        if self.lesson is None or t not in self.train:
-            return self.held_out.get(t)
+        if self.taught is None or self.lesson is None:
+            return None
+        if t not in self.train:
+            return self.taught.held_out.get(t)
         return Labels(self.lesson.ids[self.train.index(t)], self.lesson.codebook)
 
     def frame(self, t: int, camera: int, tools: Tools, mask: Int[np.ndarray, "h w"] | None = None) -> Frame:
@@ -143,7 +148,7 @@ def deform_data(
     sequence: Sequence,
     every: int,
     tools: Tools,
-    asked: TeacherChoice | None,
+    choice: TeacherChoice,
     channels: int,
     tool_values: tuple[int, ...],
     notes: Notes,
@@ -155,8 +160,8 @@ def deform_data(
         sequence: camera 0 is learned from.
         every: hold out frame i where (i - 1) mod `every` is 0, as is done with EndoNeRF; 0: none.
         tools: whether tools are left out, by the names of mask values.
-        asked: whose features are learned; checked. "auto": the masks' classes, if there are two or more among
-            pixels that count. None: nobody's.
+        choice: the teacher; checked. "auto": the masks' classes, if there are two or more among pixels that
+            count. "none": no teacher.
         channels: of a Gaussian's feature.
         tool_values: mask values that are tools; those with names of tools where there is none.
         notes: receives what is odd.
@@ -186,23 +191,20 @@ def deform_data(
                 f"{sequence.name}: expected masks of frames to learn from, found none (--tools draw)"
             )
     counted = _counted_names(sequence, [masks.get(t) for t in train], tools, tool_values, notes)
-    encoded = asked is not None and asked.features not in _OF_CLASSES
-    teaching = teaching_of(sequence, train, asked, console) if encoded else None
+    teaching = None
+    if choice.features not in _WITHOUT_ENCODER:
+        teaching = Teaching(as_photographs(sequence), train, choice, FeatureCache(), console)
     data = DeformData(sequence, train, test, [], tool_values=tool_values)
     data = replace(data, frames=[data.frame(t, 0, tools, masks.get(t)) for t in train])
     if teaching is not None:
-        teacher = EncodedTeacher(teaching, data.frames, channels)
-        lesson = Lesson(teacher.ids, teacher.codes, teacher.meaning)
-        notes.add(teacher.note())
-        console.print(f"[bold]features[/]  {teacher.note()}", soft_wrap=True)
+        numbers = {t: int(sequence.frame_ids[t]) for t in test}
+        taught = taught_by_features(teaching, data.frames, numbers, channels, notes, console)
+    elif _has_classes(sequence, len(counted), choice.features):
+        size = (sequence.width, sequence.height)
+        taught = taught_by_classes(masks, train, test, counted, size, channels)
     else:
-        teacher = None if asked is None else _of_classes(sequence, counted, asked.features, channels)
-        if teacher is None:
-            return data
-        ids = [teacher.of_mask(masks.get(t)).ids for t in train]
-        lesson = Lesson(ids, teacher.meaning.codebook, teacher.meaning)
-    held_out = labels_of(teacher, test, sequence, notes)
-    return replace(data, lesson=lesson, held_out=held_out, taught=teacher.digest())
+        return data
+    return replace(data, taught=taught)
 
 
 def _counted_names(
@@ -223,24 +225,21 @@ def _counted_names(
     return {value: name for value, name in called.items() if value not in gone}
 
 
-def _of_classes(
-    sequence: Sequence, counted: dict[int, str], features: str, channels: int
-) -> ClassTeacher | None:
-    """A teacher of the masks' classes; None where there is nothing to tell apart, unless it is asked for.
+def _has_classes(sequence: Sequence, count: int, features: str) -> bool:
+    """Whether the classes of masks teach: where there are two or more among pixels that count, and always
+    where they are asked for.
 
     Raises:
-        ValueError: it is asked for.
+        ValueError: they are asked for, and there is nothing to tell apart.
     """
     if features == "classes" and not sequence.has_masks:
         raise ValueError(f"--features classes: {sequence.name} has no masks; leave it at auto, or give masks")
-    if len(counted) >= 2:
-        return ClassTeacher(sequence, counted, channels)
-    if features == "classes":
+    if features == "classes" and count < 2:
         raise ValueError(
             "--features classes: expected two classes or more among pixels that count, found "
-            f"{len(counted)}; --tools draw counts tools too"
+            f"{count}; --tools draw counts tools too"
         )
-    return None
+    return count >= 2 and features != NO_TEACHER
 
 
 def unit_times(sequence: Sequence) -> Float[np.ndarray, "t"]:

@@ -2,7 +2,7 @@
 out."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from time import perf_counter
 from typing import Annotated, Any, Literal
 
@@ -21,8 +21,6 @@ from gsjax.engine.deform.file import NAME, write_deformation
 from gsjax.engine.deform.poses import as_refined
 from gsjax.engine.deform.results import summarize
 from gsjax.engine.deform.scores import judge
-from gsjax.engine.deform.start import NOBODY
-from gsjax.engine.distill.choice import TeacherChoice, TeacherOptions
 from gsjax.engine.drive import drive
 from gsjax.engine.ending import exit_code, finish
 from gsjax.engine.folder import RunFolder, expect_dataset
@@ -31,6 +29,7 @@ from gsjax.engine.messages import Notes, stage
 from gsjax.engine.options import RESUME_MAY_CHANGE, OfDataset, checked
 from gsjax.engine.progress import Progress, Schedule, load_run, means_of, note_if_cut_short, watch
 from gsjax.engine.recording import located, open_recording
+from gsjax.engine.teaching.choice import NO_TEACHER, TeacherChoice, TeacherOptions
 from gsjax.io.ply import write_ply
 from gsjax.methods.deform import PRESETS, Deform, DeformConfig
 from gsjax.methods.deform.method import PLAN
@@ -65,19 +64,18 @@ def run(options: Options) -> int:
         ValueError, OSError: what was asked cannot be done; everything learned before that is on disk.
     """
     options = checked(options)
-    asked = _teacher(options)
+    choice = _teacher(options)
     console, begun = Console(stderr=True, highlight=False), perf_counter()
     with Notes(console) as notes:
         expect_dataset(options.dataset)
         folder = RunFolder(options.out, overwrite=options.overwrite, resume=options.resume)
-        elsewhere = {} if asked is None else asked.located()
-        settings = replace(options, dataset=located(options.dataset), **elsewhere)
+        settings = replace(options, dataset=located(options.dataset), **choice.located())
         if options.resume:
             folder.check_config(settings, but=RESUME_MAY_CHANGE)
         sequence, source = _recording(options, notes)
-        how = (options.test_every, options.tools, asked, options.deform.channels)
+        how = (options.test_every, options.tools, choice, options.deform.channels)
         data = deform_data(sequence, *how, options.tool_values, notes, console)
-        if data.meaning is None and asked is not None:
+        if data.meaning is None and choice.features != NO_TEACHER:
             only = "One class among the pixels that count" if data.sequence.has_masks else "No masks"
             only += ": colours are learned, and no meaning or graph"
             notes.add(f"{only}.")
@@ -172,24 +170,20 @@ def _of_photographs(photographs: Photographs, facing: Float[np.ndarray, "4 4"]) 
     )
 
 
-def _teacher(options: Options) -> TeacherChoice | None:
-    """The teacher that is asked for, once all options fit; None: no teacher."""
+def _teacher(options: Options) -> TeacherChoice:
+    """The choice of a teacher, once all options fit."""
     if len(options.cameras) > 1:
         raise ValueError(f"--cameras: expected one to learn from, found {list(options.cameras)}")
     if len(options.eval_cameras) > 1:
         raise ValueError(f"--eval-cameras: expected one to judge by, found {list(options.eval_cameras)}")
-    asked = TeacherChoice(options.features, options.masks, options.sam, options.weights, options.level)
-    option = "masks" if asked.masks != "auto" else "sam" if asked.sam is not None else None
-    if option is not None and asked.features not in ("closed", "clip"):
+    option = "masks" if options.masks != "auto" else "sam" if options.sam is not None else None
+    if option is not None and options.features not in ("closed", "clip"):
         raise ValueError(
-            f"--{option}: expected --features closed or clip, which ask of masks, found {options.features}"
+            f"--{option}: expected --features closed or clip, which need masks, found {options.features}"
         )
-    if options.features != NOBODY:
-        asked.check(also=(NOBODY,))
-        return asked
-    if asked != TeacherChoice(NOBODY):
-        raise ValueError("--weights, --level: expected --features that have a use for them, found none")
-    return None
+    choice = TeacherChoice(**{f.name: getattr(options, f.name) for f in fields(TeacherOptions)})
+    choice.check(optional=True)
+    return choice
 
 
 def _in_words(row: Mapping[str, Any]) -> str:

@@ -1,4 +1,4 @@
-"""A reconstruction of a recording, begun as `gsjax deform` begins it, but of all frames and silently."""
+"""The start of `gsjax.deform`: that of `gsjax deform`, but with all frames and silently."""
 
 import warnings
 
@@ -8,14 +8,11 @@ from gsjax.data.errors import DataWarning
 from gsjax.data.sequence import Sequence
 from gsjax.engine.deform.data import Tools, deform_data
 from gsjax.engine.deform.depth import with_depth
-from gsjax.engine.distill.choice import TeacherChoice
 from gsjax.engine.messages import Notes
+from gsjax.engine.teaching.choice import TeacherChoice
 from gsjax.methods.deform import Deform, Problem
 from gsjax.optim.method import Run
 from gsjax.scene.gaussians import Gaussians
-
-NOBODY = "none"
-"""The name of a teacher that is none."""
 
 
 def start_from(
@@ -27,7 +24,7 @@ def start_from(
     first: int | None,
     gaussians: Gaussians | None,
 ) -> tuple[Problem, Run]:
-    """The problem and the run before its first step; what is odd of the data is warned of.
+    """The problem and the run before its first step; oddities of the data become warnings.
 
     Args:
         method: with its settings.
@@ -37,13 +34,11 @@ def start_from(
         ValueError, DataError, FileNotFoundError: as `gsjax.deform`.
     """
     choice = teacher if isinstance(teacher, TeacherChoice) else TeacherChoice(teacher or "auto")
-    asked = None if choice.features == NOBODY else choice
-    if asked is not None:
-        asked.check(also=(NOBODY,))
+    choice.check(optional=True)
     quiet, config = Console(quiet=True), method.config
     notes = Notes(quiet)
     seen, source = with_depth(sequence, "auto", config.plane_depth, notes)
-    data = deform_data(seen, 0, tools, asked, config.channels, tool_values, notes, quiet)
+    data = deform_data(seen, 0, tools, choice, config.channels, tool_values, notes, quiet)
     if first is not None and first not in data.train:
         raise ValueError(f"first: expected one of the frames to learn from, {data.train}, found {first}")
     for text in notes.warnings:

@@ -1,7 +1,8 @@
-"""Teachers of a deforming scene's features: classes of masks, or features of files or of an encoder, brought
+"""What teaches a deforming scene's features: classes of masks, or features of files or of an encoder, brought
 into the scene's few channels."""
 
 from collections import Counter
+from collections.abc import Mapping
 from collections.abc import Sequence as Many
 from dataclasses import replace
 from pathlib import Path
@@ -14,19 +15,18 @@ from scipy.cluster.hierarchy import fcluster, ward
 
 from gsjax.data import Photographs, Sequence
 from gsjax.data.photographs import photographs_of
-from gsjax.engine.distill.cache import FeatureCache, content_digest
-from gsjax.engine.distill.choice import TeacherChoice
-from gsjax.engine.distill.source import Source
-from gsjax.engine.distill.teacher import Teaching
 from gsjax.engine.messages import Notes, describe
-from gsjax.methods.deform import Meaning, counted_ids
+from gsjax.engine.teaching.cache import content_digest
+from gsjax.engine.teaching.source import Source
+from gsjax.engine.teaching.teaching import Teaching
+from gsjax.methods.deform import Lesson, Meaning, counted_ids
 from gsjax.methods.distill import Teacher
 from gsjax.perception.codebook import ClassCodebook
 from gsjax.scene.frame import Frame
 
 GROUPS = 8
 """The most kinds into which features without names are split."""
-_SAMPLE = 2000  # of the vectors that are split into kinds, for all pairs are compared
+_SAMPLE = 2000  # of the vectors that are split into kinds, because all pairs are compared
 _ALIKE = 0.98  # cosine of directions that are of one kind
 
 
@@ -42,142 +42,116 @@ class Labels(NamedTuple):
     codes: Float[np.ndarray, "n channels"]
 
 
-class ClassTeacher:
-    """A code for each class of the masks: a stand-in for a model, which knows the labels' names."""
+class Taught(NamedTuple):
+    """What a teacher says about a recording.
 
-    def __init__(self, sequence: Sequence, names: dict[int, str], channels: int):
-        """
-        Args:
-            sequence: the recording.
-            names: of mask values.
-            channels: of a Gaussian's feature.
+    Attributes:
+        lesson: labels of the frames to learn from.
+        held_out: labels of held-out frames, by their index; those that have none are left out.
+        digest: of all that is taught beside the ids of frames, in hexadecimal.
+    """
 
-        Raises:
-            ValueError: there are more classes than channels.
-        """
-        if len(names) > channels:
-            raise ValueError(
-                f"--deform.channels {channels}: expected at least {len(names)}, one for each class; give more"
-            )
-        self._sequence, self._values = sequence, tuple(names)
-        source = Source("classes", {value + 1: name for value, name in names.items()})
-        encoder = ClassCodebook(source.names)
-        codes = np.stack([encoder.embed_text(name) for name in names.values()])
-        basis, _ = basis_of([codes], channels)
-        self.meaning = Meaning(source, tuple(names.values()), codes @ basis, basis)
-
-    def labels(self, t: int) -> Labels:
-        """Labels of frame t, by its mask; -1 everywhere where it has none."""
-        return self.of_mask(self._sequence.mask(t, 0))
-
-    def of_mask(self, mask: Int[np.ndarray, "h w"] | None) -> Labels:
-        """Labels by a mask that was read."""
-        ids = np.full((self._sequence.height, self._sequence.width), -1, np.int32)
-        if mask is not None:
-            for row, value in enumerate(self._values):
-                ids[mask == value] = row
-        return Labels(ids, self.meaning.codebook)
-
-    def digest(self) -> str:
-        """Digest of what is taught beside the frames' ids, in hexadecimal."""
-        return content_digest(f"classes {self.meaning.names}", {})
+    lesson: Lesson
+    held_out: Mapping[int, Labels]
+    digest: str
 
 
-class EncodedTeacher:
-    """Features of files, or of an encoder, brought into the scene's channels."""
-
-    def __init__(self, teaching: Teaching, frames: Many[Frame], channels: int):
-        """
-        Args:
-            teaching: has frames segmented and encoded, or their features read.
-            frames: those that teach, of one camera each.
-            channels: of a Gaussian's feature.
-
-        Raises:
-            ValueError: grids differ, or no pixel that counts has features.
-        """
-        self._teaching, teacher = teaching, teaching.teacher
-        self.ids = _ids(teacher)
-        weights = _counts(teacher, self.ids, frames)
-        blocks = _vectors(teacher)
-        counted = np.split(weights > 0, np.cumsum([len(block) for block in blocks])[:-1])
-        vectors = [block[some] for block, some in zip(blocks, counted, strict=True)]
-        basis, self.kept = basis_of(vectors, channels)
-        self.codes = _codes(teacher, basis)
-        groups = groups_of(self.codes[weights > 0], weights[weights > 0])
-        names = tuple(f"group {n}" for n in range(1, len(groups) + 1))
-        self.meaning = Meaning(teaching.source, names, groups, basis)
-
-    def labels(self, t: int) -> Labels | None:
-        """Labels of frame t, whether it teaches or not; None where there are none.
-
-        Raises:
-            ValueError, OSError: it cannot be read, or its file does not fit.
-        """
-        teacher = self._teaching.of(t)
-        if teacher is None:
-            return None
-        (ids,) = _ids(teacher)
-        return Labels(ids, _codes(teacher, self.meaning.basis))
-
-    def digest(self) -> str:
-        """Digest of what is taught, in hexadecimal."""
-        return self._teaching.digest()
-
-    def note(self) -> str:
-        """The note that a run has of it."""
-        (dimension, channels), count = self.meaning.basis.shape, len(self.meaning.names)
-        parted = f"they are parted into {count} groups"
-        if count == 1:
-            parted = "all of it is alike, one group"
-            parted += " (--masks segment finds more pieces)" if self.meaning.source.kind == "closed" else ""
-        return (
-            f"Learned beside colours: {self._teaching.about}; {channels} channels keep {self.kept:.1%} of "
-            f"its {dimension} numbers (--deform.channels); {parted}."
-        )
-
-
-def teaching_of(sequence: Sequence, train: Many[int], asked: TeacherChoice, console: Console) -> Teaching:
-    """Have frames of camera 0 segmented and encoded, or their features read.
+def taught_by_classes(
+    masks: Mapping[int, Int[np.ndarray, "h w"] | None],
+    train: Many[int],
+    test: Many[int],
+    names: Mapping[int, str],
+    size: tuple[int, int],
+    channels: int,
+) -> Taught:
+    """A code for each class of the masks: a stand-in for a model, which knows the labels' names.
 
     Args:
-        sequence: the recording.
-        train: frames to learn from.
-        asked: whose masks and features; checked, not of classes.
-        console: shows how far it is.
+        masks: of frames; pixels of a frame without one have no label.
+        train, test: indices of the frames to learn from, and of those that are held out.
+        names: of mask values.
+        size: width and height of the masks, pixels.
+        channels: of a Gaussian's feature.
 
     Raises:
-        ValueError: there are no masks, files do not fit, or a package is missing.
-        FileNotFoundError: files of features or weights are not there.
+        ValueError: there are more classes than channels.
     """
-    return Teaching(_as_photographs(sequence), train, asked, FeatureCache(), console)
+    if len(names) > channels:
+        raise ValueError(
+            f"--deform.channels {channels}: expected at least {len(names)}, one for each class; give more"
+        )
+    source = Source("classes", {value + 1: name for value, name in names.items()})
+    encoder = ClassCodebook(source.names)
+    codes = np.stack([encoder.embed_text(name) for name in names.values()])
+    basis, _ = basis_of([codes], channels)
+    meaning = Meaning(source, tuple(names.values()), codes @ basis, basis)
+
+    def ids_of(mask: Int[np.ndarray, "h w"] | None) -> Int[np.ndarray, "h w"]:
+        ids = np.full(size[::-1], -1, np.int32)
+        for row, value in enumerate(() if mask is None else names):
+            ids[mask == value] = row
+        return ids
+
+    lesson = Lesson([ids_of(masks[t]) for t in train], meaning.codebook, meaning)
+    held_out = {t: Labels(ids_of(masks[t]), meaning.codebook) for t in test}
+    return Taught(lesson, held_out, content_digest(f"classes {meaning.names}", {}))
 
 
-def labels_of(
-    teacher: ClassTeacher | EncodedTeacher, frames: Many[int], sequence: Sequence, notes: Notes
-) -> dict[int, Labels]:
-    """Labels of frames that are only judged; those that cannot be read are noted and left out.
+def taught_by_features(
+    teaching: Teaching,
+    frames: Many[Frame],
+    test: Mapping[int, int],
+    channels: int,
+    notes: Notes,
+    console: Console,
+) -> Taught:
+    """Features of files, or of an encoder, brought into the scene's channels.
 
     Args:
-        teacher: of the frames that are learned from.
-        frames: indices of the others.
-        sequence: the recording.
-        notes: receives what could not be read.
+        teaching: the teacher of the recording, frame by frame.
+        frames: those to learn from, of one camera each.
+        test: indices of the held-out frames, with the recording's own numbers of these.
+        channels: of a Gaussian's feature.
+        notes: receives what is learned, and which held-out frames cannot be read; these are left out.
+        console: shows what is learned.
+
+    Raises:
+        ValueError: grids differ, or no pixel that counts has features.
     """
-    found: dict[int, Labels] = {}
+    teacher = teaching.teacher
+    ids, blocks = _ids(teacher), _vectors(teacher)
+    weights = _counts(ids, sum(map(len, blocks)), frames)
+    counted = np.split(weights > 0, np.cumsum([len(block) for block in blocks])[:-1])
+    vectors = [block[some] for block, some in zip(blocks, counted, strict=True)]
+    basis, kept = basis_of(vectors, channels)
+    codes = _codes(teacher, basis)
+    groups = groups_of(codes[weights > 0], weights[weights > 0])
+    names = tuple(f"group {n}" for n in range(1, len(groups) + 1))
+    lesson = Lesson(ids, codes, Meaning(teaching.source, names, groups, basis))
+    parted = f"they are parted into {len(names)} groups"
+    if len(names) == 1:
+        parted = "all of it is alike, one group"
+        parted += " (--masks segment finds more pieces)" if teaching.source.kind == "closed" else ""
+    note = (
+        f"Learned beside colours: {teaching.about}; {channels} channels keep {kept:.1%} of "
+        f"its {len(basis)} numbers (--deform.channels); {parted}."
+    )
+    notes.add(note)
+    console.print(f"[bold]features[/]  {note}", soft_wrap=True)
+    held_out: dict[int, Labels] = {}
     failed: dict[int, str] = {}
-    for t in frames:
+    for t, number in test.items():
         try:
-            if (labels := teacher.labels(t)) is not None:
-                found[t] = labels
+            if (found := teaching.of(t)) is not None:
+                held_out[t] = Labels(_ids(found)[0], _codes(found, basis))
         except FileNotFoundError:
-            failed[int(sequence.frame_ids[t])] = "they have no file"
+            failed[number] = "they have no file"
         except (ValueError, OSError) as error:
-            failed[int(sequence.frame_ids[t])] = describe(error)
+            failed[number] = describe(error)
     if failed:
         which = ", ".join(map(str, failed))
         notes.warn(f"not compared with the teacher: frames {which} ({next(iter(failed.values()))})")
-    return found
+    return Taught(lesson, held_out, teaching.digest())
 
 
 def basis_of(
@@ -195,9 +169,9 @@ def basis_of(
 
 
 def groups_of(
-    codes: Float[np.ndarray, "n channels"], weights: Float[np.ndarray, "n"], most: int = GROUPS
+    codes: Float[np.ndarray, "n channels"], weights: Float[np.ndarray, "n"]
 ) -> Float[np.ndarray, "k channels"]:
-    """Means of codes that point the same way, the heaviest group first.
+    """Means of codes that point the same way, the heaviest group first; at most `GROUPS` of them.
 
     Ward's method joins directions; it stops where to join two more costs most beside what it cost before, and
     goes on while two groups are alike.
@@ -205,7 +179,6 @@ def groups_of(
     Args:
         codes: not all zeros.
         weights: of each code, the number of its pixels.
-        most: number of groups, at most.
     """
     chosen = np.unique(np.linspace(0, len(codes) - 1, _SAMPLE).astype(int))
     codes, weights = codes[chosen], weights[chosen]
@@ -216,7 +189,8 @@ def groups_of(
     if len(codes) > 1:
         tree = ward(directions)
         alike = np.sqrt(2 - 2 * _ALIKE)  # what it costs to join two directions of one kind
-        costs = np.maximum(np.append(tree[: -most - 1 : -1, 2][: most - 1], alike), alike)  # the last first
+        last = tree[: -GROUPS - 1 : -1, 2][: GROUPS - 1]  # costs of the last joins, the last first
+        costs = np.maximum(np.append(last, alike), alike)
         count = 2 + int(np.argmax(costs[:-1] / costs[1:])) if len(costs) > 1 else 1
         group = fcluster(tree, count, "maxclust")
         while count > 1 and _closest(_means(directions, weights, group)) > _ALIKE:
@@ -239,9 +213,9 @@ def _closest(vectors: Float[np.ndarray, "k c"]) -> float:
     return float((directions @ directions.T - 2 * np.eye(len(vectors))).max())
 
 
-def _as_photographs(sequence: Sequence) -> Photographs:
-    """The frames of camera 0, named as their pictures' files are, or by their number where they have none.
-    Without depth: what a segmenter would find by it are planes, which do not deform."""
+def as_photographs(sequence: Sequence) -> Photographs:
+    """The frames of camera 0, named as their pictures' files, or by their number where they have none.
+    Without depth, by which a segmenter would find planes, which do not deform."""
     alone = photographs_of(sequence.select(cameras=[sequence.camera_ids[0]]))
     files = [Path(alone.where("image", i)) for i in range(alone.num)]
     names = [file.name for file in files if file.is_file()]
@@ -250,10 +224,8 @@ def _as_photographs(sequence: Sequence) -> Photographs:
     return replace(alone, names=tuple(names), load_depth=None)
 
 
-def _counts(
-    teacher: Teacher, ids: Many[Int[np.ndarray, "h w"]], frames: Many[Frame]
-) -> Float[np.ndarray, "n"]:
-    """The number of pixels that count which have each vector.
+def _counts(ids: Many[Int[np.ndarray, "h w"]], rows: int, frames: Many[Frame]) -> Float[np.ndarray, "n"]:
+    """The number of pixels that count which have each of this number of vectors.
 
     Raises:
         ValueError: grids differ, or no pixel has any.
@@ -262,7 +234,7 @@ def _counts(
     if len(grids) > 1:
         found = ", ".join(f"{width}x{height} ({n})" for (height, width), n in grids.most_common())
         raise ValueError(f"--features: expected one grid in all frames, found (frames) {found}")
-    counts = np.zeros(1 + sum(map(len, _vectors(teacher))))
+    counts = np.zeros(1 + rows)
     for frame, one in zip(frames, ids, strict=True):
         counted = counted_ids(one, None if frame.masks is None else frame.masks[0])
         counts += np.bincount(1 + counted.ravel(), minlength=len(counts))
@@ -282,12 +254,12 @@ def _vectors(teacher: Teacher) -> list[Float[np.ndarray, "_ D"]]:
 
 
 def _codes(teacher: Teacher, basis: Float[np.ndarray, "D channels"]) -> Float[np.ndarray, "n channels"]:
-    """All of that, in the scene's channels."""
+    """All of its vectors, in the scene's channels."""
     return np.concatenate([block @ basis for block in _vectors(teacher)])
 
 
 def _ids(teacher: Teacher) -> list[Int[np.ndarray, "h w"]]:
-    """The row of these of each pixel of each view; -1 where there is none, as where a map is zero."""
+    """The row of its vectors for each pixel of each view; -1 where there is none, as where a map is zero."""
     if teacher.maps is None:
         return teacher.ids
     ids, begin = [], 0

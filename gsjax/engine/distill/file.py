@@ -10,8 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from equinox import nn, tree_at
 
-from gsjax.engine.distill.source import Source
 from gsjax.engine.files import check_arrays, read_arrays
+from gsjax.engine.teaching.source import Source
 from gsjax.methods.distill import DistillResult, FeatureField
 from gsjax.methods.distill.result import FORMAT
 from gsjax.scene.feature_grid import FeatureGrid, FeatureGridConfig

@@ -8,7 +8,7 @@ from jaxtyping import Array, Float, UInt8
 
 from gsjax.engine.distill.scene import FieldScene
 from gsjax.engine.distill.scores import ClassScores, Frozen, angle_error, class_maps, classes_of, one_by_one
-from gsjax.engine.distill.teacher import Teaching
+from gsjax.engine.teaching.teaching import Teaching
 from gsjax.engine.folder import RunFolder
 from gsjax.engine.messages import Notes, describe
 from gsjax.engine.scores import mean_scores

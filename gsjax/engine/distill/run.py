@@ -10,13 +10,10 @@ from typing import Any
 import jax
 from rich.console import Console
 
-from gsjax.engine.distill.cache import FeatureCache
-from gsjax.engine.distill.choice import Second, TeacherChoice, TeacherOptions
 from gsjax.engine.distill.file import FOLDER, NAME
 from gsjax.engine.distill.judge import judge
 from gsjax.engine.distill.results import summarize
 from gsjax.engine.distill.scene import FieldScene, SceneOptions, open_scene
-from gsjax.engine.distill.teacher import Teaching
 from gsjax.engine.drive import drive
 from gsjax.engine.ending import exit_code, finish
 from gsjax.engine.folder import RunFolder, plain
@@ -26,22 +23,19 @@ from gsjax.engine.options import RESUME_MAY_CHANGE, Common, Resuming, Seeded, Ti
 from gsjax.engine.progress import Progress, Schedule, load_run, means_of, note_if_cut_short, watch
 from gsjax.engine.recording import located
 from gsjax.engine.records import digest
+from gsjax.engine.teaching.cache import FeatureCache
+from gsjax.engine.teaching.choice import TeacherChoice
+from gsjax.engine.teaching.teaching import Teaching
 from gsjax.io.atomic import atomic_write
 from gsjax.methods.distill import Distill, DistillConfig
 
 
 @dataclass(frozen=True, kw_only=True)
-class Options(Common, Resuming, Timed, Seeded, TeacherOptions, SceneOptions):
+class Options(Common, Resuming, Timed, Seeded, TeacherChoice, SceneOptions):
     """Options of `gsjax distill`."""
 
     out: Path | None = None
     """Folder for the field. Default: `field` in the run's folder."""
-    second: Second = "none"
-    """Second teacher beside --features clip, which knows of masks alone: maskclip, CLIP's vectors of patches,
-    by the same --weights. Its weight is --distill.weights.map."""
-    snap: int = 0
-    """Move outlines of masks to the picture's edges, where there are any within this many pixels: for masks
-    whose outlines are off, as many segmenters' are."""
     distill: DistillConfig = dataclasses.field(default_factory=DistillConfig)
     """Settings of the field and its training."""
 
@@ -55,25 +49,16 @@ def run(options: Options) -> int:
     options = checked(options)
     console, begun = Console(stderr=True, highlight=False), perf_counter()
     with Notes(console) as notes:
-        choice = TeacherChoice(
-            options.features,
-            options.masks,
-            options.sam,
-            options.weights,
-            options.level,
-            options.second,
-            options.snap,
-        )
-        choice.check()
+        options.check()
         scene = open_scene(options)
         sha256 = digest(scene.file)
         folder = RunFolder(_out(options, scene.file), overwrite=options.overwrite, resume=options.resume)
-        settings = with_paths(options, choice)
+        settings = with_paths(options)
         if options.resume:
             folder.check_config(settings, but=RESUME_MAY_CHANGE)
         cache, photographs = FeatureCache(), scene.photographs
-        teaching = Teaching(photographs, scene.taught, choice, cache, console)
-        if choice.features == "auto":
+        teaching = Teaching(photographs, scene.taught, options, cache, console)
+        if options.features == "auto":
             console.print(f"[bold]features[/]  {teaching.source.kind}: {teaching.about}", soft_wrap=True)
         method, values = Distill(options.distill), asdict(settings)
         with stage(console, "looking which Gaussians each view shows"):
@@ -133,17 +118,10 @@ def run(options: Options) -> int:
     return exit_code(progress.stopped)
 
 
-def with_paths(options: Options, choice: TeacherChoice) -> Options:
-    """The options with paths as they are found from any folder.
-
-    Args:
-        options: of the command.
-        choice: its teacher.
-    """
-    found: dict[str, Any] = choice.located() | {"scene": Path(located(str(options.scene)))}
-    if options.images is not None:
-        found["images"] = located(options.images)
-    return replace(options, **found)
+def with_paths(options: Options) -> Options:
+    """The options with paths as they are found from any folder."""
+    images = None if options.images is None else located(options.images)
+    return replace(options, **options.located(), scene=Path(located(str(options.scene))), images=images)
 
 
 def _words(row: Mapping[str, Any]) -> str:

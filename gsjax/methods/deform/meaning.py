@@ -25,7 +25,7 @@ class Meaning:
 
     Attributes:
         source: source of the teacher's features, with the encoder of texts in their space
-            (`gsjax.engine.distill.source.Source`).
+            (`gsjax.engine.teaching.source.Source`).
         names: names of classes, or of clusters of features.
         codebook: the feature of each name.
         basis: orthonormal columns that map the source's vectors of D numbers to the scene's channels. They

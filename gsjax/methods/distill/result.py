@@ -31,7 +31,7 @@ class DistillResult:
         field: the field; for a grid, with the trained entries only.
         rows: indices of these entries; None for a vector per Gaussian.
         source: source of the teacher's features, with the encoder of texts in their space
-            (`gsjax.engine.distill.source.Source`); None if unknown.
+            (`gsjax.engine.teaching.source.Source`); None if unknown.
         scene: the scene of the field, as far as it is known: `file`, `sha256`, `num_gaussians`,
             `rasterize_mode` and the options that selected its `photographs`.
         means: centres of the Gaussians to score, metres; None before the scene is loaded.

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from gsjax.engine.deform.file import NAME, write_deformation
-from gsjax.engine.distill.source import Source
+from gsjax.engine.teaching.source import Source
 from gsjax.geometry.cameras import intrinsics
 from gsjax.methods.deform import QUESTIONS, DeformingScene, DeformResult, Meaning, Timeline
 from gsjax.scene.initialize import gaussians_from_points

@@ -8,8 +8,8 @@ from rich.console import Console
 
 from gsjax.data import open_sequence
 from gsjax.engine.deform.data import deform_data
-from gsjax.engine.distill.choice import TeacherChoice
 from gsjax.engine.messages import Notes
+from gsjax.engine.teaching.choice import TeacherChoice
 
 KIDNEY, SHAFT = 4, 7
 NAMES = {0: "background-tissue", KIDNEY: "kidney-parenchyma", SHAFT: "instrument-shaft"}
@@ -30,7 +30,7 @@ def recording(masked=range(10), names=NAMES):
 def read(sequence, tools="leave-out", tool_values=(), features="auto"):
     console = Console(quiet=True)
     notes = Notes(console)
-    told = (tools, None if features == "none" else TeacherChoice(features), 8, tool_values, notes, console)
+    told = (tools, TeacherChoice(features), 8, tool_values, notes, console)
     return deform_data(sequence, 8, *told), " ".join(notes.all)
 
 

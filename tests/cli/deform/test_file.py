@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from gsjax.engine.deform.file import read_deformation, write_deformation
-from gsjax.engine.distill.source import Source
+from gsjax.engine.teaching.source import Source
 from gsjax.io.checkpoints import save_checkpoint
 from gsjax.methods.deform import DeformingScene, DeformResult, Meaning, Timeline, nodes_of
 from gsjax.scene.deformation import DeformationConfig, init_deformation

@@ -18,9 +18,9 @@ from gsjax.cli.deform import Options
 from gsjax.data import open_sequence
 from gsjax.engine.deform.data import deform_data
 from gsjax.engine.deform.file import read_deformation, write_deformation
-from gsjax.engine.distill.choice import TeacherChoice
 from gsjax.engine.folder import RunFolder
 from gsjax.engine.messages import Notes
+from gsjax.engine.teaching.choice import TeacherChoice
 from gsjax.engine.viewables import open_viewable
 from gsjax.io.ply import read_ply, write_ply
 from gsjax.io.video import read_video_frames

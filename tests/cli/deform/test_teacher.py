@@ -19,9 +19,9 @@ from gsjax.engine import progress
 from gsjax.engine.deform.data import deform_data
 from gsjax.engine.deform.file import read_deformation, write_deformation
 from gsjax.engine.deform.teacher import GROUPS, basis_of, groups_of
-from gsjax.engine.distill.choice import TeacherChoice
-from gsjax.engine.distill.source import Source
 from gsjax.engine.messages import Notes
+from gsjax.engine.teaching.choice import TeacherChoice
+from gsjax.engine.teaching.source import Source
 from gsjax.methods.deform import Deform, DeformConfig, Meaning, counted_ids, feature_prompt, text_prompt
 from tests.cli.deform.test_command import SCENE, SMALL
 from tests.perception.test_foundation import clip_folder, needs_foundation  # noqa: F401
@@ -113,7 +113,7 @@ def test_a_map_is_learned_where_it_counts_and_a_held_out_frame_may_lack_one(file
     for t in (t for t in range(10) if t != 9):
         np.save(tmp_path / f"{t:06d}.npy", feature_map(t))
     data, said = data_of(tmp_path, tmp_path)
-    assert sorted(data.held_out) == [1]
+    assert sorted(data.taught.held_out) == [1]
     assert "not compared with the teacher: frames 9 (" in said
     ids, codes = data.labels(data.train[3])
     t = data.train[3]
@@ -126,8 +126,8 @@ def test_a_map_is_learned_where_it_counts_and_a_held_out_frame_may_lack_one(file
     [
         (("--features", "nowhere"), ("--features nowhere", "auto, classes", "maskclip, none, or a folder")),
         (("--features", "clip"), ("--features clip", "--weights PATH too")),
-        (("--features", "none", "--masks", "segment"), ("--masks", "which ask of masks", "found none")),
-        (("--features", "maskclip", "--sam", "."), ("--sam", "which ask of masks", "found maskclip")),
+        (("--features", "none", "--masks", "segment"), ("--masks", "which need masks", "found none")),
+        (("--features", "maskclip", "--sam", "."), ("--sam", "which need masks", "found maskclip")),
         (("--features", "none", "--weights", "."), ("--weights", "found none")),
         (("--sam", "."), ("--sam", "found auto")),
         (("--features", "classes", "--level", "small"), ("--level small", "LangSplat")),
@@ -200,7 +200,7 @@ def test_files_are_found_by_the_names_of_pictures(tmp_path):
     console = Console(quiet=True)
     given = ("draw", TeacherChoice(str(tmp_path)), 4, (), Notes(console), console)
     found = deform_data(seen, 8, *given)
-    assert sorted(found.held_out) == [1]
+    assert sorted(found.taught.held_out) == [1]
     ids, codes = found.labels(0)
     scale = np.linalg.norm([feature_map(2 + i) for i in found.train], axis=-1).mean()
     np.testing.assert_allclose(codes[ids], feature_map(2) / scale @ found.meaning.basis, atol=1e-5)

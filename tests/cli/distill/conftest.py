@@ -6,7 +6,7 @@ import shutil
 import numpy as np
 import pytest
 
-from gsjax.engine.distill.source import Source
+from gsjax.engine.teaching.source import Source
 from gsjax.io.ply import write_ply
 from gsjax.perception.codebook import ClassCodebook
 from tests.cli.conftest import LABELS, first_picture, write_made_field
@@ -57,7 +57,7 @@ def field(made, tmp_path):
 @pytest.fixture(autouse=True)
 def cache(tmp_path, monkeypatch):
     """No test finds what another one encoded."""
-    monkeypatch.setattr("gsjax.engine.distill.cache.user_cache_dir", lambda *a, **k: str(tmp_path / "cache"))
+    monkeypatch.setattr("gsjax.engine.teaching.cache.user_cache_dir", lambda *a, **k: str(tmp_path / "cache"))
 
 
 def metrics(out):

@@ -10,9 +10,8 @@ import pytest
 import yaml
 
 from gsjax.engine import progress
-from gsjax.engine.distill import teacher as field_teacher
-from gsjax.engine.distill.choice import TeacherChoice
 from gsjax.engine.distill.run import Options, with_paths
+from gsjax.engine.teaching import teaching as field_teacher
 from gsjax.io.ply import read_ply, write_ply
 from tests.cli.distill.conftest import SMALL, metrics
 
@@ -136,11 +135,8 @@ def test_a_run_is_told_by_what_paths_mean_not_by_how_they_are_typed(monkeypatch,
         (tmp_path / name).mkdir()
 
     def settings(base):
-        told = Options(base / "scene.ply", features=str(base / "features"), sam=base / "sam")
-        asked = TeacherChoice(told.features, sam=told.sam)
-        return with_paths(told, asked)
+        return with_paths(Options(base / "scene.ply", features=str(base / "features"), sam=base / "sam"))
 
     assert settings(Path()) == settings(tmp_path)
-    asked = TeacherChoice("clip", weights=Path("clip"))
-    named = with_paths(Options(Path("run"), features="clip", weights=Path("clip")), asked)
+    named = with_paths(Options(Path("run"), features="clip", weights=Path("clip")))
     assert (named.features, named.weights) == ("clip", tmp_path / "clip")

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from gsjax.engine.distill import pictures as field_pictures
-from gsjax.engine.distill.source import Source
+from gsjax.engine.teaching.source import Source
 from gsjax.io.ply import read_ply, write_ply
 from gsjax.perception.closed_vocabulary import ClosedVocabulary
 from gsjax.perception.codebook import ClassCodebook

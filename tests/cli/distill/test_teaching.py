@@ -9,10 +9,10 @@ from rich.console import Console
 
 from gsjax.data.errors import DataWarning
 from gsjax.data.photographs import Photographs
-from gsjax.engine.distill import teacher as field_teacher
-from gsjax.engine.distill.cache import FeatureCache
-from gsjax.engine.distill.choice import TeacherChoice
-from gsjax.engine.distill.teacher import Teaching
+from gsjax.engine.teaching import teaching as field_teacher
+from gsjax.engine.teaching.cache import FeatureCache
+from gsjax.engine.teaching.choice import TeacherChoice
+from gsjax.engine.teaching.teaching import Teaching
 
 QUIET = Console(quiet=True)
 

@@ -10,7 +10,7 @@ import pytest
 import yaml
 
 from gsjax.cli import main
-from gsjax.engine.distill.source import Source
+from gsjax.engine.teaching.source import Source
 from gsjax.engine.track.grasp import draw_grasp
 from gsjax.io.video import read_video_frames
 from gsjax.methods.grasping import Grasp, Gripper

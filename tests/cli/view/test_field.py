@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from gsjax.engine.distill.saved import Whereabouts
-from gsjax.engine.distill.source import Source
+from gsjax.engine.teaching.source import Source
 from gsjax.engine.viewables import open_viewable
 from gsjax.io.ply import read_ply, write_ply
 from gsjax.perception.codebook import ClassCodebook

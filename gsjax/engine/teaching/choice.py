@@ -1,20 +1,22 @@
-"""Which masks and features teach a field, as chosen on the command line."""
+"""Which masks and features teach, as chosen on the command line or in Python."""
 
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from gsjax.engine.distill.source import KINDS
 from gsjax.engine.options import ClipWeights, SamWeights
 from gsjax.engine.recording import located
+from gsjax.engine.teaching.source import KINDS
 
 Masks = Literal["auto", "files", "segment"]
 Second = Literal["none", "maskclip"]
 Level = Literal["default", "small", "medium", "large"]
+NO_TEACHER = "none"
+"""The value of `features` by which nothing teaches, where a method can do without."""
 OF_CLIP = ("clip", "maskclip")
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class TeacherOptions(SamWeights, ClipWeights):
     """Which masks and features teach."""
 
@@ -31,31 +33,20 @@ class TeacherOptions(SamWeights, ClipWeights):
 
 
 @dataclass(frozen=True)
-class TeacherChoice:
-    """Which masks and features teach.
+class TeacherChoice(TeacherOptions):
+    """Which masks and features teach, with what `gsjax distill` alone offers."""
 
-    Attributes:
-        features: an encoder (`KINDS`), a folder of files, or "auto".
-        masks: those of files, those of a segmenter, or "auto".
-        sam: folder of SAM's weights (default: a segmenter without weights).
-        weights: folder of CLIP's weights.
-        level: size of objects in LangSplat's files.
-        second: second teacher, beside CLIP's vectors of masks.
-        snap: distance in pixels within which outlines of masks are moved to the picture's edges.
-    """
-
-    features: str = "auto"
-    masks: Masks = "auto"
-    sam: Path | None = None
-    weights: Path | None = None
-    level: Level = "default"
     second: Second = "none"
+    """Second teacher beside --features clip, which knows of masks alone: maskclip, CLIP's vectors of patches,
+    by the same --weights. Its weight is --distill.weights.map."""
     snap: int = 0
+    """Move outlines of masks to the picture's edges, where there are any within this many pixels: for masks
+    whose outlines are off, as many segmenters' are."""
 
     @property
     def of_files(self) -> bool:
         """Whether the features come from a folder of files."""
-        return self.features not in ("auto", *KINDS)
+        return self.features not in ("auto", NO_TEACHER, *KINDS)
 
     def located(self) -> dict[str, Any]:
         """Its paths as they are found from any folder, by the options that name them."""
@@ -63,20 +54,20 @@ class TeacherChoice:
         found: dict[str, Any] = {name: path and Path(located(str(path))) for name, path in paths.items()}
         return found | ({"features": located(self.features)} if self.of_files else {})
 
-    def check(self, also: tuple[str, ...] = ()) -> None:
+    def check(self, *, optional: bool = False) -> None:
         """Check the choice before anything takes time.
 
         Args:
-            also: further values of --features, for the error.
+            optional: whether the method can do without a teacher.
 
         Raises:
             ValueError: options contradict each other.
             FileNotFoundError: a folder is not there.
         """
-        if self.of_files and not Path(self.features).is_dir():
-            known = ", ".join(("auto", *KINDS, *also))
+        known = ("auto", *KINDS, *((NO_TEACHER,) if optional else ()))
+        if self.features not in known and not (self.of_files and Path(self.features).is_dir()):
             raise FileNotFoundError(
-                f"--features {self.features}: expected {known}, or a folder of feature files, "
+                f"--features {self.features}: expected {', '.join(known)}, or a folder of feature files, "
                 f"found {_what_is(Path(self.features), 'none of these')}"
             )
         for option, folder, model in (("weights", self.weights, "CLIP"), ("sam", self.sam, "SAM")):

@@ -1,4 +1,4 @@
-"""Teachers of photographs: whose masks, whose features, and where they are kept."""
+"""The teacher of photographs (frames of one camera are photographs too): their masks, and features of these."""
 
 import warnings
 from collections.abc import Mapping, Sequence
@@ -13,9 +13,9 @@ from rich.progress import track
 
 from gsjax.data.errors import DataWarning
 from gsjax.data.photographs import Photographs
-from gsjax.engine.distill.cache import FeatureCache, content_digest, folder_digest
-from gsjax.engine.distill.choice import TeacherChoice
-from gsjax.engine.distill.source import ABOUT, Source
+from gsjax.engine.teaching.cache import FeatureCache, content_digest, folder_digest
+from gsjax.engine.teaching.choice import TeacherChoice
+from gsjax.engine.teaching.source import ABOUT, Source
 from gsjax.methods.distill import Teacher, teacher_of_maps, teacher_of_objects, with_maps
 from gsjax.methods.distill.teacher import UNKNOWN_ID
 from gsjax.methods.protocols import LanguageEncoder, Segmenter
@@ -26,28 +26,32 @@ from gsjax.perception.segmenters import PieceSegmenter, PlaneOrRegionSegmenter
 _OF_OBJECTS = ("classes", "closed", "clip")
 _STRETCH = 0.02  # tolerance of the logarithm of the aspect ratio of a feature file's masks
 _IN_FILES = "in the feature files"
-_VERSION = 2  # of kept outputs; those of others are computed again
+_VERSION = 2  # of cached outputs; those of other versions are computed again
 
 
 class _View(NamedTuple):
     """Masks of a photograph.
 
     Attributes:
-        ids: index in `labels` of what each pixel shows; -1 where unknown.
-        labels: the labels that occur, in order; 0 is the background, which is a thing like others.
+        ids: index in `labels` of each pixel's label; -1 where unknown.
+        labels: the labels that occur, in ascending order; 0 is the background, which is a thing like others.
     """
 
     ids: Int[np.ndarray, "h w"]
     labels: Int[np.ndarray, "n"]
 
 
+_Objects = tuple[list[np.ndarray], list[np.ndarray]]
+"""Of each photograph, the row of a vector for each pixel, -1 where unknown, and these vectors."""
+
+
 class Teaching:
-    """The teacher of a scene's photographs. Encoder and names are settled by those to learn from, so that
-    held-out photographs have features in the same terms.
+    """The teacher of a scene's photographs. The encoder and the names are settled by the photographs to learn
+    from, so that held-out photographs have features in the same terms.
 
     Attributes:
-        teacher: of the photographs to learn from, in their order.
-        source: of its features.
+        teacher: features of the photographs to learn from, in their order.
+        source: the source of these features.
         masks: source of the masks: "files", "segment", "sam", "in the feature files", or "none".
         about: the features in words.
     """
@@ -56,7 +60,7 @@ class Teaching:
         self,
         photographs: Photographs,
         indices: Sequence[int],
-        asked: TeacherChoice,
+        choice: TeacherChoice,
         cache: FeatureCache,
         console: Console,
     ):
@@ -65,7 +69,7 @@ class Teaching:
         Args:
             photographs: of the scene.
             indices: indices of those to learn from.
-            asked: the choice of masks and features; checked.
+            choice: the masks and features; checked.
             cache: earlier outputs.
             console: shows the progress.
 
@@ -74,34 +78,33 @@ class Teaching:
             FileNotFoundError: files of features or weights are not there.
         """
         self._photographs, self._indices = photographs, list(indices)
-        self._asked, self._cache = asked, cache
-        # First what may be missing, then what takes long.
-        clip, weights = (None, "") if asked.weights is None else _clip(asked.weights)
-        reads = asked.masks != "segment" and asked.sam is None
-        reads &= asked.masks == "files" or asked.features in ("auto", *_OF_OBJECTS)
-        files = [photographs.labels(i) if reads else None for i in indices]
-        kind, self.masks = _settled(asked, any(one is not None for one in files), photographs.name)
-        self._segmenter, self._segments = _segmenter(asked, self.masks)
-        views, names = None, {}
-        if self.masks != "none":
-            shown = track(indices, "masks", console=console, transient=True)
-            views = [self._view(i, one) for i, one in zip(shown, files, strict=True)]
+        self._choice, self._cache = choice, cache
+        self._dimension: int | None = None  # of the features that teach, once they are known
+        # What may be missing comes first, and then what takes long.
+        clip, weights = (None, "") if choice.weights is None else _clip(choice.weights)
+        reads = choice.masks != "segment" and choice.sam is None
+        reads &= choice.masks == "files" or choice.features in ("auto", *_OF_OBJECTS)
+        files = reads and any(photographs.labels(i) is not None for i in indices)
+        kind, self.masks = _settled(choice, files, photographs.name)
+        self._segmenter, self._segmenter_key = _segmenter(choice, self.masks)
+        views, names = self._views(indices, console), {}
         if views is not None and self.masks == "files" and kind in _OF_OBJECTS:
             names = _names(views, photographs.label_names)
-        where = Path(asked.features) if kind == "files" else asked.weights
+        where = Path(choice.features) if kind == "files" else choice.weights
         self.source = Source(
             kind,
             {label + 1: name for label, name in names.items()},
             None if where is None else str(where.resolve()),
         )
-        self.about = ABOUT[kind] + (", and its vectors of patches" if asked.second == "maskclip" else "")
+        self.about = ABOUT[kind] + (", and its vectors of patches" if choice.second == "maskclip" else "")
         # For an encoder labels are 1 to n, whatever their values; CLIP needs no names.
         self._named = () if kind == "clip" else tuple(names)
         named = {n: names[label] for n, label in enumerate(self._named, start=1)}
         self._encoder: Any = Source(kind, named).encoder() if kind in ("classes", "closed") else clip
-        self._who = f"{kind} {named} {weights} {_VERSION}"
-        self._who_of_patches = f"maskclip {weights} {_VERSION}"
+        self._encoder_key = f"{kind} {named} {weights} {_VERSION}"
+        self._patches_key = f"maskclip {weights} {_VERSION}"
         self.teacher = self._taught(views, console)
+        self._dimension = self.teacher.dimension
 
     def of(self, i: int) -> Teacher | None:
         """The teacher of one photograph, by its masks or else by its map; None where nothing is known.
@@ -109,29 +112,16 @@ class Teaching:
         Raises:
             ValueError, OSError: it cannot be read, or its file of features does not fit.
         """
-        views = None
-        if self.masks not in ("none", _IN_FILES):
-            views = [self._view(i, self._photographs.labels(i) if self.masks == "files" else None)]
-        if self.source.kind == "files":
-            (one,) = self._files([i])
-            if one.dimension != self.teacher.dimension:
-                raise ValueError(
-                    f"{one.path}: expected features of {self.teacher.dimension} numbers as in the files that "
-                    f"taught, found {one.dimension}; take files of one encoder"
-                )
-            if one.map is not None:
-                return teacher_of_maps([one.map], self._sizes([i]), _ids(views))
-            ids, rows = _as_large(one, self._photographs, i), one.codebook
-        elif self.source.kind == "maskclip":
-            return self._of_patches([i], views, Console(quiet=True))
-        else:
-            assert views is not None
-            ids, rows = views[0].ids, self._embedded(i, views[0])
+        quiet = Console(quiet=True)
+        found = self._features([i], self._views([i], quiet), quiet)
+        if isinstance(found, Teacher):
+            return found
+        (ids,), (rows,) = found
         known = np.asarray(rows)[np.unique(ids[ids >= 0])].any()
         return teacher_of_objects([ids], [rows]) if known else None
 
     def digest(self) -> str:
-        """SHA-256 over the teacher and the poses, which tells whether two distillations learn the same."""
+        """SHA-256 over the teacher and the poses: equal where two distillations learn the same."""
         teacher, photographs = self.teacher, self._photographs
         arrays = {f"ids {v}": ids for v, ids in enumerate(teacher.ids)}
         arrays |= {f"map {v}": one for v, one in enumerate(teacher.maps or ())}
@@ -140,7 +130,29 @@ class Teaching:
         return content_digest("lesson", arrays)
 
     def _taught(self, views: list[_View] | None, console: Console) -> Teacher:
-        indices = self._indices
+        """The teacher of the photographs to learn from."""
+        found = self._features(self._indices, views, console)
+        if isinstance(found, Teacher):
+            return found
+        if self.source.kind == "files":
+            self.masks = _IN_FILES
+        with warnings.catch_warnings():  # named below
+            warnings.filterwarnings("ignore", "views without any mask")
+            teacher = teacher_of_objects(*found)
+        if self._choice.second != "none":
+            return with_maps(teacher, self._of_patches(self._indices, views, console))
+        silent = [i for i, one in zip(self._indices, teacher.ids, strict=True) if not (one >= 0).any()]
+        if silent:
+            some = ", ".join(self._photographs.names[i] for i in silent[:8])
+            more = f" and {len(silent) - 8} more" if len(silent) > 8 else ""
+            message = f"photographs of which no mask says anything teach nothing: {some}{more}"
+            warnings.warn(message, DataWarning, stacklevel=2)
+        return teacher
+
+    def _features(
+        self, indices: Sequence[int], views: list[_View] | None, console: Console
+    ) -> Teacher | _Objects:
+        """Features of photographs: a teacher with maps, or vectors of objects."""
         if self.source.kind == "maskclip":
             return self._of_patches(indices, views, console)
         if self.source.kind == "files":
@@ -150,43 +162,36 @@ class Teaching:
                 return teacher_of_maps(maps, self._sizes(indices), _ids(views))
             if maps:
                 raise ValueError(
-                    f"{self._asked.features}: expected files of one kind, found a feature a pixel in "
+                    f"{self._choice.features}: expected files of one kind, found a feature a pixel in "
                     f"{len(maps)} and masks with embeddings in {len(found) - len(maps)}"
                 )
-            self.masks = _IN_FILES
             ids = [_as_large(one, self._photographs, i) for one, i in zip(found, indices, strict=True)]
-            rows = [one.codebook for one in found]
-        else:
-            assert views is not None
-            shown = track(indices, "features", console=console, transient=True)
-            rows = [self._embedded(i, view) for i, view in zip(shown, views, strict=True)]
-            ids = [view.ids for view in views]
-        with warnings.catch_warnings():  # named below
-            warnings.filterwarnings("ignore", "views without any mask")
-            teacher = teacher_of_objects(ids, rows)
-        if self._asked.second != "none":
-            return with_maps(teacher, self._of_patches(indices, views, console))
-        silent = [i for i, one in zip(indices, teacher.ids, strict=True) if not (one >= 0).any()]
-        if silent:
-            some = ", ".join(self._photographs.names[i] for i in silent[:8])
-            more = f" and {len(silent) - 8} more" if len(silent) > 8 else ""
-            message = f"photographs of which no mask says anything teach nothing: {some}{more}"
-            warnings.warn(message, DataWarning, stacklevel=2)
-        return teacher
+            return ids, [one.codebook for one in found]
+        assert views is not None
+        shown = track(indices, "features", console=console, transient=True)
+        rows = [self._embedded(i, view) for i, view in zip(shown, views, strict=True)]
+        return [view.ids for view in views], rows
 
-    def _view(self, i: int, file: np.ndarray | None) -> _View:
+    def _views(self, indices: Sequence[int], console: Console) -> list[_View] | None:
+        """Masks of photographs; None where features have no need of them."""
+        if self.masks in ("none", _IN_FILES):
+            return None
+        return [self._view(i) for i in track(indices, "masks", console=console, transient=True)]
+
+    def _view(self, i: int) -> _View:
         """Masks of a photograph: those of its file, or a segmenter's."""
         photographs = self._photographs
+        file = photographs.labels(i) if self.masks == "files" else None
         labels = np.full(photographs.sizes[i][::-1], UNKNOWN_ID) if file is None else file.astype(np.int64)
         if (segmenter := self._segmenter) is not None:
             image, depth, K = photographs.image(i), photographs.depth(i), photographs.Ks[i]
             shown = {"image": image, "K": K} | ({} if depth is None else {"depth": depth})
-            found = self._cache(self._segments, shown, lambda: {"labels": segmenter(image, depth, K)})
+            found = self._cache(self._segmenter_key, shown, lambda: {"labels": segmenter(image, depth, K)})
             labels = found["labels"].astype(np.int64)
             if self.masks == "sam" or depth is None:  # no background here: 0 is what lies in no mask
                 labels = np.where(labels == 0, UNKNOWN_ID, labels)
-        if self._asked.snap:
-            labels = snap_outlines(labels, photographs.image(i), self._asked.snap)
+        if self._choice.snap:
+            labels = snap_outlines(labels, photographs.image(i), self._choice.snap)
         if (counted := photographs.mask(i)) is not None:
             labels = np.where(counted, labels, UNKNOWN_ID)
         there, place = np.unique(np.maximum(labels, UNKNOWN_ID), return_inverse=True)
@@ -204,27 +209,32 @@ class Teaching:
             rows = np.asarray(self._encoder.embed_objects(image, shown, max(1, len(numbers))), np.float32)
             return {"rows": rows[np.array(of_labels or [1]) - 1]}  # zeros where there is no label
 
-        return self._cache(self._who, {"image": image, **view._asdict()}, embed)["rows"]
+        return self._cache(self._encoder_key, {"image": image, **view._asdict()}, embed)["rows"]
 
     def _of_patches(self, indices: Sequence[int], views: list[_View] | None, console: Console) -> Teacher:
-        """MaskCLIP's maps; masks, where there are any, tell what is one thing."""
+        """MaskCLIP's maps; masks, where there are any, say which pixels are one thing."""
         from gsjax.perception.maskclip import MaskClipEncoder
 
         encoder, maps = MaskClipEncoder(self._encoder), []
         for i in track(indices, "patches", console=console, transient=True):
             image = self._photographs.image(i)
             output = self._cache(
-                self._who_of_patches, {"image": image}, lambda image=image: {"map": encoder(image[None])[0]}
+                self._patches_key, {"image": image}, lambda image=image: {"map": encoder(image[None])[0]}
             )
             maps.append(output["map"])
         return teacher_of_maps(maps, self._sizes(indices), _ids(views))
 
     def _files(self, indices: Sequence[int]) -> list[PictureFeatures]:
         """Features of photographs from a folder."""
-        folder, photographs = Path(self._asked.features), self._photographs
-        found = read_feature_folder(folder, photographs.names, which=indices, level=self._asked.level)
+        folder, photographs = Path(self._choice.features), self._photographs
+        found = read_feature_folder(folder, photographs.names, which=indices, level=self._choice.level)
         for one, i in zip(found, indices, strict=True):
             _expect_shape(one, photographs, i)
+            if self._dimension not in (None, one.dimension):
+                raise ValueError(
+                    f"{one.path}: expected features of {self._dimension} numbers as in the files that "
+                    f"taught, found {one.dimension}; take files of one encoder"
+                )
         return found
 
     def _sizes(self, indices: Sequence[int]) -> list[tuple[int, int]]:
@@ -251,18 +261,12 @@ def teacher_for(photographs: Photographs, wanted: Teacher | TeacherChoice | str)
     return teaching.teacher, teaching.source
 
 
-def _settled(asked: TeacherChoice, files: bool, name: str) -> tuple[Any, str]:
-    """The kind of features and the source of masks, with "auto" settled.
-
-    Args:
-        asked: the choice.
-        files: whether there are mask files.
-        name: name of the photographs.
-    """
-    if asked.masks == "files" and not files:
+def _settled(choice: TeacherChoice, files: bool, name: str) -> tuple[Any, str]:
+    """The kind of features and the source of masks, with "auto" settled by whether there are mask files."""
+    if choice.masks == "files" and not files:
         raise ValueError(f"--masks files: {name} has none of these photographs; use --masks segment")
-    masks = "sam" if asked.sam is not None else "files" if files else "segment"
-    kind = "files" if asked.of_files else asked.features
+    masks = "sam" if choice.sam is not None else "files" if files else "segment"
+    kind = "files" if choice.of_files else choice.features
     if kind == "auto":
         kind = "classes" if masks == "files" else "closed"
     if kind == "classes" and masks != "files":
@@ -270,7 +274,7 @@ def _settled(asked: TeacherChoice, files: bool, name: str) -> tuple[Any, str]:
             "--features classes: they are the classes of mask files, and masks here are a segmenter's; use "
             "closed, or clip with its --weights"
         )
-    if kind not in _OF_OBJECTS and asked.masks == "auto" and asked.sam is None:
+    if kind not in _OF_OBJECTS and choice.masks == "auto" and choice.sam is None:
         masks = "none"
     return kind, masks
 
@@ -285,17 +289,17 @@ def _clip(weights: Path) -> tuple[LanguageEncoder, str]:
         raise ValueError(f"--weights: {error}") from error
 
 
-def _segmenter(asked: TeacherChoice, masks: str) -> tuple[Segmenter | None, str]:
+def _segmenter(choice: TeacherChoice, masks: str) -> tuple[Segmenter | None, str]:
     """The segmenter, where one is needed, and what identifies it in the cache."""
     if masks in ("files", "none"):
         return None, ""
-    if asked.sam is None:
+    if choice.sam is None:
         segmenter = PlaneOrRegionSegmenter(region=PieceSegmenter().region)
         return segmenter, repr(segmenter)
     from gsjax.perception.sam import load_sam
 
     try:
-        return load_sam(asked.sam), f"sam {folder_digest(asked.sam)}"
+        return load_sam(choice.sam), f"sam {folder_digest(choice.sam)}"
     except OSError as error:
         raise ValueError(f"--sam: {error}") from error
 
