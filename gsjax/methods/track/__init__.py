@@ -4,13 +4,22 @@
     for now in gsjax.track(scene, first, frames, config):
         now.result.gaussians()
 
-    config.py    what can be set             first_fit.py  the scene at the first frame
-    scene.py     Gaussians with labels       shapes.py     the same without depth, from known shapes
-    state.py     what the step advances      update.py     the step, and the first look
-    stages/      the six stages of a frame   method.py     the tracker as one value
-    budget.py    settings for a time limit   features.py   features that ride along
-
-docs/architecture.md has the files that the stages use, in the order in which the data flows.
+    config.py     what can be set             scene.py     Gaussians with labels, the moving ones first
+    shapes.py     known shapes, for no depth  first_fit.py start_scene: the scene at the first frame
+    frames.py     the cameras tracked with    motion.py    a twist a group, a displacement a Gaussian
+    layers.py     what moves, over a background that is drawn once
+    points.py     pixels of the last frame and of a keyframe, centres
+    align.py      Levenberg-Marquardt on points, nothing rendered
+    reference.py  what an object has to look like
+    lost.py       detection of lost objects   recover.py   where a lost object may be
+    search.py     several starts, aligned
+    matching.py   masked cross-correlation of templates (the paper's)
+    refine.py     photometric refinement (the paper's), in the tiles of region.py
+    plan.py       capacities of a step        state.py     what the step advances
+    stages/       the six stages of a frame   grow.py      surfaces that come into view
+    update.py     the step, and the first look
+    budget.py     settings for a time limit   method.py    the tracker as one value
+    features.py   features that ride along    query.py     which object a text means
 """
 
 from gsjax.methods.track.config import (
