@@ -1,6 +1,7 @@
 """Faults in the files of every reader: each message names the file and says what to do.
 
-docs/data-errors.md is generated from these messages: `python -m tests.data.test_reader_errors`.
+`python -m tests.data.test_reader_errors` writes docs/data-errors.md, the faults that readers find, and
+reader_errors.md beside this file, which has their messages.
 """
 
 import re
@@ -22,15 +23,23 @@ from tests.data.faulty import Fault
 LAYOUTS = PHOTOGRAPHS | RECORDINGS | SURGERY
 CASES = [(name, fault) for name, layout in LAYOUTS.items() for fault in layout.faults]
 PAGE = Path(__file__).parents[2] / "docs" / "data-errors.md"
-HEAD = """# Reader errors
+MESSAGES = Path(__file__).with_name("reader_errors.md")
+PAGE_HEAD = """# Reader errors
 
-What each reader reports about damaged or incomplete data. `DATA` is the folder, `FILE` the path of the file
-at fault, `...` a size or another library's words. Messages that differ only in names and numbers are listed
-once.
+Damage that each reader finds. Data that cannot be used raise `DataError`, or another `ValueError` or `OSError` (exit code 2 on
+the command line); data that can be used in part, or with a doubt, give a `DataWarning`. Each message names the file,
+what was expected, what was found, and what to do. `python -m tests.data.test_reader_errors` writes this page.
 
-Most are errors (`DataError`, or another `ValueError` or `OSError`; exit code 2 on the command line).
-*Rest used* and *all used* mark warnings (`DataWarning`). `python -m tests.data.test_reader_errors` writes
-this page; a test compares it.
+layout | error | warning, the rest is used | warning, all is used
+--- | --- | --- | ---
+"""
+HEAD = """# Messages of readers
+
+Messages for damaged or incomplete data, as readers word them. `DATA` is the folder, `FILE` the path of the file at
+fault, `...` a size or another library's words. Messages that differ only in names and numbers are listed once.
+
+*Rest used* and *all used* mark warnings (`DataWarning`). `python -m tests.data.test_reader_errors` writes this file;
+a test compares it.
 """
 SHARED = "Several layouts"
 
@@ -81,19 +90,39 @@ class Case(NamedTuple):
     text: str
 
 
-def page(scratch: Path) -> str:
-    """docs/data-errors.md: a table of the messages of several layouts, then one of each layout's own."""
-    alike: dict[tuple[str, str], list[Case]] = {}
+def found_in(scratch: Path) -> list[tuple[str, Case]]:
+    """Each fault with what came of it: "" where the data were refused, else how much of them is used."""
+    found = []
     for number, (layout, fault) in enumerate(CASES):
         refused, text = outcome_of(layout, fault, scratch / str(number))
-        outcome = "" if refused else "rest used" if "left out" in text else "all used"
-        alike.setdefault((outcome, _pattern(text)), []).append(Case(layout, fault.what, text))
+        found.append((_USED[refused, "left out" in text], Case(layout, fault.what, text)))
+    return found
+
+
+_USED = {(True, True): "", (True, False): "", (False, True): "rest used", (False, False): "all used"}
+
+
+def page(found: list[tuple[str, Case]]) -> str:
+    """docs/data-errors.md: the faults of each layout."""
+    rows = []
+    for layout in LAYOUTS:
+        of = {used: [case.what for u, case in found if (u, case.layout) == (used, layout)] for used, _ in found}
+        cells = ("; ".join(dict.fromkeys(of.get(used, ()))) for used in ("", "rest used", "all used"))
+        rows.append(" | ".join((layout, *cells)).rstrip() + "\n")
+    return PAGE_HEAD + "".join(rows)
+
+
+def messages(found: list[tuple[str, Case]]) -> str:
+    """reader_errors.md: a table of the messages of several layouts, then one of each layout's own."""
+    alike: dict[tuple[str, str], list[Case]] = {}
+    for used, case in found:
+        alike.setdefault((used, _pattern(case.text)), []).append(case)
     sections: dict[str, list[str]] = {name: [] for name in (SHARED, *LAYOUTS)}
-    for (outcome, _), cases in alike.items():
+    for (used, _), cases in alike.items():
         section = SHARED if len({case.layout for case in cases}) > 1 else cases[0].layout
         same = len({case.text for case in cases}) == 1
         text = cases[0].text if same else _LEADING_PATH.sub("FILE", cases[0].text)
-        problem = _problem(cases, section == SHARED) + (f" (*{outcome}*)" if outcome else "")
+        problem = _problem(cases, section == SHARED) + (f" (*{used}*)" if used else "")
         sections[section].append(problem + " | `" + text.replace("|", r"\|") + "`\n")
     head = "\n## {}\n\nproblem | message\n--- | ---\n"
     return HEAD + "".join(head.format(name) + "".join(rows) for name, rows in sections.items() if rows)
@@ -137,11 +166,14 @@ def test_messages_name_the_file_and_say_what_to_do(layout, fault, tmp_path):
         assert "left out" in message or re.search(r"[.;?] .*\b(give|set) ", message), message
 
 
-def test_the_page_in_the_docs_is_up_to_date(tmp_path):
-    written = PAGE.read_text(encoding="utf-8")
-    assert written == page(tmp_path), "run python -m tests.data.test_reader_errors"
+def test_the_page_and_the_messages_are_up_to_date(tmp_path):
+    found = found_in(tmp_path)
+    for path, text in ((PAGE, page(found)), (MESSAGES, messages(found))):
+        assert path.read_text(encoding="utf-8") == text, "run python -m tests.data.test_reader_errors"
 
 
 if __name__ == "__main__":
     with tempfile.TemporaryDirectory() as folder:
-        PAGE.write_text(page(Path(folder)), encoding="utf-8")
+        found = found_in(Path(folder))
+    PAGE.write_text(page(found), encoding="utf-8")
+    MESSAGES.write_text(messages(found), encoding="utf-8")

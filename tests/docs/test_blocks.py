@@ -26,7 +26,6 @@ NOT_RUN = {
     "docs/experiments.md": 1,
     "docs/from-gsplat.md": 1,
     "docs/many-devices.md": 1,
-    "docs/parts.md": 1,
     "docs/scores.md": 2,
     "docs/semantics.md": 1,
     "docs/view.md": 2,
@@ -42,13 +41,15 @@ def test_what_is_not_run_says_why():
     assert Counter(block.page for block in kept) == Counter(NOT_RUN)
 
 
-LONG = ("composition", "deform", "distill", "fit", "howto/loss", "howto/step", "rasterizer", "semantics")
+LONG = ("composition", "howto/loss", "howto/step", "rasterizer", "semantics")
 SLOW = {f"docs/{page}.md" for page in LONG}
 """Of these pages, tests of methods and commands run the calls as well."""
+OF_THE_README = ("README.md", *(f"docs/{verb}.md" for verb in ("fit", "track", "parts", "distill", "deform")))
+"""Their programs have tests of their own: test_readme.py, test_programs.py."""
 PROGRAMS = [
     pytest.param(page, marks=pytest.mark.slow) if page in SLOW else page
     for page in PAGES
-    if programs(page) and page != "README.md"  # which has a test of its own
+    if programs(page) and page not in OF_THE_README
 ]
 
 

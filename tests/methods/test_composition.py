@@ -1,4 +1,5 @@
-"""Tracker, feature distillation and graph as one jitted step, as docs/composition.md has it."""
+"""Methods in one jitted step, as docs/composition.md has them: tracker, feature distillation and graph; and a
+fit with a scene that deforms."""
 
 import re
 from dataclasses import replace
@@ -14,7 +15,9 @@ import pytest
 from jaxtyping import Array, Int
 
 from gsjax.geometry.cameras import unproject
-from gsjax.methods.deform import GraphConfig, graph_of, nodes_of, seen_ids
+from gsjax.methods import deform, fit
+from gsjax.methods.deform import Deform, GraphConfig, batch_of, graph_of, nodes_of, seen_ids
+from gsjax.methods.fit import Fit
 from gsjax.methods.track import (
     PLAN,
     PRESETS,
@@ -29,6 +32,9 @@ from gsjax.methods.track import (
 from gsjax.optim.method import Run
 from gsjax.scene.deformation import Nodes
 from gsjax.scene.render import plan_render
+from tests.docs.blocks import programs
+from tests.engine.cases import FIT
+from tests.methods.tissue import CONFIG, tissue
 
 ROOT = Path(__file__).resolve().parents[2]
 CODES = jnp.eye(7, 8)
@@ -36,11 +42,11 @@ RADIUS = 0.5
 
 
 @cache
-def page_names() -> dict:
-    """What the first program of the page defines."""
-    page = (ROOT / "docs/composition.md").read_text(encoding="utf-8")
+def page_names(function: str = "composed") -> dict:
+    """What the program of the page that defines a function defines."""
+    (block,) = (one for one in programs("docs/composition.md") if f"\ndef {function}(" in one.text)
     names: dict = {}
-    exec(compile(page.split("```python\n")[1].split("```")[0], "composition.md", "exec"), names)
+    exec(compile(block.text, block.place, "exec"), names)
     return names
 
 
@@ -191,3 +197,79 @@ def test_the_page_has_what_the_experiment_runs():
         for path in ("docs/composition.md", "experiments/composition/one_step.py")
     )
     assert page == re.sub(r'    """.*?"""\n\n', "", experiment, flags=re.DOTALL)
+
+
+class Joined(NamedTuple):
+    """The page's step of a fit and a deforming scene, its params, and `batch(i)` of frame i."""
+
+    step: Any
+    configs: tuple[Any, Any]
+    params: Any
+    batch: Any
+
+
+@pytest.fixture(scope="module")
+def joined():
+    """Tissue that breathes, and the tools before it, which stand still as far as the fit is concerned."""
+    page, (frames, _) = page_names("together"), tissue()
+    still = Fit(replace(FIT, steps=20, coarse_until=0.0, sh_degree=0))
+    moving = Deform(replace(CONFIG, warmup=0, iterations=20, graph=GraphConfig(kind="none")))
+    background, first = still.start([replace(frame, masks=~frame.masks) for frame in frames])
+    motion, second = moving.start(frames)
+    first, second = still.between(background, first, 0.0), moving.between(motion, second, 0.0)
+
+    def batch(i):
+        seen, _ = still.batch(background, first.having(step=i), 0.0)
+        return page["Both"](seen, batch_of(motion, second, int(seen.view)))
+
+    configs = still.config, moving.config
+    return Joined(page["together"](*configs), configs, page["Both"](first.params, second.params), batch)
+
+
+@pytest.fixture(scope="module")
+def update_joined(joined):
+    return jax.jit(joined.step.update)
+
+
+class TestStillAndMoving:
+    def test_each_part_is_updated_as_by_its_step_alone(self, joined, update_joined):
+        page = page_names("together")
+        still, moving = (
+            fit.step(joined.configs[0]),
+            deform.step(joined.configs[1], (page["nothing_outside"],)),
+        )
+        batch, key, params = joined.batch(0), jax.random.key(3), joined.params
+        together, state, info = update_joined(params, joined.step.init(params), batch, step=0, key=key)
+        for name, step in (("still", still), ("moving", moving)):
+            part, given = getattr(params, name), getattr(batch, name)
+            alone, alone_state, reported = jax.jit(step.update)(
+                part, step.init(part), given, step=0, key=key
+            )
+            found = getattr(together, name), getattr(state, name)
+            for a, b in zip(jax.tree.leaves(found), jax.tree.leaves((alone, alone_state)), strict=True):
+                np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-6)
+            np.testing.assert_allclose(getattr(info["losses"], name), reported["loss"], rtol=1e-5)
+        np.testing.assert_allclose(info["loss"], sum(info["losses"]), rtol=1e-6)
+
+    def test_both_losses_go_down_in_one_compiled_program(self, joined, update_joined):
+        params, losses = joined.params, []
+        state = joined.step.init(params)
+        for i in range(16):
+            given = joined.batch(i % 2)
+            params, state, info = update_joined(params, state, given, step=i, key=jax.random.key(i))
+            assert not info["skipped"]
+            losses.append([float(loss) for loss in info["losses"]])
+        assert np.isfinite(losses).all()
+        assert (np.mean(losses[-2:], axis=0) < np.mean(losses[:2], axis=0)).all()
+        assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(params))
+        assert update_joined._cache_size() == 1
+
+    def test_where_one_overflows_neither_is_updated(self, joined):
+        params, batch = joined.params, joined.batch(0)
+        tight = batch.moving._replace(plan=replace(batch.moving.plan, capacity=16))
+        state, update = joined.step.init(params), jax.jit(joined.step.update)
+        after = update(params, state, batch._replace(moving=tight), step=0, key=jax.random.key(0))
+        assert after[2]["skipped"]
+        assert after[2]["overflow"]
+        for a, b in zip(jax.tree.leaves(after[:2]), jax.tree.leaves((params, state)), strict=True):
+            np.testing.assert_array_equal(a, b)
