@@ -1,6 +1,6 @@
 """Makes docs/images/tracking.jpg out of a run of `make demo`: three moments, as seen and as understood.
 
-    .venv/bin/python docs/images/make_picture.py runs/demo
+.venv/bin/python docs/images/make_picture.py runs/demo
 """
 
 import sys

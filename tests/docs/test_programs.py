@@ -1,5 +1,5 @@
-"""The five programs of a researcher: the same in README.md and at the top of their pages, alike in their words,
-and run, with less to do than they have there."""
+"""The five programs of a researcher: the same in README.md and on their pages, in the same words, and run, with
+fewer frames and steps."""
 
 import re
 from dataclasses import replace

@@ -242,9 +242,7 @@ class TestStillAndMoving:
         together, state, info = update_joined(params, joined.step.init(params), batch, step=0, key=key)
         for name, step in (("still", still), ("moving", moving)):
             part, given = getattr(params, name), getattr(batch, name)
-            alone, alone_state, reported = jax.jit(step.update)(
-                part, step.init(part), given, step=0, key=key
-            )
+            alone, alone_state, reported = jax.jit(step.update)(part, step.init(part), given, step=0, key=key)
             found = getattr(together, name), getattr(state, name)
             for a, b in zip(jax.tree.leaves(found), jax.tree.leaves((alone, alone_state)), strict=True):
                 np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-6)

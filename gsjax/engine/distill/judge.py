@@ -8,10 +8,10 @@ from jaxtyping import Array, Float, UInt8
 
 from gsjax.engine.distill.scene import FieldScene
 from gsjax.engine.distill.scores import ClassScores, Frozen, angle_error, class_maps, classes_of, one_by_one
-from gsjax.engine.teaching.teaching import Teaching
 from gsjax.engine.folder import RunFolder
 from gsjax.engine.messages import Notes, describe
 from gsjax.engine.scores import mean_scores
+from gsjax.engine.teaching.teaching import Teaching
 from gsjax.io.pictures import write_png
 from gsjax.methods.distill import DistillConfig, DistillResult, FeatureField, rendered_features
 from gsjax.rasterize.frozen import paint

@@ -181,7 +181,7 @@ def at_means(
     if not isinstance(field.encoding, FeatureGrid):
         count = len(field.encoding)
         if count != len(means):
-            raise ValueError(f"means: expected {count} Gaussians, as this field has vectors, found {len(means)}")
+            raise ValueError(f"means: expected {count} Gaussians, one per vector, found {len(means)}")
         return field, None
     assert rows is not None
     located = locate(field.encoding, means)

@@ -31,9 +31,7 @@ def moving_segments(
     return np.where(kept[segments], segments, 0)
 
 
-def view_order(
-    viewmats: Float[np.ndarray, "C 4 4"], first: int, focus: Float[np.ndarray, "3"]
-) -> list[int]:
+def view_order(viewmats: Float[np.ndarray, "C 4 4"], first: int, focus: Float[np.ndarray, "3"]) -> list[int]:
     """Views in an order in which each is the nearest to those before it, by the angle at `focus`.
 
     Args:

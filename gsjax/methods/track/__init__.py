@@ -1,25 +1,25 @@
 """The object-aware tracker (Object-Aware Gaussian Splatting for Robotic Manipulation), from one view's mask.
 
-    scene = start_scene(first, mask, mask_camera, config)
-    for now in gsjax.track(scene, first, frames, config):
-        now.result.gaussians()
+scene = start_scene(first, mask, mask_camera, config)
+for now in gsjax.track(scene, first, frames, config):
+    now.result.gaussians()
 
-    config.py     settings                    scene.py      Gaussians with labels, the moving ones first
-    first_fit.py  the scene at frame one      shapes.py     the same without depth, from known shapes
-    frames.py     preparation of frames       motion.py     twists of groups, displacements of Gaussians
-    layers.py     moving Gaussians over a background that is drawn once
-    points.py     the points that are aligned: pixels of the last frame and of a keyframe, centres
-    align.py      Levenberg-Marquardt on points, without rendering
-    reference.py  the Gaussians that the first mask labelled: what an object has to look like
-    lost.py       detection of lost objects   recover.py    relocation of lost objects
-    search.py     several starts, aligned; the one that agrees best is kept
-    matching.py   masked cross-correlation of templates (the paper's)
-    refine.py     photometric refinement (the paper's), in the tiles of region.py
-    plan.py       capacities of a step        state.py      parameters, state and batch of the step
-    stages/       the six stages of a frame   grow.py       surfaces that come into view
-    update.py     the step                    method.py     the tracker as one value
-    budget.py     settings for a time limit   features.py   features that move with the Gaussians
-    query.py      language queries
+config.py     settings                    scene.py      Gaussians with labels, the moving ones first
+first_fit.py  the scene at frame one      shapes.py     the same without depth, from known shapes
+frames.py     preparation of frames       motion.py     twists of groups, displacements of Gaussians
+layers.py     moving Gaussians over a background that is drawn once
+points.py     the points that are aligned: pixels of the last frame and of a keyframe, centres
+align.py      Levenberg-Marquardt on points, without rendering
+reference.py  the Gaussians that the first mask labelled: what an object has to look like
+lost.py       detection of lost objects   recover.py    relocation of lost objects
+search.py     several starts, aligned; the one that agrees best is kept
+matching.py   masked cross-correlation of templates (the paper's)
+refine.py     photometric refinement (the paper's), in the tiles of region.py
+plan.py       capacities of a step        state.py      parameters, state and batch of the step
+stages/       the six stages of a frame   grow.py       surfaces that come into view
+update.py     the step                    method.py     the tracker as one value
+budget.py     settings for a time limit   features.py   features that move with the Gaussians
+query.py      language queries
 """
 
 from gsjax.methods.track.config import (
