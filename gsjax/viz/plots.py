@@ -74,7 +74,8 @@ def fit_curve(rows: Sequence[Mapping[str, float | None]]) -> Figure:
     """
     figure, axes = _new("Held-out PSNR", "minutes", "dB")
     behind = axes.twinx()
-    behind.plot([row["seconds"] / 60 for row in rows], [row["alive"] for row in rows], color=FAINT, lw=1.0)
+    minutes = np.array([row["seconds"] for row in rows], float) / 60
+    behind.plot(minutes, [row["alive"] for row in rows], color=FAINT, lw=1.0)
     behind.set_ylabel("Gaussians", color=FAINT)
     behind.set_ylim(bottom=0)
     behind.spines[["top"]].set_visible(False)
@@ -195,7 +196,7 @@ def _new(title: str, xlabel: str, ylabel: str) -> tuple[Figure, Axes]:
 
 
 def style_axes(axes: Axes, xlabel: str, ylabel: str) -> None:
-    """Label axes, with a faint grid behind the data."""
+    """Label the axes (xlabel, ylabel), with a faint grid behind the data."""
     axes.set_xlabel(xlabel, color=FAINT, fontsize=10)
     axes.set_ylabel(ylabel, color=FAINT, fontsize=10)
     axes.tick_params(colors=FAINT, labelsize=9.5, length=0)

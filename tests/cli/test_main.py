@@ -96,7 +96,7 @@ def test_info_says_what_is_there(say):
         "3, numbered 0 to 2",
         "30.0 Hz",
         "carton (label 2)",
-        "1 robot",
+        "robot  carton  can  ball",
     ):
         assert said in out, out
 

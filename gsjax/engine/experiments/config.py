@@ -104,7 +104,7 @@ def _fields(kind: type, value: Any, where: str, separator: str = ".") -> Any:
 
 
 def expect(holds: Any, where: str, expected: str, found: Any) -> None:
-    """Raises a ValueError with the place, what was expected and what was found, unless `holds`."""
+    """Raises a ValueError that says where, what was expected and what was found, unless `holds`."""
     if holds:
         return
     found = "nothing" if found is None else found
