@@ -37,10 +37,10 @@ def near_scene(scene: TrackedScene, near: Bool[Array, "background"], num_near: i
     """The scene with only the near Gaussians of the background, in `num_near` rows, of which surplus ones are
     invisible."""
     rows = jnp.nonzero(near, size=num_near, fill_value=0)[0] + scene.num_moving
-    rows = jnp.concatenate([jnp.arange(scene.num_moving), rows])
-    surplus = jnp.arange(len(rows)) >= scene.num_moving + near.sum()
+    background = emptied(take(scene.gaussians, rows), jnp.arange(num_near) >= near.sum())
+    moving = jax.tree.map(lambda a: a[: scene.num_moving], scene.gaussians)
+    gaussians = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), moving, background)
     labels = jnp.concatenate([scene.groups, jnp.zeros(num_near, jnp.int32)])
-    gaussians = emptied(take(scene.gaussians, rows), surplus)
     return TrackedScene(gaussians, scene.normals, labels, scene.label_ids, scene.num_moving)
 
 
