@@ -63,7 +63,7 @@ class DistillConfig:
     weights: DistillWeightsConfig = field(default_factory=DistillWeightsConfig)
     """Weights of the losses."""
     contrast_after: float = 800 / 1500
-    """Share of the iterations after which the contrastive loss is added; earlier it would scatter features."""
+    """Share of the iterations after which the contrastive loss is added; earlier, features would scatter."""
     contrast_gamma: float = 1.0
     """Gamma of the contrastive kernel exp(-gamma |A - B|^2)."""
     contrast_pool: int = 4
