@@ -1,4 +1,4 @@
-"""A deforming scene: where it starts, that it learns, and what it knows."""
+"""A deforming scene: its initialization, training and features."""
 
 from dataclasses import replace
 from itertools import pairwise
@@ -39,7 +39,7 @@ def lesson():
 
 
 def sight(problem, run, i, time=None):
-    """PSNR of what the scene looks like where frame `i` was, at its time or another."""
+    """PSNR of the scene rendered in the camera of frame `i`, at its time or another."""
     seen = problem.seen[i]
     there = run.params.at(seen.time if time is None else time, run.kept.moving)
     drawn = render(there, seen.cameras, run.plans[PLAN])
@@ -56,7 +56,7 @@ def seen_in(frame, points):
 
 
 class TestStart:
-    def test_gaussians_lie_where_the_first_frame_sees_something(self, frames):
+    def test_gaussians_lie_on_the_surface_of_the_first_frame(self, frames):
         gaussians = start_gaussians(frames[:1], 0, 1.0)
         x, y, depth = seen_in(frames[0], gaussians.means)
         np.testing.assert_allclose(known_depth(frames[0])[y, x], depth, rtol=0.02)
@@ -147,17 +147,17 @@ class TestLearning:
         last = len(first) - 1
         assert now[last] > sight(problem, run, last, problem.seen[0].time) + 0.3
 
-    def test_gaussians_mean_what_the_teacher_says(self, learned):
+    def test_features_approach_those_of_the_teacher(self, learned):
         *_, infos = learned
         assert {"node", "structure"} <= set(infos[-1])
         assert infos[-1]["feature"] < 0.6 * infos[0]["feature"]
 
-    def test_the_field_opens_after_the_warm_up_and_the_graph_comes_later(self, learned):
+    def test_the_field_is_added_after_the_warm_up_and_the_graph_later(self, learned):
         *_, infos = learned
         assert next(i for i, info in enumerate(infos) if "planes" in info) == 8
         assert next(i for i, info in enumerate(infos) if "node" in info) == 8 + 35
 
-    def test_depth_that_is_no_number_is_unknown(self, frames):
+    def test_depth_that_is_not_finite_is_unknown(self, frames):
         depths = frames[0].depths.copy()
         depths[0, 10, 10], depths[0, 11, 11] = np.nan, np.inf
         method = Deform(replace(CONFIG, warmup=1, iterations=0))
@@ -166,8 +166,8 @@ class TestLearning:
         assert np.isfinite(info["loss"])
         assert not info["skipped"]
 
-    def test_rates_fall_over_both_parts_of_the_learning(self, frames):
-        """The optimizer begins anew with the deformation, and its rates do not."""
+    def test_rates_decay_over_warm_up_and_joint_steps(self, frames):
+        """The optimizer is new with the deformation; its schedule is not."""
         method = Deform(replace(CONFIG, warmup=3, iterations=3, schedule="cosine", warmup_frames="all"))
         problem, run = method.start(frames)
         means = [np.array(run.params.gaussians.means)]
@@ -178,7 +178,7 @@ class TestLearning:
         np.testing.assert_allclose(steps[3] / steps[0], fall, rtol=0.02)
 
     @pytest.mark.slow
-    def test_those_that_moved_farthest_go_on_deforming(self, frames, tmp_path):
+    def test_those_that_moved_farthest_keep_deforming(self, frames, tmp_path):
         method = Deform(replace(CONFIG, nodes=0, warmup=2, iterations=12, moving_share=0.25))
         ticks, gate = drive(method, *method.start(frames)), 2 + 3
         for now in ticks:
@@ -212,7 +212,7 @@ class TestLearning:
         *_, last = drive(Deform(CONFIG), problem, again)
         jax.tree.map(np.testing.assert_array_equal, whole.params, last.run.params)
 
-    def test_what_cannot_be_drawn_is_left_out(self, frames):
+    def test_invalid_gaussians_are_left_out(self, frames):
         given = start_gaussians(frames[:1], 0, 2.0)
         spoilt = eqx.tree_at(lambda g: g.means, given, given.means.at[:3].set(jnp.nan))
         _, run = Deform(CONFIG).start(frames, gaussians=spoilt)
@@ -221,22 +221,22 @@ class TestLearning:
         with pytest.raises(ValueError, match="gaussians: expected some"):
             Deform(CONFIG).start(frames, gaussians=nowhere)
 
-    def test_what_was_given_is_kept(self, frames):
+    def test_given_gaussians_are_not_donated(self, frames):
         given, method = start_gaussians(frames[:1], 0, 2.0), Deform(replace(CONFIG, warmup=1, iterations=0))
         next(drive(method, *method.start(frames, gaussians=given)))
         assert not given.means.is_deleted()
 
 
-def test_a_learned_scene_is_asked_what_it_was_taught(learned):
-    """One class in view of the tools that are left out: what it was taught is what it answers."""
+def test_the_class_of_a_trained_scene_is_the_teachers(learned):
+    """Tools are left out, so one class is in view."""
     _, run, *_ = learned
     found = prompt_probabilities(run.params.gaussians.features, jnp.asarray(CODES, jnp.float32))
     assert (found[:, 0] > 0.9).mean() > 0.8
 
 
 @pytest.mark.parametrize("smaller", [1, 2])
-def test_what_does_not_count_is_not_taught(frames, smaller):
-    """Else what lies behind a tool would learn that it is one."""
+def test_pixels_that_do_not_count_have_no_label(frames, smaller):
+    """Else tissue behind a tool would learn the tool's features."""
     counts = np.ones_like(frames[0].masks)
     counts[0, 10:20, 30:44] = False
     ids = np.ones(counts.shape[1:], np.int32)[::smaller, ::smaller]

@@ -1,4 +1,4 @@
-"""Features of a deforming scene: losses of a teacher and of a graph, and what prompts find by them."""
+"""Features of a deforming scene: losses of a teacher and of a graph, and prompts."""
 
 from dataclasses import replace
 
@@ -49,7 +49,7 @@ class TestFeatureLoss:
         found = feature_loss(drawn, jnp.asarray(CODES, jnp.float32), jnp.asarray(ids))
         np.testing.assert_allclose(found, expected, rtol=1e-6)
 
-    def test_a_teacher_of_its_own_size_is_not_resized(self):
+    def test_a_teacher_of_the_same_size_is_not_resized(self):
         drawn = jnp.asarray(np.random.default_rng(1).uniform(size=(5, 7, 4)), jnp.float32)
         found = feature_loss(drawn, jnp.asarray(CODES, jnp.float32), jnp.ones((5, 7), jnp.int32))
         np.testing.assert_allclose(found, np.abs(np.asarray(drawn) - CODES[1]).mean(), rtol=1e-6)
@@ -59,7 +59,7 @@ class TestFeatureLoss:
         slope = jax.jit(jax.grad(feature_loss))(jnp.full((24, 32, 4), 2.0), codes, ids)
         assert (jnp.abs(slope) > 0).all()
 
-    def test_a_teacher_that_says_nothing(self):
+    def test_without_labels_there_is_none(self):
         drawn = jnp.ones((4, 4, 4))
         assert feature_loss(drawn, jnp.asarray(CODES, jnp.float32), jnp.full((4, 4), -1)) == 0
 
@@ -87,7 +87,7 @@ class TestGraph:
         features = jnp.ones((nodes.max() + 1, 4))
         assert all(value == 0 for value in graph_loss(features, none[0], CONFIG.graph).values())
 
-    def test_what_the_teacher_says_costs_nothing(self, graphs):
+    def test_the_teachers_own_features_cost_nothing(self, graphs):
         """One class in view: features that are its code have no node loss, and no pair apart."""
         nodes, found = graphs
         features = jnp.zeros((nodes.max() + 1, 4)).at[:, 0].set(1.0)
@@ -99,7 +99,7 @@ class TestGraph:
             values = graph_loss(apart, found[kind][0], replace(CONFIG.graph, kind=kind))
             assert sum(values.values()) > 0.01
 
-    def test_slopes_reach_nodes_alone(self, graphs):
+    def test_gradients_reach_only_nodes(self, graphs):
         nodes, found = graphs
         features = jnp.asarray(np.random.default_rng(0).normal(size=(nodes.max() + 5, 4)), jnp.float32)
         slope = jax.jit(jax.grad(lambda f: sum(graph_loss(f, found["matching"][2], CONFIG.graph).values())))(
@@ -146,7 +146,7 @@ class TestPrompts:
         longer = prompt_probabilities(jnp.asarray(1e3 * features), jnp.asarray(1e-3 * prompts))
         np.testing.assert_allclose(longer, expected, atol=1e-12)
 
-    def test_nothing_is_as_likely_each(self):
+    def test_a_feature_of_length_0_makes_all_equally_likely(self):
         features = jnp.zeros((2, 4)).at[1, 0].set(1.0)
         found = prompt_probabilities(features, jnp.asarray(CODES))
         np.testing.assert_allclose(found[0], 0.5)

@@ -1,4 +1,4 @@
-"""Where a deforming scene begins without depth."""
+"""Initialization of a deforming scene without depth."""
 
 from dataclasses import replace
 
@@ -21,7 +21,7 @@ TINY = DeformConfig(warmup=3, iterations=3, nodes=16)
 
 @pytest.fixture(scope="module")
 def frames():
-    """A camera that goes round something, and does not know how far that is."""
+    """A camera around an object at an unknown distance."""
     images = np.random.default_rng(0).integers(0, 255, (3, 32, 40, 3), np.uint8)
     eyes = np.array([[0.1, 0.2, -2.0], [0.6, 0.1, -1.8], [-0.7, 0.3, -2.2]])
     views = [look_at(eye, np.array([0.05, 0.0, 0.0]), UP) for eye in eyes]
@@ -46,7 +46,7 @@ def test_a_camera_that_looks_away_sees_none_of_it(frames):
     np.testing.assert_array_equal(with_plane_depths([frames[0], away], 0, 1.0)[1].depths, 0)
 
 
-def test_a_scene_begins_there_where_the_first_pixel_counts(frames):
+def test_a_scene_starts_there_from_the_first_frame_with_pixels_that_count(frames):
     hidden = np.zeros((1, 32, 40), bool)
     part = np.ones((1, 32, 40), bool)
     part[..., :20] = False

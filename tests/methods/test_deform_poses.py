@@ -1,4 +1,4 @@
-"""Poses that are refined while a deforming scene is learned."""
+"""Poses refined together with a deforming scene."""
 
 from dataclasses import replace
 
@@ -38,7 +38,7 @@ CONFIG = DeformConfig(
 
 
 def off_by(viewmat, twist):
-    """A view matrix whose camera is turned (degrees) about its centre, and shifted (metres)."""
+    """The view matrix of a camera rotated about its centre (degrees) and translated (metres)."""
     rotation = viewmat[:3, :3] @ Rotation.from_rotvec(np.deg2rad(twist[:3])).as_matrix().T
     found = np.eye(4)
     found[:3, :3], found[:3, 3] = rotation, -rotation @ (center(viewmat) + twist[3:])
@@ -56,14 +56,14 @@ def turned(one, other):
 
 @pytest.fixture(scope="module")
 def frames():
-    """Built-in tissue that stands still, tools left out."""
+    """Static built-in tissue, tools left out."""
     seen = gsjax.open_sequence("simulated:tissue?width=40&height=32&frames=4&still=true").select(cameras=(0,))
     return frames_of(seen)
 
 
 @pytest.fixture(scope="module")
 def askew(frames):
-    """The same, all but the first from somewhat elsewhere than they say: by 1 degree and 1.5 mm."""
+    """The same, with pose errors of 1 degree and 1.5 mm in all frames but the first."""
     random = np.random.default_rng(0)
     twists = random.normal(size=(len(frames), 6)) * np.repeat([0.6, 0.9e-3], 3)
     twists[0] = 0
@@ -78,7 +78,7 @@ def viewmats_of(frames):
 
 
 def corners_off(found, frames):
-    """Pixels by which points are seen elsewhere: turns and shifts of a camera look much alike."""
+    """Reprojection error in pixels, as rotations and translations look much alike."""
     offs = []
     for viewmat, frame in zip(found, frames, strict=True):
         pixels = np.array([[5, 5, 1], [35, 5, 1], [20, 16, 1], [5, 27, 1], [35, 27, 1]], float)
@@ -97,8 +97,8 @@ def learned(askew):
 
 
 @pytest.mark.slow
-def test_finds_where_cameras_stood(frames, askew):
-    """By the scene alone: nothing moves, and all frames teach it."""
+def test_recovers_the_true_poses(frames, askew):
+    """In a static scene, from all frames."""
     method = Deform(replace(CONFIG, warmup=120, iterations=0, warmup_frames="all"))
     for now in drive(method, *method.start(askew)):
         assert not now.info["skipped"]
@@ -121,7 +121,7 @@ class TestRefining:
         _, run = Deform(replace(CONFIG, refine_poses=False)).start(askew)
         assert run.params.twists is None
 
-    def test_slopes_are_of_the_frames_own_twist(self, learned):
+    def test_gradients_are_of_the_frames_own_twist(self, learned):
         problem, run = learned.problem, learned.run
         loss, rows, key = deform_loss(CONFIG), run.params.twists, jax.random.key(0)
         still = run.having(kept=Kept())
@@ -148,7 +148,7 @@ class TestBetweenFrames:
         random = np.random.default_rng(2)
         return jnp.asarray(random.normal(size=(len(askew), 6)) * 0.01, jnp.float32)
 
-    def test_what_is_off_lies_between_that_of_neighbours(self, askew, twists):
+    def test_corrections_are_interpolated_between_neighbours(self, askew, twists):
         view, learned = np.eye(4)[None, None], times_of(askew)
         middle = 0.5 * (learned[1] + learned[2])
         found = refined_viewmats(view, np.array([middle]), twists, learned, 2.0)[0, 0]

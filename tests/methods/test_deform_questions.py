@@ -1,4 +1,4 @@
-"""Questions on a deforming scene: a made-up one of known facts, what is understood, and what is not."""
+"""Questions on a made-up deforming scene of known facts: parsing and answers."""
 
 from dataclasses import replace
 
@@ -105,7 +105,7 @@ class TestAnswers:
         assert (found.value, found.unit) == (pytest.approx(value, abs=0.6) if unit else value, unit)
         assert found.text.endswith(".")
 
-    def test_a_way_is_as_long_as_it_is(self, facts):
+    def test_a_motion_has_its_true_length(self, facts):
         one, other = (made_up(t).points[1] for t in (12 - 10, 13 - 10))
         found = ask("how far does the needle driver move between frames 12 and 13", facts)
         assert found.value == pytest.approx(1e3 * np.median(np.linalg.norm(one - other, axis=1)))
@@ -178,7 +178,7 @@ class TestParsing:
             "how far is tissue from needle driver in frame 12", NAMES
         )
 
-    def test_the_camera_is_no_thing(self):
+    def test_the_camera_is_not_a_class(self):
         assert parse_question("How far is the tissue from the camera in frame 11?", NAMES).kind == "depth"
         assert parse_question("How far away is the tissue in frame 11?", NAMES).kind == "depth"
 
@@ -199,14 +199,14 @@ class TestParsing:
             ("Is there tissue in frame 14?", "frame 14: expected one of the recording's 4 frames, 10 to 13"),
         ],
     )
-    def test_what_cannot_be_asked_is_said(self, facts, question, words):
+    def test_invalid_questions_are_explained(self, facts, question, words):
         with pytest.raises(ValueError, match=words):
             ask(question, facts)
 
-    def test_a_question_that_no_template_fits_says_all_that_do(self, facts):
-        with pytest.raises(ValueError, match="expected one of these") as told:
+    def test_a_question_without_a_template_lists_all_templates(self, facts):
+        with pytest.raises(ValueError, match="expected one of these") as error:
             ask("what is the diagnosis", facts)
-        assert all(kind.example in str(told.value) for kind in QUESTIONS)
+        assert all(kind.example in str(error.value) for kind in QUESTIONS)
 
     def test_which_frames_a_question_needs(self):
         assert rows_of(parse_question("is there tissue in frame 12", NAMES), FRAMES) == [2]
@@ -215,7 +215,7 @@ class TestParsing:
 
 
 class TestLanguageModel:
-    def test_is_told_the_facts_and_the_question(self, facts):
+    def test_gets_the_facts_and_the_question(self, facts):
         prompt = question_prompt("Is it safe?", facts)
         assert prompt.endswith("Question: Is it safe?\nAnswer:")
         assert "Frame 10:\n- tissue: 100.0 % of the picture" in prompt
@@ -223,16 +223,16 @@ class TestLanguageModel:
         assert " from tissue, moves by (" in prompt
         assert "nan" not in prompt
 
-    def test_answers_by_its_users_function(self, facts):
-        told = []
+    def test_answers_by_the_users_function(self, facts):
+        prompts = []
 
         def model(prompt: str) -> str:
-            told.append(prompt)
+            prompts.append(prompt)
             return " As far as is known. \n"
 
         found = PromptedAnswerer(model)("Is it safe?", facts)
         assert (found.text, found.value) == ("As far as is known.", None)
-        assert told == [question_prompt("Is it safe?", facts)]
+        assert prompts == [question_prompt("Is it safe?", facts)]
         assert isinstance(model, LanguageModel)
         assert isinstance(ask, Answerer)
 
@@ -274,14 +274,14 @@ class TestOfAScene:
     def test_without_meaning_there_are_none(self, wall):
         bare = DeformingScene(eqx.tree_at(lambda g: g.features, wall.scene.gaussians, None))
         for result in (replace(wall, meaning=None), replace(wall, scene=bare)):
-            with pytest.raises(ValueError, match="expected a scene whose features have a meaning"):
+            with pytest.raises(ValueError, match="features: expected a scene that learned from a teacher"):
                 scene_facts(result, [0])
         with pytest.raises(ValueError, match="rows: expected at least one frame"):
             scene_facts(wall, [])
 
 
-def test_names_are_known_however_they_are_spelt():
+def test_names_match_in_any_spelling():
     names = ("suturing-needle", "st. mark")
-    for said in ("suturing needle", "suturing-needle", "the Suturing_Needle"):
-        assert parse_question(f"where is {said} in frame 3?", names).things == (0,)
+    for spelling in ("suturing needle", "suturing-needle", "the Suturing_Needle"):
+        assert parse_question(f"where is {spelling} in frame 3?", names).things == (0,)
     assert parse_question("where is st. mark in frame 3?", names).things == (1,)

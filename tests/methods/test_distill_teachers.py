@@ -1,4 +1,4 @@
-"""What teachers say of pixels reaches the loss as it was said, however it is kept."""
+"""Target features of pixels reach the loss unchanged, from masks and from maps."""
 
 from dataclasses import replace
 
@@ -53,7 +53,7 @@ def scene():
 
 
 def halves(one: int, other: int) -> np.ndarray:
-    """Masks of a view: one thing to the left, another to the right, and nothing known above."""
+    """Masks of a view: one object on the left, another on the right, and unknown at the top."""
     mask = np.full((HEIGHT, WIDTH), one, np.int64)
     mask[:, WIDTH // 2 :], mask[:4] = other, -1
     return mask
@@ -81,30 +81,30 @@ def test_a_view_keeps_what_it_shows_of_the_codebook_and_that_is_as_good(scene):
         np.testing.assert_array_equal(ids < 0, teacher.ids[v] < 0)
         np.testing.assert_array_equal(book[ids[ids >= 0]], teacher.codebook[teacher.ids[v][ids >= 0]])
     config = replace(QUICK, contrast_after=0.0)
-    told, run = Distill(config).start(scene, cameras(3), teacher)
-    whole = told.views[1]._replace(ids=jnp.asarray(teacher.ids[1]), codebook=jnp.asarray(teacher.codebook))
-    assert len(whole.codebook) == 6 > len(told.views[1].codebook) == 2
-    for name, value in loss_of(config, run, told.views[1])[1].items():
+    problem, run = Distill(config).start(scene, cameras(3), teacher)
+    whole = problem.views[1]._replace(ids=jnp.asarray(teacher.ids[1]), codebook=jnp.asarray(teacher.codebook))
+    assert len(whole.codebook) == 6 > len(problem.views[1].codebook) == 2
+    for name, value in loss_of(config, run, problem.views[1])[1].items():
         np.testing.assert_allclose(value, loss_of(config, run, whole)[1][name], rtol=1e-5)
 
 
-def test_views_that_show_all_or_nothing_of_the_codebook_are_told_apart():
+def test_views_that_show_all_or_nothing_of_the_codebook():
     full = teacher_of_objects([np.arange(6).reshape(2, 3)], [BOOK])
     ids, book = view_codebook(full, 0, 6)
     np.testing.assert_allclose(book[ids], full.codebook[full.ids[0]])
-    silent = full._replace(ids=[np.full((2, 3), -1)])
-    ids, book = view_codebook(silent, 0, 2)
+    empty = full._replace(ids=[np.full((2, 3), -1)])
+    ids, book = view_codebook(empty, 0, 2)
     assert (ids == -1).all()
     assert not book.any()
 
 
 @pytest.mark.parametrize("weight", [0.0, 0.5, 2.0])
-def test_two_teachers_are_the_mean_of_both_by_weight(scene, weight):
+def test_masks_with_maps_give_the_weighted_mean_of_both_losses(scene, weight):
     weights = DistillWeightsConfig(map=weight, contrast=0.0, tv=0.0)
     config, both, found = replace(QUICK, weights=weights), with_maps(objects(), maps()), []
     for teacher in (objects(), maps(), both):
-        told, run = Distill(config).start(scene, cameras(3), teacher)
-        found.append(loss_of(config, run, told.views[0])[1])
+        problem, run = Distill(config).start(scene, cameras(3), teacher)
+        found.append(loss_of(config, run, problem.views[0])[1])
     of_objects, of_maps, of_both = found
     known = (HEIGHT - 4) * WIDTH
     share = weight * HEIGHT * WIDTH / (known + weight * HEIGHT * WIDTH)
@@ -113,7 +113,7 @@ def test_two_teachers_are_the_mean_of_both_by_weight(scene, weight):
         np.testing.assert_allclose(of_both[name], want, rtol=1e-5)
 
 
-def test_teachers_that_do_not_go_together_are_refused():
+def test_teachers_that_do_not_match_are_refused():
     with pytest.raises(ValueError, match="expected one of masks and one of maps"):
         with_maps(maps(), objects())
     other = teacher_of_maps([np.ones((9, 12, 5))] * 3, [(HEIGHT, WIDTH)] * 3)
@@ -132,14 +132,15 @@ def test_a_teacher_with_maps_of_other_views_is_refused(scene):
 
 @pytest.mark.parametrize("size", [(9, 12), (5, 7), (36, 48), (50, 70)])
 def test_maps_are_stretched_as_opencv_does(scene, size):
-    told, _ = Distill(QUICK).start(scene, cameras(3), objects())
-    plan, said = told.views[0].plan, np.random.default_rng(2).normal(size=(*size, 3)).astype(np.float32)
-    want = cv2.resize(said, (WIDTH, HEIGHT), interpolation=cv2.INTER_LINEAR)
-    np.testing.assert_allclose(_stretched(jnp.asarray(said), 0, HEIGHT, plan), want, atol=1e-4)
-    np.testing.assert_allclose(_stretched(jnp.asarray(said), 8, 4, plan), want[8:12], atol=1e-4)
+    problem, _ = Distill(QUICK).start(scene, cameras(3), objects())
+    plan = problem.views[0].plan
+    features = np.random.default_rng(2).normal(size=(*size, 3)).astype(np.float32)
+    want = cv2.resize(features, (WIDTH, HEIGHT), interpolation=cv2.INTER_LINEAR)
+    np.testing.assert_allclose(_stretched(jnp.asarray(features), 0, HEIGHT, plan), want, atol=1e-4)
+    np.testing.assert_allclose(_stretched(jnp.asarray(features), 8, 4, plan), want[8:12], atol=1e-4)
 
 
-def test_how_long_an_encoders_vectors_are_does_not_matter(scene):
+def test_the_length_of_an_encoders_vectors_does_not_matter(scene):
     found = []
     for factor in (1.0, 1e6, 1e-6):
         teacher = teacher_of_objects(objects().ids, [np.float32(factor) * BOOK] * 3)
@@ -152,31 +153,31 @@ def test_how_long_an_encoders_vectors_are_does_not_matter(scene):
     np.testing.assert_allclose(long.maps[0], maps().maps[0], rtol=1e-5)
 
 
-def test_maps_teach(scene):
-    """A feature a pixel, of three stripes that lie on the scene itself."""
+def test_it_learns_from_maps(scene):
+    """Maps of three stripes on the scene itself."""
     labels = np.digitize(np.asarray(scene.means)[:, 2], [-0.25, 0.25])
-    said = []
+    stripes = []
     for view, plan in frozen_views(scene, cameras(3)):
         shares = np.asarray(paint(view, jax.nn.one_hot(labels, 3), plan)[0])
-        said.append(BOOK[shares.argmax(-1)] + 0.0)
-    teacher = teacher_of_maps(said, [(HEIGHT, WIDTH)] * 3)
+        stripes.append(BOOK[shares.argmax(-1)] + 0.0)
+    teacher = teacher_of_maps(stripes, [(HEIGHT, WIDTH)] * 3)
     method = Distill(replace(QUICK, iterations=150))
-    told, run = method.start(scene, cameras(3), teacher)
-    *_, last = drive(method, told, run)
+    problem, run = method.start(scene, cameras(3), teacher)
+    *_, last = drive(method, problem, run)
     cosines = np.asarray(last.result.cosines(BOOK[:3]))
-    shown = np.unique(np.concatenate([view.view.rows for view in told.views]))
+    shown = np.unique(np.concatenate([view.view.rows for view in problem.views]))
     assert (cosines.argmax(1) == labels)[shown].mean() > 0.85
 
 
 def test_the_contrast_counts_from_its_step_on(scene):
     config = replace(QUICK, iterations=10, contrast_after=0.5)
-    told, run = Distill(config).start(scene, cameras(3), objects())
-    values = [float(loss_of(config, run, told.views[0], step)[1]["contrast"]) for step in (0, 4, 5, 9)]
+    problem, run = Distill(config).start(scene, cameras(3), objects())
+    values = [float(loss_of(config, run, problem.views[0], step)[1]["contrast"]) for step in (0, 4, 5, 9)]
     assert values[:2] == [0, 0]
     assert values[2] == values[3] > 0
 
 
-def test_memory_of_what_a_view_says_is_counted(scene):
+def test_strips_count_the_memory_of_the_teacher(scene):
     config = replace(QUICK, strip_megabytes=0.4)
     few, _ = Distill(config).start(scene, cameras(3), objects())
     many = few.views[0]._replace(codebook=jnp.zeros((500, DIMENSION)))
@@ -199,24 +200,25 @@ def test_a_few_gaussians_far_out_do_not_make_cells_coarse():
 
 @pytest.mark.usefixtures("x64")
 @pytest.mark.parametrize("megabytes", [256.0, 0.1])
-def test_slopes_by_either_teacher_are_those_of_central_differences(scene, megabytes):
+def test_gradients_are_those_of_central_differences(scene, megabytes):
     def wide(tree):
         return jax.tree.map(lambda a: a.astype(np.float64) if a.dtype == np.float32 else a, tree)
 
     config = replace(QUICK, contrast_after=0.0, strip_megabytes=megabytes)
-    told, run = Distill(config).start(wide(scene), cameras(3), with_maps(objects(), maps()))
-    batch, random = wide(told.views[0]), np.random.default_rng(1)
+    problem, run = Distill(config).start(wide(scene), cameras(3), with_maps(objects(), maps()))
+    batch, random = wide(problem.views[0]), np.random.default_rng(1)
     field = jax.tree.map(lambda a: a + 0.1 * jnp.asarray(random.normal(size=a.shape)), wide(run.params))
-    along = jax.tree.map(lambda a: jnp.asarray(random.normal(size=a.shape)), field)
     loss = jax.jit(lambda f: distill_loss(config)(f, batch, step=0, key=jax.random.key(0))[0])
-    want = sum(
-        (s * d).sum()
-        for s, d in zip(*map(jax.tree.leaves, (jax.jit(jax.grad(loss))(field), along)), strict=True)
-    )
-    ahead, behind = (
-        loss(jax.tree.map(lambda a, d, step=step: a + step * d, field, along)) for step in (1e-6, -1e-6)
-    )
-    np.testing.assert_allclose((ahead - behind) / 2e-6, want, rtol=1e-4)
+    slope = jax.jit(jax.grad(loss))(field)
+    for pick in ("table", "layers", "lift"):
+        along = jax.tree_util.tree_map_with_path(
+            lambda path, a, pick=pick: jnp.asarray(random.normal(size=a.shape)) * (pick in str(path)), field
+        )
+        want = sum((s * d).sum() for s, d in zip(*map(jax.tree.leaves, (slope, along)), strict=True))
+        ahead, behind = (
+            loss(jax.tree.map(lambda a, d, step=step: a + step * d, field, along)) for step in (1e-6, -1e-6)
+        )
+        np.testing.assert_allclose((ahead - behind) / 2e-6, want, rtol=1e-4)
 
 
 THREE = BOOK[:3]
@@ -227,7 +229,7 @@ def mask_of(*labels):
 
 
 @pytest.mark.parametrize(
-    ("masks", "embeddings", "says"),
+    ("masks", "embeddings", "message"),
     [
         ([], [], "masks: expected those of at least one view, found none"),
         ([mask_of(0, 1)], [], "embeddings: expected those of 1 views, found 0"),
@@ -242,12 +244,12 @@ def mask_of(*labels):
         ([mask_of(0, 0)], [THREE * 0], "found none that has an embedding"),
     ],
 )
-def test_teachers_that_cannot_be_are_refused(masks, embeddings, says):
-    with pytest.raises(ValueError, match=says):
+def test_invalid_masks_and_embeddings_are_refused(masks, embeddings, message):
+    with pytest.raises(ValueError, match=message):
         teacher_of_objects(masks, embeddings)
 
 
-def test_objects_that_look_the_same_are_one_thing_and_a_silent_view_is_told():
+def test_objects_with_equal_embeddings_are_one_object_and_a_view_without_masks_is_warned_of():
     rows = np.stack([np.zeros(4), np.eye(4)[0], np.eye(4)[1], np.eye(4)[0]]).astype(np.float32)
     with pytest.warns(UserWarning, match="views without any mask are not used: 1 of 2"):
         teacher = teacher_of_objects([mask_of(0, 1, 2, 3, -1), mask_of(0, 0, 0, 0, 0)], [rows, rows])
@@ -258,7 +260,7 @@ def test_objects_that_look_the_same_are_one_thing_and_a_silent_view_is_told():
 
 
 @pytest.mark.parametrize(
-    ("maps", "says"),
+    ("maps", "message"),
     [
         ([np.zeros((3, 4, 5))], "maps: expected those of 2 views, found 1"),
         ([np.zeros((3, 4, 5)), np.zeros((3, 4, 6))], r"maps of view 1: expected \[h, w, 5\], found float64"),
@@ -269,6 +271,6 @@ def test_objects_that_look_the_same_are_one_thing_and_a_silent_view_is_told():
         ),
     ],
 )
-def test_maps_that_do_not_fit_are_refused(maps, says):
-    with pytest.raises(ValueError, match=says):
+def test_maps_that_do_not_fit_are_refused(maps, message):
+    with pytest.raises(ValueError, match=message):
         teacher_of_maps(maps, [(HEIGHT, WIDTH)] * 2)

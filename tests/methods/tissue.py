@@ -1,4 +1,4 @@
-"""Frames of the built-in tissue, codes for what they show, and a scene that learns them within seconds."""
+"""Frames of the built-in tissue, codes of its classes, and a configuration that trains within seconds."""
 
 from functools import cache
 
@@ -26,13 +26,13 @@ CONFIG = DeformConfig(
 
 @cache
 def tissue():
-    """Every other frame of built-in tissue, tools left out, and what each pixel shows."""
+    """Every other frame of built-in tissue, tools left out, and the class of each pixel."""
     seen = gsjax.open_sequence("simulated:tissue?width=64&height=52&frames=10").select(range(0, 10, 2), (0,))
     return frames_of(seen), Lesson([seen.mask(t, 0) for t in range(seen.num_frames)], CODES)
 
 
 def frames_of(seen):
-    """The first camera's, tools left out."""
+    """Frames of the first camera, tools left out."""
     last = seen.num_frames - 1
     return [
         one_frame(
@@ -48,7 +48,7 @@ def frames_of(seen):
 
 
 def one_frame(image, viewmat, K, time, depth=None, mask=None):
-    """What one camera saw, on the host."""
+    """A frame of one camera, on the host."""
     height, width = image.shape[:2]
     return Frame(
         image[None],

@@ -141,32 +141,25 @@ def scene_facts(result: DeformResult, rows: Sequence[int]) -> SceneFacts:
     Raises:
         ValueError: the scene has no features with a meaning, or there are no frames.
     """
-    if result.meaning is None or result.scene.gaussians.features is None:
-        raise ValueError("features: expected a scene whose features have a meaning, found none")
     if not len(rows):
         raise ValueError("rows: expected at least one frame, found none")
-    timeline, codebook = result.timeline, result.meaning.codebook
+    timeline = result.timeline
     times, frames = timeline.times[list(rows)], timeline.frame_ids[list(rows)].tolist()
-    features = result.scene.at(jnp.asarray(times[0], jnp.float32), result.moving).features
-    assert features is not None
-    likely = np.asarray(prompt_probabilities(features, jnp.asarray(codebook, features.dtype)))
+    likely = np.asarray(result.probabilities(times[0]))
     solid = np.asarray(result.scene.gaussians.opacities) > _LEAST_OPACITY
     labels = np.where(solid, most_likely(likely), -1)
     members = [np.flatnonzero(labels == k) for k in range(len(result.names))]
     points = tuple(some[:: max(1, -(-len(some) // _MOST_POINTS))] for some in members)
-    views = _views(result, rows, jnp.asarray(codebook, jnp.float32), points)
-    facts = facts_of_views(views, result.names, frames, times, metric=timeline.metric)
+    facts = facts_of_views(_views(result, rows, points), result.names, frames, times, metric=timeline.metric)
     return replace(facts, gaussians=np.array([len(some) for some in members]))
 
 
 def _views(
-    result: DeformResult,
-    rows: Sequence[int],
-    codebook: Float[Array, "k c"],
-    points: tuple[Int[np.ndarray, "_"], ...],
+    result: DeformResult, rows: Sequence[int], points: tuple[Int[np.ndarray, "_"], ...]
 ) -> Iterator[LabelledView]:
     """The views of the frames, rendered one at a time."""
-    plan = None
+    assert result.meaning is not None
+    codebook, plan = jnp.asarray(result.meaning.codebook, jnp.float32), None
     for row in rows:
         camera, time = result.camera(row), jnp.asarray(result.timeline.times[row], jnp.float32)
         if plan is None:

@@ -158,15 +158,15 @@ def text_prompt(
         reader = source.encoder() if encoder is None else encoder()
     except ValueError as error:
         raise ValueError(f"{error}; or by a name: {', '.join(meaning.names)}") from error
-    negatives = source.negatives(text) if negatives is None else negatives
-    texts = np.stack([np.asarray(reader.embed_text(one), np.float64) for one in (text, *negatives)])
+    against = source.negatives(text) if negatives is None else negatives
+    texts = np.stack([np.asarray(reader.embed_text(one), np.float64) for one in (text, *against)])
     if texts.shape[1] != len(meaning.basis):
         raise ValueError(
             f"expected texts of {len(meaning.basis)} numbers like these features, found {texts.shape[1]}: "
             "--weights are those of another encoder"
         )
     min_score = reader.min_score if source.kind == "closed" else None
-    return Prompt(_normalized(texts) @ meaning.basis, 0, None, negatives, min_score)
+    return Prompt(_normalized(texts) @ meaning.basis, 0, None, against, min_score)
 
 
 def feature_prompt(meaning: Meaning, feature: Float[np.ndarray, "c"]) -> Prompt:

@@ -1,7 +1,7 @@
 """The method of the drive loop: frames, warm-up, deformation field, moving Gaussians and the graph."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import equinox as eqx
@@ -23,7 +23,7 @@ from gsjax.methods.deform.update import Batch, DeformingScene, Moving, deform_st
 from gsjax.methods.sampling import shuffled_index
 from gsjax.optim.method import Run
 from gsjax.optim.step import Step
-from gsjax.rasterize.plan import HEADROOM, Plan
+from gsjax.rasterize.plan import HEADROOM
 from gsjax.scene.deformation import init_deformation
 from gsjax.scene.frame import Frame
 from gsjax.scene.gaussians import Gaussians, cull_invalid
@@ -142,7 +142,8 @@ class Deform:
             codebook = jnp.asarray(lesson.codebook, jnp.result_type(float))
         timeline = timeline_of(frames) if timeline is None else timeline
         problem = Problem(frames, lesson, seen, ids, codebook, first, radius, bounds, timeline)
-        plans = {PLAN: _plan_for_all(scene.gaussians, seen)}
+        cameras = jax.tree.map(lambda *arrays: jnp.concatenate(arrays), *(frame.cameras for frame in seen))
+        plans = {PLAN: plan_render(scene.gaussians, cameras, headroom=HEADROOM)}
         return problem, Run(scene, self.step.init(scene), plans=plans, kept=Kept())
 
     @property
@@ -276,14 +277,6 @@ def _first_scene(gaussians: Gaussians, config: DeformConfig, frames: int, is_tau
         return scene
     features = jnp.zeros((gaussians.num, config.channels))
     return eqx.tree_at(lambda s: s.gaussians.features, scene, features, is_leaf=lambda leaf: leaf is None)
-
-
-def _plan_for_all(gaussians: Gaussians, frames: Sequence[Frame]) -> Plan:
-    """A plan that holds the scene in every camera."""
-    cameras = [frame.cameras for frame in frames]
-    viewmats, Ks = (jnp.concatenate([getattr(c, name) for c in cameras]) for name in ("viewmat", "K"))
-    together = replace(cameras[0], viewmat=viewmats, K=Ks)
-    return plan_render(gaussians, together, headroom=HEADROOM)
 
 
 def _check(frames: Sequence[Frame], config: DeformConfig, lesson: Lesson | None) -> None:

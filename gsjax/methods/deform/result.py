@@ -48,13 +48,11 @@ class Timeline(NamedTuple):
 
 def timeline_of(frames: Sequence[Frame]) -> Timeline:
     """The timeline of frames alone: numbered from 0, one second long, and metric where any has depth."""
-    camera = frames[0].cameras
-    viewmats, Ks = (
-        np.concatenate([np.asarray(getattr(frame.cameras, name), np.float64) for frame in frames])
-        for name in ("viewmat", "K")
+    cameras = jax.tree.map(
+        lambda *arrays: np.concatenate(arrays).astype(np.float64), *(frame.cameras for frame in frames)
     )
+    view = (cameras.viewmat, cameras.K, (cameras.width, cameras.height), cameras.near)
     metric = any(frame.depths is not None for frame in frames)
-    view = (viewmats, Ks, (camera.width, camera.height), camera.near)
     return Timeline(times_of(frames), np.arange(len(frames)), 1.0, *view, np.zeros(0, int), metric)
 
 

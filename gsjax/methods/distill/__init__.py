@@ -34,9 +34,7 @@ from gsjax.methods.distill.query import (
     gaussian_cosines,
     pixel_cosines,
     pixel_features,
-    pixel_mask,
     relevancy,
-    selection_mask,
     threshold_for,
 )
 from gsjax.methods.distill.result import DistillResult
@@ -69,10 +67,8 @@ __all__ = [
     "majority_labels",
     "pixel_cosines",
     "pixel_features",
-    "pixel_mask",
     "relevancy",
     "rendered_features",
-    "selection_mask",
     "step",
     "teacher_of_maps",
     "teacher_of_objects",

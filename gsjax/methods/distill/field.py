@@ -163,33 +163,3 @@ def full_table(field: FeatureField, rows: Int[np.ndarray, "active"] | None) -> F
     table = field.encoding.table
     full = jnp.zeros((sum(field.encoding.config.entries), table.shape[1]), table.dtype).at[rows].set(table)
     return eqx.tree_at(lambda f: f.encoding.table, field, full)
-
-
-def at_means(
-    field: FeatureField, rows: Int[np.ndarray, "active"] | None, means: Float[Array, "n 3"]
-) -> tuple[FeatureField, Located | None]:
-    """The field of an `active_table`, and the locations of any Gaussians in it. On the host.
-
-    Args:
-        field: the field with the active entries of its table.
-        rows: indices of these entries; None for a vector per Gaussian.
-        means: centres of the Gaussians, metres.
-
-    Raises:
-        ValueError: the field has a vector for each Gaussian, and their number differs.
-    """
-    if not isinstance(field.encoding, FeatureGrid):
-        count = len(field.encoding)
-        if count != len(means):
-            raise ValueError(f"means: expected {count} Gaussians, one per vector, found {len(means)}")
-        return field, None
-    assert rows is not None
-    located = locate(field.encoding, means)
-    indices = np.asarray(located.indices)
-    place = np.minimum(np.searchsorted(rows, indices), len(rows) - 1)
-    # An entry that surrounds no training Gaussian is the row of zeros at the end.
-    place = np.where(rows[place] == indices, place, len(rows))
-    table = field.encoding.table
-    table = jnp.concatenate([table, jnp.zeros((1, table.shape[1]), table.dtype)])
-    field = eqx.tree_at(lambda f: f.encoding.table, field, table)
-    return field, located._replace(indices=jnp.asarray(place, jnp.int32))

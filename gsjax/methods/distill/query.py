@@ -13,7 +13,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
 from gsjax.methods.distill.field import FeatureField, RenderedFeatures, rendered_features
 from gsjax.rasterize.frozen import FrozenView, paint, paint_shown
@@ -24,7 +24,6 @@ TEMPERATURE = 0.1
 EVEN = 0.5
 """The threshold with negatives: the query matches better than each of them."""
 _LEAST_NORM = 1e-12
-_LEAST_ALPHA = 0.5  # below which a pixel shows nothing of the scene
 
 
 class Threshold(NamedTuple):
@@ -133,25 +132,6 @@ def threshold_for(
     from skimage.filters import threshold_otsu  # slow to import; see tests/test_import.py
 
     return Threshold(float(threshold_otsu(scores)), "Otsu")
-
-
-def selection_mask(view: FrozenView, plan: Plan, selected: Bool[Array, "n"]) -> Bool[Array, "height width"]:
-    """Where selected Gaussians contribute more than half of a pixel's light, with occlusion by the others."""
-    share, _ = paint(view, selected.astype(view.opacities.dtype)[:, None], plan)
-    return share[..., 0] > _LEAST_ALPHA
-
-
-def pixel_mask(
-    scores: Float[Array, "height width"], alphas: Float[Array, "height width"], threshold: float
-) -> Bool[Array, "height width"]:
-    """Where the scores of pixels are above the threshold, and their alphas above 1/2.
-
-    Args:
-        scores: scores of pixels.
-        alphas: their alphas.
-        threshold: score above which a pixel is selected.
-    """
-    return (scores > threshold) & (alphas > _LEAST_ALPHA)
 
 
 def _of_gaussians(parts: RenderedFeatures) -> Float[Array, "n r"]:

@@ -8,15 +8,16 @@ from dataclasses import field as default
 from functools import cached_property
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Int
 
-from gsjax.methods.distill.field import FeatureField, at_means, features_of
+from gsjax.methods.distill.field import FeatureField, features_of
 from gsjax.methods.distill.query import gaussian_cosines, relevancy
 from gsjax.methods.protocols import LanguageEncoder
-from gsjax.scene.feature_grid import FeatureGrid, Located
+from gsjax.scene.feature_grid import FeatureGrid, Located, locate
 
 FORMAT = 1
 """Format of field.npz."""
@@ -63,7 +64,20 @@ class DistillResult:
         Raises:
             ValueError: the field has a vector for each Gaussian, and their number differs.
         """
-        return at_means(self.field, self.rows, means)
+        encoding, rows = self.field.encoding, self.rows
+        if not isinstance(encoding, FeatureGrid):
+            if len(encoding) != len(means):
+                raise ValueError(f"means: expected {len(encoding)}, one per vector, found {len(means)}")
+            return self.field, None
+        assert rows is not None
+        located = locate(encoding, means)
+        indices = np.asarray(located.indices)
+        place = np.minimum(np.searchsorted(rows, indices), len(rows) - 1)
+        # An entry that surrounds no training Gaussian is the row of zeros at the end.
+        place = np.where(rows[place] == indices, place, len(rows))
+        table = jnp.pad(encoding.table, ((0, 1), (0, 0)))
+        field = eqx.tree_at(lambda f: f.encoding.table, self.field, table)
+        return field, located._replace(indices=jnp.asarray(place, jnp.int32))
 
     def features(self) -> Float[Array, "n channels"]:
         """The field's feature of each Gaussian; `field.lift` maps it to the teacher's channels."""
