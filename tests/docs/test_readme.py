@@ -1,4 +1,4 @@
-"""The README stays short, and its derivative runs as it stands there; the five programs have test_programs.py."""
+"""The README stays short, and its derivative runs; the five programs have test_programs.py."""
 
 import re
 
