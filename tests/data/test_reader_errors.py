@@ -27,8 +27,8 @@ MESSAGES = Path(__file__).with_name("reader_errors.md")
 PAGE_HEAD = """# Reader errors
 
 Damage that each reader finds. Data that cannot be used raise `DataError`, or another `ValueError` or
-`OSError` (exit code 2 on the command line); data that can be used in part, or with a doubt, give a `DataWarning`. Each
-message names the file, what was expected, what was found, and what to do.
+`OSError` (exit code 2 on the command line); data that can be used in part, or with a doubt, give a
+`DataWarning`. Each message names the file, what was expected, what was found, and what to do.
 `python -m tests.data.test_reader_errors` writes this page.
 
 layout | error | warning, the rest is used | warning, all is used
