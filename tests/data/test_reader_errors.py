@@ -26,20 +26,22 @@ PAGE = Path(__file__).parents[2] / "docs" / "data-errors.md"
 MESSAGES = Path(__file__).with_name("reader_errors.md")
 PAGE_HEAD = """# Reader errors
 
-Damage that each reader finds. Unusable data raise `DataError`, or another `ValueError` or `OSError` (exit code 2
-on the command line); doubtful or partly usable data give a `DataWarning`. Each message names the file, what was
-expected, what was found, and what to do. `python -m tests.data.test_reader_errors` writes this page.
+Damage that each reader finds. Data that cannot be used raise `DataError`, or another `ValueError` or
+`OSError` (exit code 2 on the command line); data that can be used in part, or with a doubt, give a
+`DataWarning`. Each message names the file, what was expected, what was found, and what to do.
+`python -m tests.data.test_reader_errors` writes this page.
 
 layout | error | warning, the rest is used | warning, all is used
 --- | --- | --- | ---
 """
 HEAD = """# Messages of readers
 
-Messages for damaged or incomplete data. `DATA` is the folder, `FILE` the path of the damaged file, `...` a size
-or another library's words. Messages that differ only in names and numbers are listed once.
+Messages for damaged or incomplete data, as readers word them. `DATA` is the folder, `FILE` the path of the
+file at fault, `...` a size or another library's words. Messages that differ only in names and numbers are
+listed once.
 
-*Rest used* and *all used* mark warnings (`DataWarning`). `python -m tests.data.test_reader_errors` writes this
-file; a test compares it.
+*Rest used* and *all used* mark warnings (`DataWarning`). `python -m tests.data.test_reader_errors` writes
+this file; a test compares it.
 """
 SHARED = "Several layouts"
 
@@ -101,15 +103,15 @@ def found_in(scratch: Path) -> list[tuple[str, Case]]:
 
 _USED = {(True, True): "", (True, False): "", (False, True): "rest used", (False, False): "all used"}
 
+_COLUMNS = ("", "rest used", "all used")
+
 
 def page(found: list[tuple[str, Case]]) -> str:
     """docs/data-errors.md: the faults of each layout."""
     rows = []
     for layout in LAYOUTS:
-        of = {
-            used: [case.what for u, case in found if (u, case.layout) == (used, layout)] for used, _ in found
-        }
-        cells = ("; ".join(dict.fromkeys(of.get(used, ()))) for used in ("", "rest used", "all used"))
+        mine = [(used, case.what) for used, case in found if case.layout == layout]
+        cells = ("; ".join(what for used, what in mine if used == column) for column in _COLUMNS)
         rows.append(" | ".join((layout, *cells)).rstrip() + "\n")
     return PAGE_HEAD + "".join(rows)
 

@@ -1,5 +1,5 @@
 """The five programs of a researcher: the same in README.md and on their pages, in the same words, and run, with
-fewer frames and steps."""
+fewer steps."""
 
 import re
 from dataclasses import replace
@@ -29,7 +29,7 @@ SHORTER = {
     "distill": {"steps=500, cap=5000": "steps=4, cap=300", "iterations=200": "iterations=3"},
     "deform": {"warmup=100, iterations=200": "warmup=2, iterations=3, nodes=64"},
 }
-"""What a program is given to do here, for what it says; it compiles the same steps."""
+"""Less to do for each program: text of it, and what stands for it here."""
 
 
 def program(verb: str) -> Block:
