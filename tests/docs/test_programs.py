@@ -1,5 +1,5 @@
-"""The five programs of a researcher: the same in README.md and on their pages, in the same words, and run, with
-fewer steps."""
+"""The five programs of a researcher: the same in README.md and on their pages, in the same words, and run
+with fewer steps."""
 
 import re
 from dataclasses import replace
