@@ -113,7 +113,7 @@ def test_depth_that_is_all_zero(refused, recording):
     said = refused(recording)
     assert said.count("warning:") == 1
     assert "no pixel has a valid depth" in said
-    assert "no valid depth in any camera" in said
+    assert "depths: expected positive values in the first frame, found none in any camera" in said
 
 
 def test_pose_that_is_no_rotation(refused, recording):

@@ -282,7 +282,7 @@ class TestMistakes:
     def test_a_tracker_that_refines_nothing_has_no_use_for_one(self, table, started, config):
         _, frames, _ = table()
         without = replace(config, refine=replace(config.refine, iterations=0))
-        with pytest.raises(ValueError, match=r"extra_losses: expected none where config\.refine\.iterations"):
+        with pytest.raises(ValueError, match=r"extra_losses: expected none with config\.refine\.iterations"):
             next(track(started, frames[0], frames[1:], without, extra_losses=(nothing,)))
         with pytest.raises(ValueError, match="extra_losses: expected none under budget_ms"):
             next(track(started, frames[0], frames[1:], config, budget_ms=50.0, extra_losses=(nothing,)))
