@@ -95,6 +95,6 @@ def test_bad_input_says_what_is_wrong(table):
     empty = eqx.tree_at(lambda f: f.depths, first, jnp.zeros_like(first.depths))
     with (
         pytest.warns(UserWarning, match="no pixel is positive"),
-        pytest.raises(ValueError, match="expected positive values in the first frame, found none in any camera"),
+        pytest.raises(ValueError, match="depths: expected positive values in the first frame"),
     ):
         labelled_cloud(empty, mask, 0, START)
