@@ -58,11 +58,11 @@ class Options(Common):
     run: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
     """Folder of a run of `gsjax fit`, finished or stopped."""
     views: Literal["held-out", "train", "all"] = "held-out"
-    """Which photographs to score: those that the fit never saw, those that it was fitted to, or both."""
+    """Which photographs to score: held-out ones, training ones, or both."""
     images: str | None = None
-    """Where the photographs are now; where they were for the fit, unless given."""
+    """Present location of the photographs; default: where the fit found them."""
     lpips_weights: Path | None = None
-    """Weights of LPIPS, a .npz or .safetensors file or a folder of them; without, there is no LPIPS."""
+    """Weights of LPIPS, a .npz or .safetensors file or a folder of them; without them LPIPS is not scored."""
 
 
 class Chosen(NamedTuple):
