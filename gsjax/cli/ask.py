@@ -1,4 +1,4 @@
-"""`gsjax ask`: questions on a deforming scene in plain English, answered by what is measured of it."""
+"""`gsjax ask`: questions about a deforming scene in plain English, answered from its measurements."""
 
 import json
 from dataclasses import dataclass
@@ -26,8 +26,8 @@ from gsjax.methods.deform import (
 )
 
 HELP = (
-    ' As in `gsjax ask RUN "how far is the tool from the tissue in frame 12?"`; without a question it says '
-    "what can be asked. The run is to know what is what: `gsjax deform DATASET --tools draw --out RUN`."
+    ' As in `gsjax ask RUN "how far is the tool from the tissue in frame 12?"`; without a question it lists '
+    "what can be asked. The run needs features with a meaning: `gsjax deform DATASET --tools draw --out RUN`."
 )
 
 
@@ -38,13 +38,13 @@ class Options(Common):
     run: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
     """Folder of a run of `gsjax deform`."""
     question: Annotated[str | None, tyro.conf.Positional, tyro.conf.arg(metavar="[QUESTION]")] = None
-    """In plain English. Unless given, what can be asked is listed."""
+    """The question, in plain English (default: list what can be asked)."""
     json: bool = False
     """Print JSON: the answer, its value and unit, and the facts that it rests on."""
 
 
 def run(options: Options) -> int:
-    """Answer a question, or say what can be asked; returns the exit code.
+    """Answer a question, or list what can be asked; returns the exit code.
 
     Raises:
         ValueError, OSError: there is no such run, it has no meaning, or the question cannot be answered.
@@ -66,7 +66,7 @@ def run(options: Options) -> int:
         return 0
     asked = parse_question(options.question, result.names)
     rows = rows_of(asked, result.timeline.frame_ids.tolist())
-    with stage(console, f"looking at {_in_words(result, rows)}"):
+    with stage(console, f"measuring {_in_words(result, rows)}"):
         facts = facts_of_run(result, rows)
     answer = TemplatedAnswerer()(options.question, facts)
     if options.json:
@@ -83,11 +83,11 @@ def run(options: Options) -> int:
 
 
 def facts_of_run(result: DeformResult, rows: list[int]) -> SceneFacts:
-    """Facts of some of a run's frames; of the first too, where its depth is the unit of lengths.
+    """Facts about some of a run's frames, and about the first where its depth is the unit of lengths.
 
     Args:
         result: a scene with a meaning.
-        rows: of its frames, 0 to T - 1.
+        rows: indices of the frames.
     """
     assert result.meaning is not None
     if not result.timeline.metric and 0 not in rows:
@@ -101,7 +101,7 @@ def facts_of_run(result: DeformResult, rows: list[int]) -> SceneFacts:
 
 
 def _used(asked: Question, facts: SceneFacts) -> dict[str, Any]:
-    """The facts that an answer rests on."""
+    """The facts on which an answer rests."""
     steps = zip(range(len(facts.frames)), range(1, len(facts.frames)), strict=False)
     return {
         "unit": facts.unit,
@@ -112,7 +112,7 @@ def _used(asked: Question, facts: SceneFacts) -> dict[str, Any]:
 
 
 def _in_words(result: DeformResult, rows: list[int]) -> str:
-    """Which frames are looked at."""
+    """The frames that are measured, in words."""
     frames = [str(result.timeline.frame_ids[row]) for row in rows]
     if len(rows) == 1:
         return f"frame {frames[0]}"

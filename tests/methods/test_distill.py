@@ -28,13 +28,12 @@ from gsjax.methods.distill import (
     pixel_features,
     pixel_mask,
     pseudo_inverse,
-    relevancy,
     rendered_features,
     selection_mask,
     teacher_of_maps,
     teacher_of_objects,
-    threshold_for,
 )
+from gsjax.methods.query import relevancy, threshold_for
 from gsjax.rasterize.frozen import paint, paint_shown
 from gsjax.scene.feature_grid import FeatureGridConfig, locate
 from gsjax.scene.gaussians import gaussians_from_activated

@@ -12,11 +12,11 @@ from rich.console import Console
 from rich.progress import track
 
 from gsjax.engine.pictures import frame_rate
-from gsjax.engine.selected import Changes
+from gsjax.engine.query import Changes, Selection, write_mask
 from gsjax.geometry.cameras import Camera
 from gsjax.io.pictures import write_png
 from gsjax.io.video import VideoWriter
-from gsjax.methods.deform import DeformResult, Wanted
+from gsjax.methods.deform import DeformResult
 from gsjax.methods.deform.query import most_likely, prompt_probabilities
 from gsjax.rasterize.plan import Plan
 from gsjax.scene.gaussians import Gaussians
@@ -36,7 +36,8 @@ class _Seen(NamedTuple):
     """A frame of the scene.
 
     Attributes:
-        t: which.
+        t: its index.
+        number: the recording's own number of it.
         gaussians: there and then.
         camera: that saw it.
         plan: that held it.
@@ -46,6 +47,7 @@ class _Seen(NamedTuple):
     """
 
     t: int
+    number: int
     gaussians: Gaussians
     camera: Camera
     plan: Plan
@@ -58,39 +60,37 @@ def draw(
     folder: Path,
     result: DeformResult,
     pictured: Sequence[int],
-    wanted: Wanted,
-    threshold: float,
+    found: Selection,
     changes: Changes,
     console: Console,
 ) -> dict[str, int]:
-    """Writes masks/FRAME.png and frames/FRAME.png of some frames, and video.mp4 of all: the scene beside the
-    scene without what is meant.
+    """Writes masks/FRAME.png (255 where a pixel's own features match) and frames/FRAME.png of some frames,
+    and video.mp4 of all: the scene beside the scene without what was found.
 
     Args:
-        folder: for them.
+        folder: for the pictures.
         result: the scene.
         pictured: indices of the frames.
-        wanted: what is looked for.
-        threshold: of the score of a Gaussian, and of a pixel.
-        changes: edits of what is meant.
-        console: shows progress.
+        found: the result of the query; its threshold holds for Gaussians and for pixels.
+        changes: changes to what was found.
+        console: shows the progress.
 
     Returns:
         The number of pixels of each mask.
     """
     pixels: dict[str, int] = {}
+    wanted, threshold = found.wanted, found.threshold.value
     with VideoWriter(folder / "video.mp4", _frame_rate(result)) as video:
         for seen in _frames(result, console):
             assert seen.gaussians.features is not None
             selected = wanted.scores(seen.gaussians.features) > threshold
-            both = {f"frame {result.timeline.frame_ids[seen.t]}": to_uint8(seen.colors)}
+            both = {f"frame {seen.number}": to_uint8(seen.colors)}
             both["without it"] = _picture(hidden(seen.gaussians, selected), seen)
             video.write(in_rows(both, 2, _PANEL_HEIGHT))
             if seen.t in pictured:
-                name = f"{result.timeline.frame_ids[seen.t]:06d}"
+                name = f"{seen.number:06d}"
                 mask = (np.asarray(wanted.scores(seen.features)) > threshold) & seen.there
-                write_png(folder / "masks" / f"{name}.png", np.where(mask, 255, 0).astype(np.uint8))
-                pixels[name] = int(mask.sum())
+                pixels[name] = write_mask(folder, name, mask)
                 scenes = {"it alone": hidden(seen.gaussians, ~selected)}
                 changed = changes.of(seen.gaussians, np.asarray(selected))
                 scenes |= {_WORDS[edit]: scene for edit, scene in changed.items()}
@@ -106,10 +106,10 @@ def draw_labels(
     beside what each pixel most likely is.
 
     Args:
-        folder: for them.
+        folder: for the pictures.
         result: of a run.
         pictured: indices of the frames.
-        console: shows progress.
+        console: shows the progress.
 
     Returns:
         By frame, the share of the picture that each name has.
@@ -123,12 +123,10 @@ def draw_labels(
             labels = np.where(seen.there, 1 + most_likely(likely), 0)
             colors = to_uint8(seen.colors)
             over = overlay_labels(colors, labels)
-            panel = in_rows(
-                {f"frame {result.timeline.frame_ids[seen.t]}": colors, "what is what": over}, 2, _PANEL_HEIGHT
-            )
+            panel = in_rows({f"frame {seen.number}": colors, "what is what": over}, 2, _PANEL_HEIGHT)
             video.write(panel)
             if seen.t in pictured:
-                name = f"{result.timeline.frame_ids[seen.t]:06d}"
+                name = f"{seen.number:06d}"
                 write_png(folder / "masks" / f"{name}.png", labels.astype(np.uint8))
                 write_png(folder / "frames" / f"{name}.png", panel)
                 shares[name] = {
@@ -150,7 +148,8 @@ def _frames(result: DeformResult, console: Console) -> Iterator[_Seen]:
         drawn, plan = render_with_room(gaussians, camera, plan)
         assert drawn.features is not None
         there = np.asarray(drawn.alphas[0]) > _OPAQUE
-        yield _Seen(t, gaussians, camera, plan, np.asarray(drawn.colors[0]), drawn.features[0], there)
+        scene, number = (gaussians, camera, plan), int(result.timeline.frame_ids[t])
+        yield _Seen(t, number, *scene, np.asarray(drawn.colors[0]), drawn.features[0], there)
 
 
 def _picture(gaussians: Gaussians, seen: _Seen) -> np.ndarray:

@@ -5,19 +5,20 @@ All are drawn by one program for each size of picture, with one colour a Gaussia
 than drawing. What is not to be seen is hidden, not left out, so the number of Gaussians is the same.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 from rich.console import Console
 from rich.progress import track
 
 from gsjax.engine.distill.saved import FieldRun, short_names
 from gsjax.engine.messages import Notes, describe
+from gsjax.engine.query import Changes, Selection, write_mask
 from gsjax.geometry.cameras import Camera, camera_centers
 from gsjax.geometry.spherical_harmonics import evaluate_sh
 from gsjax.io.pictures import write_png
@@ -37,10 +38,8 @@ def draw(
     folder: Path,
     run: FieldRun,
     which: Sequence[int],
-    selected: Bool[np.ndarray, "n"],
-    scores: Float[np.ndarray, "n"],
-    threshold: float,
-    scenes: Mapping[str, Gaussians],
+    found: Selection,
+    changes: Changes,
     notes: Notes,
     console: Console,
 ) -> dict[str, int]:
@@ -50,17 +49,16 @@ def draw(
         folder: for the pictures.
         run: the field and its scene.
         which: indices of its photographs.
-        selected: the Gaussians that were found; a pixel shows them if more than half of its light is theirs.
-        scores: of all Gaussians.
-        threshold: of the scores, marked on their scale.
-        scenes: changed scenes by name.
+        found: the result of the query; a pixel shows the selected Gaussians if more than half of its light is
+            theirs.
+        changes: changes to them.
         notes: receives warnings of photographs that cannot be read.
         console: shows the progress.
 
     Returns:
         Number of pixels in each mask.
     """
-    photographs = run.photographs
+    photographs, selected, scores = run.photographs, found.selected, found.scores
     drawer = Drawer(antialiased=run.rasterize_mode == "antialiased", compiler_options=host_options())
     assert photographs is not None
     names, pixels = short_names(photographs.names), {}
@@ -72,8 +70,7 @@ def draw(
     for v in track(which, "drawing", console=console, transient=True):
         drawn = drawer(values, _one(photographs.camera(v))).colors
         mask = drawn[..., 0] > _MOST
-        write_png(folder / "masks" / f"{names[v]}.png", np.where(mask, 255, 0).astype(np.uint8))
-        pixels[names[v]] = int(mask.sum())
+        pixels[names[v]] = write_mask(folder, names[v], mask)
         if best is None or mask.mean() > best[0]:
             best = (float(mask.mean()), v, drawn)
     assert best is not None
@@ -82,13 +79,14 @@ def draw(
     shown = {"the object alone": hidden(run.gaussians, ~there)}
     if not selected.all():
         shown["without it"] = hidden(run.gaussians, there)
-    shown |= {_WORDS[name]: scene for name, scene in scenes.items()}
+    shown |= {_WORDS[name]: scene for name, scene in changes.of(run.gaussians, selected).items()}
     behind_is = "photograph"
     try:
         behind = photographs.image(v)
     except (ValueError, OSError) as error:
         notes.warn(f"overview.png shows a render in place of a photograph: {describe(error)}")
         behind_is, behind = "scene", to_uint8(drawer(_seen_from(run.gaussians, camera), camera).colors)
+    threshold = found.threshold.value
     scale = enlarged(heat(drawn[..., 1]), _PANEL_HEIGHT)
     panels = {
         f"found in view {names[v]}": highlight(behind, drawn[..., 0] > _MOST, _MARK),

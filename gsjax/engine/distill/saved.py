@@ -28,7 +28,7 @@ _OF_IMAGES = ("images", "scale", "frames", "cameras", "eval_cameras", "test_ever
 
 @dataclass(frozen=True)
 class Whereabouts:
-    """Where the things are now that a field belongs to (default: where they were).
+    """Current places of a field's scene, photographs and encoder (default: where they were).
 
     Attributes:
         scene: the scene's PLY file.

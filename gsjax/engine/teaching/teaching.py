@@ -1,4 +1,4 @@
-"""The teacher of photographs (frames of one camera are photographs too): their masks, and features of these."""
+"""The teacher of photographs, frames of a recording among them: their masks, and the features of these."""
 
 import warnings
 from collections.abc import Mapping, Sequence

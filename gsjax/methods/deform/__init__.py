@@ -37,7 +37,7 @@ from gsjax.methods.deform.graph import (
     graph_of,
     seen_ids,
 )
-from gsjax.methods.deform.meaning import Lesson, Meaning, Wanted, counted_ids, wanted_like, wanted_text
+from gsjax.methods.deform.meaning import Lesson, Meaning, counted_ids, wanted_like, wanted_text
 from gsjax.methods.deform.method import Deform, Kept, Problem, batch_of, with_field
 from gsjax.methods.deform.nodes import nodes_of
 from gsjax.methods.deform.poses import refined_viewmats, times_of
@@ -80,7 +80,6 @@ __all__ = [
     "Sight",
     "TemplatedAnswerer",
     "Timeline",
-    "Wanted",
     "batch_of",
     "can_start_from",
     "counted_ids",

@@ -1,26 +1,12 @@
 """Gaussians of a deforming scene that a prompt means (SurstSplat, section 2.4; GaussianClin, section 3.4)."""
 
-from typing import NamedTuple
-
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-_LEAST_NORM = 1e-6
+from gsjax.methods.query import directions
+
 _LITTLE = 0.5  # of a pixel's light that the scene must send, on average
-
-
-class Prompt(NamedTuple):
-    """A prompt and its alternatives.
-
-    Attributes:
-        vectors: in the scene's channels, a row a candidate.
-        row: of the prompt.
-    """
-
-    vectors: Float[np.ndarray, "k c"]
-    row: int
 
 
 def prompt_probabilities(
@@ -37,19 +23,7 @@ def prompt_probabilities(
             is the mean of the features rendered there.
         temperature: of the softmax.
     """
-    return jax.nn.softmax(prompt_cosines(features, _directions(prompts)) / temperature, axis=-1)
-
-
-def prompt_cosines(features: Float[Array, "*n c"], directions: Float[Array, "k c"]) -> Float[Array, "*n k"]:
-    """Cosines of features, whatever their length, and vectors that have length 1 in the space that they come
-    from; 0 for features without length."""
-    return _directions(features) @ directions.T
-
-
-def _directions(features: Float[Array, "*n c"]) -> Float[Array, "*n c"]:
-    squared = jnp.sum(features**2, axis=-1, keepdims=True)
-    there = squared > _LEAST_NORM**2
-    return jnp.where(there, features / jnp.sqrt(jnp.where(there, squared, 1.0)), 0.0)
+    return jax.nn.softmax(directions(features) @ directions(prompts).T / temperature, axis=-1)
 
 
 def most_likely(probabilities: Float[np.ndarray, "*n k"]) -> Int[np.ndarray, "*n"]:
@@ -90,12 +64,3 @@ def region_feature(
     if alphas[region].mean() < _LITTLE:
         raise ValueError("expected something of the scene, found nothing there")
     return drawn[region].mean(axis=(0, 1))
-
-
-def like_feature(feature: Float[np.ndarray, "c"], codebook: Float[np.ndarray, "k c"]) -> Prompt:
-    """A prompt for what has a feature, in place of the code that is the most like it; the other codes are its
-    alternatives."""
-    probabilities = np.asarray(prompt_probabilities(jnp.asarray(feature), jnp.asarray(codebook)))
-    row, vectors = int(probabilities.argmax()), np.array(codebook)
-    vectors[row] = feature
-    return Prompt(vectors, row)

@@ -99,12 +99,12 @@ class DeformResult:
         negatives: tuple[str, ...] | None = None,
         encoder: Callable[[], LanguageEncoder] | None = None,
     ) -> Float[Array, "n"]:
-        """Scores of Gaussians for a text, at a time; see `Wanted.scores`.
+        """Scores of Gaussians for a text, at a time; see `gsjax.methods.query.Wanted.scores`.
 
         Args:
             text: one of `names`, or what the encoder of the features reads.
             time: 0 to 1; of no matter unless features change over time.
-            negatives: texts that it is held against (default: the encoder's own). Of no use for names.
+            negatives: texts to compare with (default: the encoder's own). Of no use for names.
             encoder: loads the encoder that reads texts (default: that of the features).
 
         Raises:

@@ -9,7 +9,7 @@ scores = now.result.scores(vectors)
 config.py   what can be set                 update.py  the loss, and one step
 teacher.py  features of pixels to learn     method.py  what the loop has to know
 field.py    hash grid and convolution       result.py  the field with its queries
-query.py    scores of Gaussians and pixels
+query.py    cosines of Gaussians and pixels
 inverse.py  from the teacher's channels back to the field's
 votes.py    labels by majority, the baseline
 """
@@ -26,16 +26,13 @@ from gsjax.methods.distill.field import (
 from gsjax.methods.distill.inverse import learned_inverse, pseudo_inverse
 from gsjax.methods.distill.method import Distill, Problem, frozen_views
 from gsjax.methods.distill.query import (
-    Threshold,
     back_projected_cosines,
     gaussian_cosines,
     painted_cosines,
     pixel_cosines,
     pixel_features,
     pixel_mask,
-    relevancy,
     selection_mask,
-    threshold_for,
 )
 from gsjax.methods.distill.result import DistillResult
 from gsjax.methods.distill.teacher import Teacher, teacher_of_maps, teacher_of_objects, with_maps
@@ -53,7 +50,6 @@ __all__ = [
     "FeatureField",
     "Problem",
     "Teacher",
-    "Threshold",
     "active_table",
     "back_projected_cosines",
     "distill_loss",
@@ -70,12 +66,10 @@ __all__ = [
     "pixel_features",
     "pixel_mask",
     "pseudo_inverse",
-    "relevancy",
     "rendered_features",
     "selection_mask",
     "step",
     "teacher_of_maps",
     "teacher_of_objects",
-    "threshold_for",
     "with_maps",
 ]

@@ -6,14 +6,11 @@ that takes q to the field's own channels, is there for comparison: the pseudo-in
 (`gsjax.methods.distill.inverse`).
 
 Against negatives a score is the share of the query in a softmax of two, with the negative that takes most of
-it (Kerr et al. 2023, "LERF", section 3.4): 1/2 where both fit equally well.
+it: `gsjax.methods.query`.
 """
-
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from gsjax.methods.distill.field import FeatureField, RenderedFeatures, rendered_features
@@ -21,18 +18,8 @@ from gsjax.rasterize.frozen import FrozenView, paint, paint_shown
 from gsjax.rasterize.plan import Plan
 from gsjax.scene.feature_grid import Located
 
-TEMPERATURE = 0.1
-EVEN = 0.5
-"""The threshold against negatives: the query fits better than each of them."""
 _LEAST_NORM = 1e-12
 _OPAQUE = 0.5  # a pixel to which the scene sends less of its light shows nothing
-
-
-class Threshold(NamedTuple):
-    """Score above which something is selected, and the rule that it comes from."""
-
-    value: float
-    rule: str
 
 
 def gaussian_cosines(
@@ -117,42 +104,6 @@ def back_projected_cosines(
     features = parts.channels_of(rendered)
     back = jnp.matmul(queries, inverse.T, precision="highest")
     return jnp.matmul(_normalised(features), _normalised(back).T, precision="highest")
-
-
-def relevancy(cosines: Float[Array, "*n q"], temperature: float = TEMPERATURE) -> Float[Array, "*n"]:
-    """The first query's score: its cosine where it is alone, else its least share against one of the others.
-
-    Args:
-        cosines: those of the query, then those of negatives.
-        temperature: difference of cosines at which the shares are e : 1.
-    """
-    if cosines.shape[-1] == 1:
-        return cosines[..., 0]
-    ahead = cosines[..., 0] - cosines[..., 1:].max(axis=-1)
-    return jax.nn.sigmoid(ahead / temperature)
-
-
-def threshold_for(
-    scores: Float[np.ndarray, "n"], against_negatives: bool, given: float | None = None
-) -> Threshold:
-    """The given threshold; 1/2 against negatives; else Otsu's, which divides the scores into two classes with
-    the least variance within each. On the host.
-
-    Args:
-        scores: of Gaussians.
-        against_negatives: whether the scores are shares against negatives.
-        given: threshold to use (default: by the rules above).
-    """
-    if given is not None:
-        return Threshold(float(given), "given")
-    if against_negatives:
-        return Threshold(EVEN, "better than each negative")
-    scores = scores[np.isfinite(scores)]
-    if not len(scores) or scores.max() - scores.min() < 1e-6:
-        return Threshold(float("inf"), "Otsu; all scores are alike")
-    from skimage.filters import threshold_otsu  # slow to import
-
-    return Threshold(float(threshold_otsu(scores)), "Otsu")
 
 
 def selection_mask(view: FrozenView, plan: Plan, selected: Bool[Array, "n"]) -> Bool[Array, "height width"]:

@@ -14,8 +14,9 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Int
 
 from gsjax.methods.distill.field import FeatureField, at_means, features_of
-from gsjax.methods.distill.query import gaussian_cosines, relevancy
+from gsjax.methods.distill.query import gaussian_cosines
 from gsjax.methods.protocols import LanguageEncoder
+from gsjax.methods.query import read_text, relevancy
 from gsjax.scene.feature_grid import FeatureGrid, Located
 
 FORMAT = 1
@@ -110,33 +111,8 @@ class DistillResult:
             ValueError: the encoder is not known, does not read the text, or made other features.
             FileNotFoundError: the encoder's weights are not there.
         """
-        return self.scores(self.text_vectors(text, negatives, encoder)[0])
-
-    def text_vectors(
-        self,
-        text: str,
-        negatives: tuple[str, ...] | None = None,
-        encoder: LanguageEncoder | None = None,
-    ) -> tuple[Float[np.ndarray, "q d"], tuple[str, ...]]:
-        """The vectors of a text and of negatives, as `scores` takes them, and the negatives.
-
-        Args:
-            text, negatives, encoder: as for `query`.
-
-        Raises:
-            ValueError, FileNotFoundError: as for `query`.
-        """
-        if encoder is None and self.source is None:
-            raise ValueError(
-                "encoder: expected one that reads texts in the space of this field's features, found none, "
-                "and the source of the features is not known; give one, or use `scores`"
-            )
-        reader: LanguageEncoder = self.source.encoder() if encoder is None else encoder
-        if negatives is not None:
-            against = tuple(negatives)
-        else:
-            against: tuple[str, ...] = () if self.source is None else tuple(self.source.negatives(text))
-        return np.stack([reader.embed_text(one) for one in (text, *against)]), against
+        reader = None if encoder is None else lambda: encoder
+        return self.scores(read_text(self.source, text, negatives, reader).vectors)
 
     def write(self, path: str | os.PathLike) -> None:
         """Write field.npz, which `gsjax query` and `gsjax view` read beside the scene.

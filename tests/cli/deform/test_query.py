@@ -21,12 +21,12 @@ from gsjax.engine.deform.file import read_deformation, write_deformation
 from gsjax.engine.folder import RunFolder
 from gsjax.engine.messages import Notes
 from gsjax.engine.teaching.choice import TeacherChoice
+from gsjax.engine.teaching.source import Source
 from gsjax.engine.viewables import open_viewable
 from gsjax.io.ply import read_ply, write_ply
 from gsjax.io.video import read_video_frames
-from gsjax.methods.deform import Deform, DeformConfig, Kept, with_field
+from gsjax.methods.deform import Deform, DeformConfig, Kept, Meaning, wanted_like, with_field
 from gsjax.methods.deform.query import (
-    like_feature,
     most_likely,
     prompt_probabilities,
     region_feature,
@@ -153,10 +153,10 @@ def test_without_a_prompt_all_are_named(gsjax, run):
         (("--box", "9,9,3"), "--box: expected X0,Y0,X1,Y1 in pixels, found '9,9,3'"),
         (("tool", "--frame", 10), "--frame: expected one of 0 to 9, found 10"),
         (("tool", "--frames", "20:"), "--frames: 20: holds no frame of the run, which has 10"),
-        (("tool", "--threshold", 1), "--threshold: expected 0 to below 1"),
+        (("tool", "--threshold", 1), "--threshold: expected a finite number below 1"),
         (("tool", "--threshold", 0.99999), "best score"),
         (("tool", "--camera", 1), "--camera: a run of `gsjax deform` has no use for it"),
-        (("tool", "--negatives", "tissue"), "--negatives: a name is held against"),
+        (("tool", "--negatives", "tissue"), "--negatives: a name is compared with"),
         (("--point", "3,3", "--negatives", "tissue"), "--negatives: expected a TEXT too"),
         (("tool", "--image", "x.png"), "--image: a run of `gsjax deform` has no use for it"),
         (("tool", "--min-score", 0.1), "--min-score: a run of `gsjax deform` has no use for it"),
@@ -246,11 +246,12 @@ def test_features_that_change_are_those_of_the_frame(run):
 def test_a_prompt_of_a_feature_is_told_apart_from_the_other_names():
     rng = np.random.default_rng(0)
     codebook = np.linalg.qr(rng.normal(size=(6, 6)))[0][:3]
-    prompt = like_feature(0.2 * (codebook[2] + 0.4 * codebook[0]), codebook)
-    assert prompt.row == 2
-    np.testing.assert_array_equal(prompt.vectors[:2], codebook[:2])
-    said = np.asarray(prompt_probabilities(jnp.asarray(codebook), jnp.asarray(prompt.vectors)))
-    np.testing.assert_array_equal(most_likely(said), [0, 1, 2])
+    meaning = Meaning(Source("files"), ("a", "b", "c"), codebook, np.eye(6))
+    wanted = wanted_like(meaning, 0.2 * (codebook[2] + 0.4 * codebook[0]))
+    assert (wanted.meant, wanted.against) == ("c", ("a", "b"))
+    np.testing.assert_allclose(wanted.vectors[1:], codebook[:2], atol=1e-12)
+    said = np.asarray(prompt_probabilities(jnp.asarray(codebook), jnp.asarray(wanted.vectors)))
+    np.testing.assert_array_equal(most_likely(said), [1, 2, 0])
     np.testing.assert_array_equal(most_likely(np.full((2, 3), 1 / 3)), [-1, -1])
 
 

@@ -239,8 +239,8 @@ def test_clip_teaches_and_reads(tmp_path, request, monkeypatch):
 def test_classes_are_named_and_nothing_else():
     names = ("tissue", "tool")
     meaning = Meaning(Source("classes", dict(enumerate(names, 1))), names, np.eye(2), np.eye(5, 2))
-    assert wanted_text(meaning, "Tool").row == 1
-    with pytest.raises(ValueError, match="--negatives: a name is held against the other names"):
+    assert wanted_text(meaning, "Tool").meant == "tool"
+    with pytest.raises(ValueError, match="--negatives: a name is compared with the other names"):
         wanted_text(meaning, "tool", ("x",))
     with pytest.raises(ValueError, match="no class 'forceps'"):
         wanted_text(meaning, "forceps")
