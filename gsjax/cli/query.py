@@ -13,14 +13,15 @@ from rich.console import Console
 from gsjax.engine.deform.file import NAME as DEFORMATION
 from gsjax.engine.deform.file import read_deformation, warn_of_partial
 from gsjax.engine.deform.query import QueryableScene, label_everything
+from gsjax.engine.distill.file import FOLDER
 from gsjax.engine.distill.query import QueryableField
-from gsjax.engine.distill.saved import Whereabouts, field_of, open_field_run, unfinished_field_of
+from gsjax.engine.distill.saved import Whereabouts, field_of, open_field_run
 from gsjax.engine.folder import expect_folder, is_run
 from gsjax.engine.messages import Notes, describe, stage
 from gsjax.engine.options import Common, ObjectText
 from gsjax.engine.program import USER_ERRORS
 from gsjax.engine.query import Changes, Question, answer
-from gsjax.engine.records import read_config, read_record
+from gsjax.engine.records import kind_of
 from gsjax.engine.track.query import ObjectQuery, ask_for_object
 
 HELP = (
@@ -150,24 +151,18 @@ def _expect_none_of(reason: str, *groups: Any) -> None:
 
 def _expect_track(path: Path) -> None:
     """Raises a ValueError where a run has no field (yet), and is not a run of `gsjax track` either."""
-    unfinished = unfinished_field_of(path)
-    if unfinished is not None:
-        raise ValueError(
-            f"{unfinished}: expected field.npz, found none yet: it is still being distilled, or was killed; "
-            "then gsjax distill goes on with --resume"
-        )
-    if not is_run(path):
-        return
-    if "deform" in read_config(path / "config.yml"):
+    for folder in (path, path / FOLDER):
+        if kind_of(folder) == "distill":
+            raise ValueError(
+                f"{folder}: expected field.npz, found none yet: it is still being distilled, or was killed; "
+                "then gsjax distill goes on with --resume"
+            )
+    if kind_of(path) == "deform":
         raise ValueError(
             f"{path}: expected {DEFORMATION}, found none yet: it is still being reconstructed, or "
             "was killed; then gsjax deform goes on with --resume"
         )
-    try:
-        kind = read_record(path).kind
-    except ValueError:
-        kind = "another"
-    if kind != "track":
+    if is_run(path) and kind_of(path) != "track":
         raise ValueError(f"{path}: expected a field, found none; gsjax distill {path} makes one")
 
 

@@ -336,7 +336,7 @@ def _check_count(run: Queryable, question: Question, found: Selection, frame: in
         where = "" if run.frame_ids is None else f" in frame {run.frame_ids[frame]}"
         raise ValueError(
             f"{question.words} means nothing of this scene{where}: the best score is "
-            f"{found.scores.max():.3f}, and more than {threshold.value:.3f} is required ({threshold.rule}); "
+            f"{found.scores.max():.3f}, and more than {threshold.value:.5g} is required ({threshold.rule}); "
             "try a lower --threshold"
         )
     if selected.all():

@@ -1,18 +1,20 @@
-"""Which object a text means (section III-B): the one whose embedding is nearest to the text's by cosine."""
+"""The object that a text means (section III-B): its embedding is nearest to the text's by cosine."""
 
 from typing import NamedTuple
 
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from gsjax.methods.query import directions
+
 
 class Match(NamedTuple):
-    """What a query found.
+    """The object that a query found.
 
     Attributes:
         best: row of the object with the highest score; the first of several.
         scores: the cosine of each object with the query; 0 for one without an embedding (all zeros).
-        margin: how far the best score lies above the next; infinite where there is one object only.
+        margin: difference of the best score and the next; infinite for one object only.
         found: whether the best score reaches `min_score`; if not, the query means none of them.
     """
 
@@ -36,15 +38,11 @@ def find_object(
     """
     count, size = object_embeddings.shape
     if count == 0:
-        raise ValueError("object_embeddings: got no object, want at least one")
+        raise ValueError("object_embeddings: expected at least one object, found none")
     if text_embedding.shape != (size,):
-        raise ValueError(f"text_embedding: got shape {text_embedding.shape}, want [{size}] as the objects'")
-    scores = _unit(object_embeddings) @ _unit(text_embedding)
+        found = text_embedding.shape
+        raise ValueError(f"text_embedding: expected shape [{size}] as the objects', found {found}")
+    scores = directions(object_embeddings) @ directions(text_embedding)
     best = jnp.argmax(scores)
     rest = jnp.where(jnp.arange(count) == best, -jnp.inf, scores)
     return Match(best, scores, scores[best] - rest.max(), scores[best] >= min_score)
-
-
-def _unit(vectors: Float[Array, "*k d"]) -> Float[Array, "*k d"]:
-    length = jnp.linalg.norm(vectors, axis=-1, keepdims=True)
-    return jnp.where(length > 0, vectors / jnp.where(length > 0, length, 1.0), 0.0)
