@@ -1,7 +1,6 @@
 """`gsjax query`: find what a text means in a run: an object of a tracked run, in every frame; Gaussians where
 there is a field (`gsjax distill`); or Gaussians over time in a deforming scene (`gsjax deform`)."""
 
-import math
 from dataclasses import dataclass, fields
 from pathlib import Path
 from time import perf_counter
@@ -20,7 +19,7 @@ from gsjax.engine.folder import expect_folder, is_run
 from gsjax.engine.messages import Notes, describe, stage
 from gsjax.engine.options import Common, ObjectText
 from gsjax.engine.program import USER_ERRORS
-from gsjax.engine.query import Changes, Question, answer
+from gsjax.engine.query import Question, answer
 from gsjax.engine.records import kind_of
 from gsjax.engine.track.query import ObjectQuery, ask_for_object
 
@@ -30,7 +29,6 @@ HELP = (
     "names Gaussians over time, as in `gsjax query RUN tool`, and without a text it labels everything. "
     "Where a tracked run has a field too, RUN/field queries the field."
 )
-_COLOR = (1.0, 0.25, 0.6)
 _LISTED = 6  # photographs, at most
 
 
@@ -169,7 +167,7 @@ def _expect_track(path: Path) -> None:
 def _query_field(options: Options, path: Path, console: Console) -> None:
     """Query a field."""
     begun, folder = perf_counter(), options.run / "query"
-    question, changes = _question(options), _changes(options)
+    question = _question(options)
     ways = sum(way is not None for way in (question.text, question.image, question.point))
     if ways != 1:
         raise ValueError(
@@ -183,7 +181,7 @@ def _query_field(options: Options, path: Path, console: Console) -> None:
         with stage(console, "reading the field"):
             now = Whereabouts(options.field.scene, options.field.images, options.weights)
             found = open_field_run(path, notes, now)
-        told = answer(QueryableField(found), question, changes, folder, notes, console)
+        told = answer(QueryableField(found), question, folder, notes, console)
     _print(question, found.unit, "photographs", told, perf_counter() - begun)
     print(f"scene     {found.file}")
     print(f"query     {folder}: selection.npz, object.ply{', overview.png' if told['pixels'] else ''}")
@@ -194,7 +192,7 @@ def _query_deformation(options: Options, console: Console) -> None:
     begun, folder = perf_counter(), options.run / "query"
     reason = "a run of `gsjax deform` has no use for it; leave it out"
     _expect_none_of(reason, options.field, options.track)
-    question, changes = _question(options), _changes(options)
+    question = _question(options)
     if question.camera is not None:
         raise ValueError(f"--camera: {reason}")
     ways = sum(way is not None for way in (question.text, question.point, question.box))
@@ -209,7 +207,7 @@ def _query_deformation(options: Options, console: Console) -> None:
         warn_of_partial(options.run, notes)
         scene = QueryableScene(options.run, result, options.weights)
         if ways:
-            told = answer(scene, question, changes, folder, notes, console)
+            told = answer(scene, question, folder, notes, console)
         else:
             told = label_everything(scene, question, folder, notes, console)
     if ways:
@@ -255,6 +253,8 @@ def _question(options: Options) -> Question:
         frames=deform.frames,
         threshold=gaussians.threshold,
         negatives=gaussians.negatives,
+        move=gaussians.move,
+        **({} if gaussians.color is None else {"color": gaussians.color}),
     )
 
 
@@ -273,20 +273,6 @@ def _numbers(option: str, text: str | None, wanted: str) -> Any:
     if len(found) != wanted.count(",") + 1:
         raise ValueError(f"{option}: expected {wanted} in pixels, found {text!r}")
     return found
-
-
-def _changes(options: Options) -> Changes:
-    """The changes to what was found, checked."""
-    color, move = options.gaussians.color, options.gaussians.move
-    if color is not None and any(not 0 <= value <= 1 for value in color):
-        raise ValueError(f"--color: expected three numbers of 0 to 1, found {_spaced(color)}")
-    if move is not None and not all(map(math.isfinite, move)):
-        raise ValueError(f"--move: expected three finite numbers, found {_spaced(move)}")
-    return Changes(color or _COLOR, move)
-
-
-def _spaced(numbers: tuple[float, ...]) -> str:
-    return " ".join(f"{number:g}" for number in numbers)
 
 
 def _object_query(options: Options) -> ObjectQuery:

@@ -29,14 +29,16 @@ from gsjax.scene.gaussians import Gaussians
 from gsjax.scene.selection import only, shifted, tinted
 from gsjax.viz.viewer import Answer, Asking
 
+SCENE_CAPTIONS = {"recolored": "recoloured", "moved": "moved"}
+"""Captions of the scenes of `Question.changed`, by the names of their files."""
 _EXTRACTED = "extracted"  # folder of parts that the viewer saved, in that of the run
 _HIGHEST = 1.0  # highest score: a cosine is from -1 to 1, a share against others from 0 to 1
 
 
 @dataclass(frozen=True)
 class Question:
-    """A query: one of text, image, point and box, and how it is scored. Without any of these everything is
-    labelled, where features have names.
+    """A query: one of text, image, point and box, how it is scored, and the changes to what is found. Without
+    any of the four everything is labelled, where features have names.
 
     Attributes:
         text: "red can".
@@ -49,9 +51,11 @@ class Question:
         frames: frames to draw, as a Python slice (default: the held-out ones).
         threshold: score above which a Gaussian is selected (default: by a rule).
         negatives: texts to compare with (default: the encoder's own).
+        color: RGB, 0 to 1, of what is found in recolored.ply.
+        move: shift of it in moved.ply, metres; None writes none.
 
     Raises:
-        ValueError: no score can be above the threshold, or each is.
+        ValueError: no score can be above the threshold, or each is; a colour or a shift is out of range.
     """
 
     text: str | None = None
@@ -63,6 +67,8 @@ class Question:
     frames: str | None = None
     threshold: float | None = None
     negatives: tuple[str, ...] | None = None
+    color: tuple[float, float, float] = (1.0, 0.25, 0.6)
+    move: tuple[float, float, float] | None = None
 
     def __post_init__(self):
         if self.threshold is not None and not -math.inf < self.threshold < _HIGHEST:
@@ -70,6 +76,10 @@ class Question:
                 f"--threshold: expected a finite number below {_HIGHEST:g}, which no score is above, found "
                 f"{self.threshold:g}"
             )
+        if any(not 0 <= value <= 1 for value in self.color):
+            raise ValueError(f"--color: expected three numbers of 0 to 1, found {_spaced(self.color)}")
+        if self.move is not None and not all(map(math.isfinite, self.move)):
+            raise ValueError(f"--move: expected three finite numbers, found {_spaced(self.move)}")
 
     @property
     def words(self) -> str:
@@ -81,20 +91,7 @@ class Question:
             return "what is in {:g},{:g} to {:g},{:g}".format(*self.box)
         return repr(self.text) if self.image is None else f"what {self.image.name} shows"
 
-
-@dataclass(frozen=True)
-class Changes:
-    """The changes to what was found.
-
-    Attributes:
-        color: RGB, 0 to 1, that it has in recolored.ply.
-        move: shift of it in moved.ply, metres; None writes none.
-    """
-
-    color: tuple[float, float, float]
-    move: tuple[float, float, float] | None = None
-
-    def of(self, gaussians: Gaussians, selected: Bool[np.ndarray, "n"]) -> dict[str, Gaussians]:
+    def changed(self, gaussians: Gaussians, selected: Bool[np.ndarray, "n"]) -> dict[str, Gaussians]:
         """Scenes with the selected Gaussians changed, by the names of their files."""
         there = jnp.asarray(selected)
         scenes = {"recolored": jax.jit(tinted)(gaussians, there, jnp.asarray(self.color))}
@@ -108,12 +105,16 @@ class Selection:
     """The result of a query.
 
     Attributes:
+        question: the query.
+        frame: index of the frame whose Gaussians were scored.
         wanted: what was looked for.
         scores: of all Gaussians.
         threshold: score above which they are selected.
         seconds: time that it took to score all Gaussians.
     """
 
+    question: Question
+    frame: int
     wanted: Wanted
     scores: Float[np.ndarray, "n"]
     threshold: Threshold
@@ -125,6 +126,7 @@ class Selection:
         return self.scores > self.threshold.value
 
 
+@dataclass(eq=False)
 class Queryable(ABC):
     """A run whose Gaussians can be queried.
 
@@ -138,22 +140,13 @@ class Queryable(ABC):
         frame_ids: numbers of the frames; None of a scene that stands still.
     """
 
-    def __init__(
-        self,
-        path: Path,
-        kind: str,
-        hint: str,
-        rows: Int[np.ndarray, "n"],
-        num_rows: int,
-        labels: Int[np.ndarray, "n"] | None = None,
-        frame_ids: tuple[int, ...] | None = None,
-    ):
-        """
-        Args:
-            path, kind, hint, rows, num_rows, labels, frame_ids: the attributes.
-        """
-        self.path, self.kind, self.hint = path, kind, hint
-        self.rows, self.num_rows, self.labels, self.frame_ids = rows, num_rows, labels, frame_ids
+    path: Path
+    kind: str
+    hint: str
+    rows: Int[np.ndarray, "n"]
+    num_rows: int
+    labels: Int[np.ndarray, "n"] | None = None
+    frame_ids: tuple[int, ...] | None = None
 
     @abstractmethod
     def frame_of(self, question: Question) -> int:
@@ -189,45 +182,40 @@ class Queryable(ABC):
         """Entries of query.json that this kind of run has beside those of `answer`."""
 
     @abstractmethod
-    def draw(
-        self,
-        folder: Path,
-        question: Question,
-        found: Selection,
-        changes: Changes,
-        notes: Notes,
-        console: Console,
-    ) -> dict[str, int]:
+    def draw(self, folder: Path, found: Selection, notes: Notes, console: Console) -> dict[str, int]:
         """Write pictures of a selection; returns the number of pixels in each mask.
 
         Args:
             folder: for the pictures.
-            question: the query.
-            found: its result.
-            changes: the changes that pictures show.
+            found: the result of a query.
             notes: receives warnings.
             console: shows the progress.
         """
 
 
-def select(run: Queryable, wanted: Wanted, frame: int, threshold: float | None = None) -> Selection:
+def select(run: Queryable, question: Question, frame: int, wanted: Wanted | None = None) -> Selection:
     """Score all Gaussians of a run.
 
     Args:
         run: the run.
-        wanted: what is looked for.
+        question: the query.
         frame: index of the frame.
-        threshold: score above which Gaussians are selected (default: by a rule).
+        wanted: what is looked for (default: by the question).
+
+    Raises:
+        ValueError, FileNotFoundError: as `Queryable.wanted`.
     """
+    wanted = run.wanted(question, frame) if wanted is None else wanted
     score = run.scorer(wanted, frame)
     jax.block_until_ready(score())  # compiles
     begun = perf_counter()
     scores, seconds = np.asarray(score()), perf_counter() - begun
-    return Selection(wanted, scores, wanted.threshold(scores, threshold), seconds)
+    threshold = wanted.threshold(scores, question.threshold)
+    return Selection(question, frame, wanted, scores, threshold, seconds)
 
 
 def answer(
-    run: Queryable, question: Question, changes: Changes, folder: Path, notes: Notes, console: Console
+    run: Queryable, question: Question, folder: Path, notes: Notes, console: Console
 ) -> dict[str, Any]:
     """Query a run, and write the result into a folder; returns the content of query.json.
 
@@ -242,7 +230,6 @@ def answer(
     Args:
         run: the run or field.
         question: the query.
-        changes: the changes to the selected Gaussians.
         folder: for the result, which replaces an earlier one once it is complete.
         notes: receives warnings.
         console: shows the progress.
@@ -253,17 +240,17 @@ def answer(
     """
     frame = run.frame_of(question)
     gaussians = run.at(frame)
-    found = select(run, run.wanted(question, frame), frame, question.threshold)
+    found = select(run, question, frame)
     selected = found.selected
-    _check_count(run, question, found, frame, notes)
+    _check_count(run, found, notes)
     with replaced_folder(folder, OF_QUERY) as new:
         _write_selection(new / "selection.npz", run, gaussians, found)
         for name, kept in (("object", selected), ("without", ~selected)):
             if kept.any():
                 _write_part(new / f"{name}.ply", gaussians, kept, run.labels)
-        for name, scene in changes.of(gaussians, selected).items():
+        for name, scene in question.changed(gaussians, selected).items():
             write_ply(new / f"{name}.ply", scene, labels=run.labels)
-        pixels = run.draw(new, question, found, changes, notes, console)
+        pixels = run.draw(new, found, notes, console)
         means = np.asarray(gaussians.means)[selected]
         told = {
             "text": question.text,
@@ -291,19 +278,20 @@ def asking_of(run: Queryable) -> Asking:
     """Queries of a run for the viewer's page, which saves to `extracted/` in the run's folder."""
     one_by_one = threading.Lock()
 
-    def answered(words: str, wanted: Wanted, frame: int) -> Answer:
-        found = select(run, wanted, frame)
+    def answered(words: str, question: Question, frame: int, wanted: Wanted) -> Answer:
+        found = select(run, question, frame, wanted)
         return Answer(words, found.scores, *found.threshold, found.seconds)
 
     def ask(text: str, frame: int) -> Answer:
+        question = Question(text=text)
         with one_by_one:  # several pages may query before the encoder is loaded
-            wanted = run.wanted(Question(text=text), frame)
-        return answered(text, wanted, frame)
+            wanted = run.wanted(question, frame)
+        return answered(text, question, frame, wanted)
 
     def like(row: int, frame: int) -> Answer:
         wanted = run.like(row, frame)
         meant = "" if wanted.meant is None else f" ({wanted.meant})"
-        return answered(f"like Gaussian {row}{meant}", wanted, frame)
+        return answered(f"like Gaussian {row}{meant}", Question(), frame, wanted)
 
     def save(selected: Bool[np.ndarray, "n"], name: str, frame: int) -> Path:
         folder = run.path / _EXTRACTED
@@ -329,19 +317,19 @@ def write_mask(folder: Path, name: str, mask: Bool[np.ndarray, "h w"]) -> int:
     return int(mask.sum())
 
 
-def _check_count(run: Queryable, question: Question, found: Selection, frame: int, notes: Notes) -> None:
+def _check_count(run: Queryable, found: Selection, notes: Notes) -> None:
     """Raises a ValueError where nothing is selected, and warns where everything is."""
-    selected, threshold = found.selected, found.threshold
+    selected, threshold, words = found.selected, found.threshold, found.question.words
     if not selected.any():
-        where = "" if run.frame_ids is None else f" in frame {run.frame_ids[frame]}"
+        where = "" if run.frame_ids is None else f" in frame {run.frame_ids[found.frame]}"
         raise ValueError(
-            f"{question.words} means nothing of this scene{where}: the best score is "
+            f"{words} means nothing of this scene{where}: the best score is "
             f"{found.scores.max():.3f}, and more than {threshold.value:.5g} is required ({threshold.rule}); "
             "try a lower --threshold"
         )
     if selected.all():
         notes.warn(
-            f"{question.words} means all {len(selected)} Gaussians; a higher --threshold would select some "
+            f"{words} means all {len(selected)} Gaussians; a higher --threshold would select some "
             "of them"
         )
 
@@ -361,3 +349,7 @@ def _write_part(
 ) -> None:
     """Writes some Gaussians as a PLY file, with their labels where there are any."""
     write_ply(path, only(gaussians, kept), labels=None if labels is None else labels[kept])
+
+
+def _spaced(numbers: tuple[float, ...]) -> str:
+    return " ".join(f"{number:g}" for number in numbers)

@@ -11,8 +11,7 @@ from gsjax.data.ordered import open_as_sequence
 from gsjax.data.photographs import Photographs
 from gsjax.engine.deform.file import NAME as DEFORMATION
 from gsjax.engine.deform.file import read_deformation
-from gsjax.engine.deform.pictures import probabilities_of
-from gsjax.engine.deform.query import QueryableScene
+from gsjax.engine.deform.query import QueryableScene, probabilities_of
 from gsjax.engine.distill.file import NAME
 from gsjax.engine.distill.query import QueryableField
 from gsjax.engine.distill.saved import AS_IT_WAS, FieldRun, Whereabouts, field_of, open_field_run

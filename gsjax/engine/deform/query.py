@@ -1,33 +1,69 @@
 """Queries of a run of `gsjax deform`: the Gaussians that a text, a point or a box means, or what all of them
 are, at every time."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from functools import cached_property, partial
 from pathlib import Path
 from time import perf_counter
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 from rich.console import Console
+from rich.progress import track
 
-from gsjax.engine.deform.pictures import draw, draw_labels, probabilities_of
 from gsjax.engine.folder import OF_QUERY, replaced_folder
 from gsjax.engine.messages import Notes
-from gsjax.engine.query import Changes, Queryable, Question, Selection
+from gsjax.engine.pictures import frame_rate
+from gsjax.engine.query import SCENE_CAPTIONS, Queryable, Question, Selection, write_mask
 from gsjax.engine.recording import parse_frames
+from gsjax.geometry.cameras import Camera
 from gsjax.io.atomic import write_json, write_npz
+from gsjax.io.pictures import write_png
 from gsjax.io.ply import write_ply
+from gsjax.io.video import VideoWriter
 from gsjax.methods.deform import DeformResult, wanted_like, wanted_text
-from gsjax.methods.deform.query import most_likely, region_feature
+from gsjax.methods.deform.query import most_likely, prompt_probabilities, region_feature
 from gsjax.methods.protocols import LanguageEncoder
 from gsjax.methods.query import Wanted
+from gsjax.rasterize.plan import Plan
 from gsjax.scene.gaussians import Gaussians
 from gsjax.scene.render import render_with_room
-from gsjax.viz.colors import INVALID, label_color
+from gsjax.scene.selection import hidden
+from gsjax.viz.colors import INVALID, in_rows, label_color, overlay_labels, to_uint8
 from gsjax.viz.viewer.drawing import recolored
+
+_PANEL_HEIGHT = 240  # pixels, at least
+_OPAQUE = 0.5  # a pixel in which less of the scene shows is of nothing
+
+probabilities_of = jax.jit(prompt_probabilities)
+"""`prompt_probabilities` of Gaussians or of a picture, compiled."""
+
+
+class _Seen(NamedTuple):
+    """A frame of the scene.
+
+    Attributes:
+        t: its index.
+        number: the recording's own number of it.
+        gaussians: the scene in it.
+        camera: its camera.
+        plan: that it was drawn with.
+        colors: rendered, 0 to 1.
+        features: rendered, on the device.
+        there: where something of the scene is drawn.
+    """
+
+    t: int
+    number: int
+    gaussians: Gaussians
+    camera: Camera
+    plan: Plan
+    colors: Float[np.ndarray, "h w 3"]
+    features: Float[Array, "h w c"]
+    there: Bool[np.ndarray, "h w"]
 
 
 class QueryableScene(Queryable):
@@ -64,10 +100,10 @@ class QueryableScene(Queryable):
         self.pictured(question, 0)
         if question.frame is None:
             return 0
-        if question.frame not in self.frame_ids:
-            known = f"{self.frame_ids[0]} to {self.frame_ids[-1]}"
-            raise ValueError(f"--frame: expected one of {known}, found {question.frame}")
-        return self.frame_ids.index(question.frame)
+        known = self.result.timeline.frame_ids.tolist()
+        if question.frame not in known:
+            raise ValueError(f"--frame: expected one of {known[0]} to {known[-1]}, found {question.frame}")
+        return known.index(question.frame)
 
     def pictured(self, question: Question, frame: int) -> list[int]:
         """Indices of the frames to draw: the one in question, and those that the question names.
@@ -77,11 +113,10 @@ class QueryableScene(Queryable):
         """
         if question.frames is None:
             return sorted({frame, *self.result.timeline.held_out.tolist()})
-        chosen = range(len(self.frame_ids))[parse_frames(question.frames)]
+        count = len(self.result.timeline.times)
+        chosen = range(count)[parse_frames(question.frames)]
         if not chosen:
-            raise ValueError(
-                f"--frames: {question.frames} holds no frame of the run, which has {len(self.frame_ids)}"
-            )
+            raise ValueError(f"--frames: {question.frames} holds no frame of the run, which has {count}")
         return sorted({frame, *chosen})
 
     def at(self, frame: int) -> Gaussians:
@@ -98,7 +133,7 @@ class QueryableScene(Queryable):
             feature = region_feature(np.asarray(drawn.features[0]), np.asarray(drawn.alphas[0]), region)
         except ValueError as error:
             option = "--box" if question.point is None else "--point"
-            raise ValueError(f"{option}: {error} (frame {self.frame_ids[frame]})") from None
+            raise ValueError(f"{option}: {error} (frame {self.result.timeline.frame_ids[frame]})") from None
         return wanted_like(self.meaning, feature.astype(np.float64))
 
     def like(self, row: int, frame: int) -> Wanted:
@@ -108,19 +143,32 @@ class QueryableScene(Queryable):
         return partial(wanted.scores, self._features(frame))
 
     def about(self, question: Question, frame: int) -> dict[str, Any]:
-        return {"box": question.box, "names": self.result.names, "frame": self.frame_ids[frame]}
+        return {"box": question.box, "names": self.result.names, "frame": int(self.result.timeline.frame_ids[frame])}
 
-    def draw(
-        self,
-        folder: Path,
-        question: Question,
-        found: Selection,
-        changes: Changes,
-        notes: Notes,
-        console: Console,
-    ) -> dict[str, int]:
-        pictured = self.pictured(question, self.frame_of(question))
-        return draw(folder, self.result, pictured, found, changes, console)
+    def draw(self, folder: Path, found: Selection, notes: Notes, console: Console) -> dict[str, int]:
+        """Writes masks/FRAME.png (255 where a pixel's own features score above the threshold) and
+        frames/FRAME.png (the scene, it without what was found, that alone, recoloured, moved) of some frames,
+        and video.mp4 of all: the scene beside the scene without what was found."""
+        result, pictured = self.result, self.pictured(found.question, found.frame)
+        pixels: dict[str, int] = {}
+        wanted, threshold = found.wanted, found.threshold.value
+        with VideoWriter(folder / "video.mp4", _frame_rate(result)) as video:
+            for seen in _frames(result, console):
+                assert seen.gaussians.features is not None
+                selected = wanted.scores(seen.gaussians.features) > threshold
+                both = {f"frame {seen.number}": to_uint8(seen.colors)}
+                both["without it"] = _picture(hidden(seen.gaussians, selected), seen)
+                video.write(in_rows(both, 2, _PANEL_HEIGHT))
+                if seen.t in pictured:
+                    name = f"{seen.number:06d}"
+                    mask = (np.asarray(wanted.scores(seen.features)) > threshold) & seen.there
+                    pixels[name] = write_mask(folder, name, mask)
+                    scenes = {"it alone": hidden(seen.gaussians, ~selected)}
+                    changed = found.question.changed(seen.gaussians, np.asarray(selected))
+                    scenes |= {SCENE_CAPTIONS[edit]: scene for edit, scene in changed.items()}
+                    panels = both | {words: _picture(scene, seen) for words, scene in scenes.items()}
+                    write_png(folder / "frames" / f"{name}.png", in_rows(panels, 2, _PANEL_HEIGHT))
+        return pixels
 
     def _features(self, frame: int) -> Float[Array, "n c"]:
         """Features of all Gaussians; those that do not change are the same in all frames."""
@@ -177,8 +225,57 @@ def label_everything(
             "query_seconds": seconds,
             "classes": {name: int((labels == label).sum()) for label, name in enumerate(result.names, 1)},
             "colors": colors,
-            "shares": draw_labels(new, result, scene.pictured(question, frame), console),
+            "shares": _draw_labels(new, result, scene.pictured(question, frame), console),
             "notes": notes.all,
         }
         write_json(new / "query.json", told)
     return told
+
+
+def _draw_labels(
+    folder: Path, result: DeformResult, pictured: Sequence[int], console: Console
+) -> dict[str, dict[str, float]]:
+    """Writes label maps masks/FRAME.png and frames/FRAME.png of some frames, and video.mp4 of all: the scene
+    beside what each pixel most likely is. Returns, by frame, the share of the picture that each name has."""
+    assert result.meaning is not None
+    codebook = jnp.asarray(result.meaning.codebook, jnp.float32)
+    shares: dict[str, dict[str, float]] = {}
+    with VideoWriter(folder / "video.mp4", _frame_rate(result)) as video:
+        for seen in _frames(result, console):
+            likely = np.asarray(probabilities_of(seen.features, codebook))
+            labels = np.where(seen.there, 1 + most_likely(likely), 0)
+            colors = to_uint8(seen.colors)
+            over = overlay_labels(colors, labels)
+            panel = in_rows({f"frame {seen.number}": colors, "what is what": over}, 2, _PANEL_HEIGHT)
+            video.write(panel)
+            if seen.t in pictured:
+                name = f"{seen.number:06d}"
+                write_png(folder / "masks" / f"{name}.png", labels.astype(np.uint8))
+                write_png(folder / "frames" / f"{name}.png", panel)
+                shares[name] = {
+                    word: float((labels == label).mean()) for label, word in enumerate(result.names, 1)
+                }
+    return shares
+
+
+def _frame_rate(result: DeformResult) -> float:
+    """Pictures a second of a film of all frames."""
+    return frame_rate(result.timeline.times * result.timeline.seconds)
+
+
+def _frames(result: DeformResult, console: Console) -> Iterator[_Seen]:
+    """All frames, one after the other."""
+    plan = None
+    for t in track(range(len(result.timeline.times)), "drawing", console=console, transient=True):
+        gaussians, camera = result.at(result.timeline.times[t]), result.camera(t)
+        drawn, plan = render_with_room(gaussians, camera, plan)
+        assert drawn.features is not None
+        there = np.asarray(drawn.alphas[0]) > _OPAQUE
+        scene, number = (gaussians, camera, plan), int(result.timeline.frame_ids[t])
+        yield _Seen(t, number, *scene, np.asarray(drawn.colors[0]), drawn.features[0], there)
+
+
+def _picture(gaussians: Gaussians, seen: _Seen) -> np.ndarray:
+    """Colours of a scene that stands as another does; drawn as that was, with features, for compiling takes
+    longer than drawing these."""
+    return to_uint8(np.asarray(render_with_room(gaussians, seen.camera, seen.plan)[0].colors[0]))

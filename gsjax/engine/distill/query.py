@@ -7,23 +7,34 @@ from pathlib import Path
 from typing import Any
 
 import cv2
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 from rich.console import Console
+from rich.progress import track
 
 from gsjax.data.photographs import Photographs
-from gsjax.engine.distill.pictures import draw
 from gsjax.engine.distill.saved import FieldRun, short_names
-from gsjax.engine.messages import Notes
-from gsjax.engine.query import Changes, Queryable, Question, Selection
+from gsjax.engine.messages import Notes, describe
+from gsjax.engine.query import SCENE_CAPTIONS, Queryable, Question, Selection, write_mask
+from gsjax.geometry.cameras import Camera, camera_centers
+from gsjax.geometry.spherical_harmonics import evaluate_sh
+from gsjax.io.pictures import write_png
 from gsjax.methods.distill import FeatureField, frozen_views, pixel_features
 from gsjax.methods.query import Wanted, read_text
+from gsjax.optim.compiler import host_options
 from gsjax.rasterize.frozen import strip_of
 from gsjax.scene.gaussians import Gaussians
+from gsjax.scene.selection import hidden
+from gsjax.viz.colors import enlarged, heat, highlight, in_rows, to_uint8, with_heat_scale
+from gsjax.viz.viewer.drawing import Drawer, recolored
 
 _LEAST_ALPHA = 0.5  # share of a pixel's light that the scene must send
+_MARK = (255, 70, 160)
+_PANEL_HEIGHT = 240  # pixels, at least
+_MOST = 0.5  # share of a pixel's light above which it shows the object
 
 
 class QueryableField(Queryable):
@@ -88,22 +99,60 @@ class QueryableField(Queryable):
         image = None if question.image is None else str(question.image)
         return {"image": image, "camera": question.camera, "scene": str(self.run.file)}
 
-    def draw(
-        self,
-        folder: Path,
-        question: Question,
-        found: Selection,
-        changes: Changes,
-        notes: Notes,
-        console: Console,
-    ) -> dict[str, int]:
-        photographs = self.run.photographs
+    def draw(self, folder: Path, found: Selection, notes: Notes, console: Console) -> dict[str, int]:
+        """Writes masks/CAMERA.png, 255 where more than half of a pixel's light is of the selected Gaussians,
+        and overview.png of the photograph that shows most: it, a heat map of the scores, and the scenes
+        without what was found, it alone, recoloured, moved.
+
+        All are drawn by one program for each size of picture, with one colour a Gaussian, because compiling
+        takes longer than drawing. What is not to be seen is hidden, not left out, so the number of Gaussians
+        stays the same."""
+        run, question, photographs = self.run, found.question, self.run.photographs
         if photographs is None:
             return {}
         which = range(photographs.num)
         if question.camera is not None and question.point is None:
             which = [_index(photographs, question.camera)]
-        return draw(folder, self.run, which, found, changes, notes, console)
+        selected, scores = found.selected, found.scores
+        drawer = Drawer(antialiased=run.rasterize_mode == "antialiased", compiler_options=host_options())
+        names, pixels = short_names(photographs.names), {}
+        low, high = _ends(scores)
+        shares = np.clip((np.nan_to_num(scores) - low) / max(high - low, 1e-6), 0, 1)
+        painted = np.stack([selected, shares, np.zeros(len(scores))], axis=1).astype(np.float32)
+        values = _painted(run.gaussians, painted)
+        best: tuple[float, int, np.ndarray] | None = None
+        for v in track(which, "drawing", console=console, transient=True):
+            drawn = drawer(values, _one(photographs.camera(v))).colors
+            mask = drawn[..., 0] > _MOST
+            pixels[names[v]] = write_mask(folder, names[v], mask)
+            if best is None or mask.mean() > best[0]:
+                best = (float(mask.mean()), v, drawn)
+        assert best is not None
+        _, v, drawn = best
+        camera, there = _one(photographs.camera(v)), jnp.asarray(selected)
+        shown = {"the object alone": hidden(run.gaussians, ~there)}
+        if not selected.all():
+            shown["without it"] = hidden(run.gaussians, there)
+        changed = question.changed(run.gaussians, selected)
+        shown |= {SCENE_CAPTIONS[name]: scene for name, scene in changed.items()}
+        behind_is = "photograph"
+        try:
+            behind = photographs.image(v)
+        except (ValueError, OSError) as error:
+            notes.warn(f"overview.png shows a render in place of a photograph: {describe(error)}")
+            behind_is, behind = "scene", to_uint8(drawer(_seen_from(run.gaussians, camera), camera).colors)
+        threshold = found.threshold.value
+        scale = enlarged(heat(drawn[..., 1]), _PANEL_HEIGHT)
+        panels = {
+            f"found in view {names[v]}": highlight(behind, drawn[..., 0] > _MOST, _MARK),
+            f"scores; found above {threshold:.2f}": with_heat_scale(scale, low, high, threshold),
+        }
+        for words, scene in shown.items():
+            panels[words] = to_uint8(drawer(_seen_from(scene, camera), camera).colors)
+        if len(panels) % 2:  # two rows, and no place in them is empty
+            panels = {behind_is: behind, **panels}
+        write_png(folder / "overview.png", in_rows(panels, len(panels) // 2, _PANEL_HEIGHT))
+        return pixels
 
     def _read(self, text: str, negatives: tuple[str, ...] | None) -> Wanted:
         return read_text(self._source, text, negatives, lambda: self.run.encoder)
@@ -159,3 +208,30 @@ def _index(photographs: Photographs, camera: str) -> int:
             return known.index(camera)
     listed = ", ".join(names[:12]) + (", ..." if len(names) > 12 else "")
     raise ValueError(f"--camera: expected one of {listed}, found {camera}")
+
+
+def _one(camera: Camera) -> Camera:
+    """A batch of one."""
+    return Camera(camera.viewmat[None], camera.K[None], camera.width, camera.height, camera.near)
+
+
+def _ends(scores: Float[np.ndarray, "n"]) -> tuple[float, float]:
+    """The least and largest score, without a few outliers at the lower end."""
+    scores = np.nan_to_num(scores)
+    return float(np.percentile(scores, 1)), float(scores.max())
+
+
+def _seen_from(gaussians: Gaussians, camera: Camera) -> Gaussians:
+    """The scene with the colours that one camera sees, the same from all sides."""
+    return _painted(gaussians, np.asarray(_colors(gaussians, camera)))
+
+
+@jax.jit
+def _colors(gaussians: Gaussians, camera: Camera) -> Float[Array, "n 3"]:
+    toward = gaussians.means - camera_centers(camera.viewmat)[0]
+    return jnp.maximum(evaluate_sh(gaussians.sh_degree, gaussians.sh, toward), 0)
+
+
+def _painted(gaussians: Gaussians, colors: Float[np.ndarray, "n 3"]) -> Gaussians:
+    """The scene with one colour a Gaussian and no features."""
+    return eqx.tree_at(lambda g: g.features, recolored(gaussians, colors), None, is_leaf=lambda x: x is None)
