@@ -181,10 +181,10 @@ def _query_field(options: Options, path: Path, console: Console) -> None:
         with stage(console, "reading the field"):
             now = Whereabouts(options.field.scene, options.field.images, options.weights)
             found = open_field_run(path, notes, now)
-        told = answer(QueryableField(found), question, folder, notes, console)
-    _print(question, found.unit, "photographs", told, perf_counter() - begun)
+        info = answer(QueryableField(found), question, folder, notes, console)
+    _print(question, found.unit, "photographs", info, perf_counter() - begun)
     print(f"scene     {found.file}")
-    print(f"query     {folder}: selection.npz, object.ply{', overview.png' if told['pixels'] else ''}")
+    print(f"query     {folder}: selection.npz, object.ply{', overview.png' if info['pixels'] else ''}")
 
 
 def _query_deformation(options: Options, console: Console) -> None:
@@ -207,41 +207,41 @@ def _query_deformation(options: Options, console: Console) -> None:
         warn_of_partial(options.run, notes)
         scene = QueryableScene(options.run, result, options.weights)
         if ways:
-            told = answer(scene, question, folder, notes, console)
+            info = answer(scene, question, folder, notes, console)
         else:
-            told = label_everything(scene, question, folder, notes, console)
+            info = label_everything(scene, question, folder, notes, console)
     if ways:
-        _print(question, "m" if result.timeline.metric else "", "frames", told, perf_counter() - begun)
+        _print(question, "m" if result.timeline.metric else "", "frames", info, perf_counter() - begun)
     else:
-        found = ", ".join(f"{name}: {count:,}" for name, count in told["classes"].items())
-        print(f"{'found':<10}{found} of {told['of']:,} Gaussians, in frame {told['frame']}")
+        found = ", ".join(f"{name}: {count:,}" for name, count in info["classes"].items())
+        print(f"{'found':<10}{found} of {info['of']:,} Gaussians, in frame {info['frame']}")
     print(f"query     {folder}: selection.npz, recolored.ply, frames/, masks/, video.mp4")
 
 
-def _print(question: Question, unit: str, seen_in: str, told: dict[str, Any], seconds: float) -> None:
+def _print(question: Question, unit: str, seen_in: str, info: dict[str, Any], seconds: float) -> None:
     """What was found, in a few lines."""
-    meant = f", {told['meant']!r}" if told["meant"] and told["meant"] != told["text"] else ""
-    against = f", against {', '.join(told['against'][:_LISTED])}" if told["against"] else ""
+    meant = f", {info['meant']!r}" if info["meant"] and info["meant"] != info["text"] else ""
+    against = f", against {', '.join(info['against'][:_LISTED])}" if info["against"] else ""
     unit = f" {unit}" if unit else ""
     rows = {
-        "found": f"{question.words}{meant}: {told['gaussians']:,} of {told['of']:,} Gaussians",
-        "centre": ", ".join(f"{x:.3f}" for x in told["center"]) + unit,
-        "size": " x ".join(f"{x:.3f}" for x in told["size"]) + unit,
-        "score": f"above {told['threshold']:.2f} ({told['rule']}), {told['best_score']:.2f} at best{against}",
+        "found": f"{question.words}{meant}: {info['gaussians']:,} of {info['of']:,} Gaussians",
+        "centre": ", ".join(f"{x:.3f}" for x in info["center"]) + unit,
+        "size": " x ".join(f"{x:.3f}" for x in info["size"]) + unit,
+        "score": f"above {info['threshold']:.2f} ({info['rule']}), {info['best_score']:.2f} at best{against}",
     }
-    if pixels := told["pixels"]:
+    if pixels := info["pixels"]:
         unseen = [name for name, count in pixels.items() if not count]
         more = ", ..." if len(unseen) > _LISTED else ""
         rows["seen"] = f"in {len(pixels) - len(unseen)} of {len(pixels)} {seen_in}" + (
             f"; not in {', '.join(unseen[:_LISTED])}{more}" if unseen else ""
         )
-    rows["time"] = f"{seconds:.1f} s, of which the query took {1e3 * told['query_seconds']:.1f} ms"
+    rows["time"] = f"{seconds:.1f} s, of which the query took {1e3 * info['query_seconds']:.1f} ms"
     for name, row in rows.items():
         print(f"{name:<10}{row}")
 
 
 def _question(options: Options) -> Question:
-    """The question, whatever it is asked of."""
+    """The question, for a run of any kind."""
     gaussians, deform = options.gaussians, options.deform
     return Question(
         text=options.text,
@@ -278,7 +278,7 @@ def _numbers(option: str, text: str | None, wanted: str) -> Any:
 def _object_query(options: Options) -> ObjectQuery:
     """The query of a tracked run for an object, checked."""
     _expect_none_of(
-        f"{options.run} has no field that could be asked so; gsjax distill {options.run} makes one",
+        f"{options.run} has no field that could be queried so; gsjax distill {options.run} makes one",
         options.gaussians,
         options.field,
     )

@@ -24,7 +24,7 @@ from gsjax.engine.messages import Notes
 from gsjax.io.atomic import write_json, write_new, write_npz
 from gsjax.io.pictures import write_png
 from gsjax.io.ply import write_ply
-from gsjax.methods.query import Threshold, Wanted
+from gsjax.methods.query import Prompt, Threshold
 from gsjax.scene.gaussians import Gaussians
 from gsjax.scene.selection import only, shifted, tinted
 from gsjax.viz.viewer import Answer, Asking
@@ -107,7 +107,7 @@ class Selection:
     Attributes:
         question: the query.
         frame: index of the frame whose Gaussians were scored.
-        wanted: what was looked for.
+        prompt: of the query.
         scores: of all Gaussians.
         threshold: score above which they are selected.
         seconds: time that it took to score all Gaussians.
@@ -115,7 +115,7 @@ class Selection:
 
     question: Question
     frame: int
-    wanted: Wanted
+    prompt: Prompt
     scores: Float[np.ndarray, "n"]
     threshold: Threshold
     seconds: float
@@ -161,8 +161,8 @@ class Queryable(ABC):
         """The scene in a frame."""
 
     @abstractmethod
-    def wanted(self, question: Question, frame: int) -> Wanted:
-        """What a question looks for.
+    def prompt(self, question: Question, frame: int) -> Prompt:
+        """The prompt of a question.
 
         Raises:
             ValueError: the question cannot be answered.
@@ -170,11 +170,11 @@ class Queryable(ABC):
         """
 
     @abstractmethod
-    def like(self, row: int, frame: int) -> Wanted:
-        """What is similar to a Gaussian, by its row."""
+    def like(self, row: int, frame: int) -> Prompt:
+        """The prompt for what is similar to a Gaussian, by its row."""
 
     @abstractmethod
-    def scorer(self, wanted: Wanted, frame: int) -> Callable[[], Float[Array, "n"]]:
+    def scorer(self, prompt: Prompt, frame: int) -> Callable[[], Float[Array, "n"]]:
         """A function that scores all Gaussians."""
 
     @abstractmethod
@@ -193,25 +193,25 @@ class Queryable(ABC):
         """
 
 
-def select(run: Queryable, question: Question, frame: int, wanted: Wanted | None = None) -> Selection:
+def select(run: Queryable, question: Question, frame: int, prompt: Prompt | None = None) -> Selection:
     """Score all Gaussians of a run.
 
     Args:
         run: the run.
         question: the query.
         frame: index of the frame.
-        wanted: what is looked for (default: by the question).
+        prompt: of the query (default: that of the question).
 
     Raises:
-        ValueError, FileNotFoundError: as `Queryable.wanted`.
+        ValueError, FileNotFoundError: as `Queryable.prompt`.
     """
-    wanted = run.wanted(question, frame) if wanted is None else wanted
-    score = run.scorer(wanted, frame)
+    prompt = run.prompt(question, frame) if prompt is None else prompt
+    score = run.scorer(prompt, frame)
     jax.block_until_ready(score())  # compiles
     begun = perf_counter()
     scores, seconds = np.asarray(score()), perf_counter() - begun
-    threshold = wanted.threshold(scores, question.threshold)
-    return Selection(question, frame, wanted, scores, threshold, seconds)
+    threshold = prompt.threshold(scores, question.threshold)
+    return Selection(question, frame, prompt, scores, threshold, seconds)
 
 
 def answer(
@@ -252,13 +252,13 @@ def answer(
             write_ply(new / f"{name}.ply", scene, labels=run.labels)
         pixels = run.draw(new, found, notes, console)
         means = np.asarray(gaussians.means)[selected]
-        told = {
+        info = {
             "text": question.text,
             "point": question.point,
             "features": run.kind,
             **run.about(question, frame),
-            "meant": found.wanted.meant,
-            "against": found.wanted.against,
+            "meant": found.prompt.meant,
+            "against": found.prompt.against,
             "threshold": found.threshold.value,
             "rule": found.threshold.rule,
             "gaussians": len(means),
@@ -270,28 +270,28 @@ def answer(
             "pixels": pixels,
             "notes": notes.all,
         }
-        write_json(new / "query.json", told)
-    return told
+        write_json(new / "query.json", info)
+    return info
 
 
 def asking_of(run: Queryable) -> Asking:
     """Queries of a run for the viewer's page, which saves to `extracted/` in the run's folder."""
     one_by_one = threading.Lock()
 
-    def answered(words: str, question: Question, frame: int, wanted: Wanted) -> Answer:
-        found = select(run, question, frame, wanted)
+    def answered(words: str, question: Question, frame: int, prompt: Prompt) -> Answer:
+        found = select(run, question, frame, prompt)
         return Answer(words, found.scores, *found.threshold, found.seconds)
 
     def ask(text: str, frame: int) -> Answer:
         question = Question(text=text)
         with one_by_one:  # several pages may query before the encoder is loaded
-            wanted = run.wanted(question, frame)
-        return answered(text, question, frame, wanted)
+            prompt = run.prompt(question, frame)
+        return answered(text, question, frame, prompt)
 
     def like(row: int, frame: int) -> Answer:
-        wanted = run.like(row, frame)
-        meant = "" if wanted.meant is None else f" ({wanted.meant})"
-        return answered(f"like Gaussian {row}{meant}", Question(), frame, wanted)
+        prompt = run.like(row, frame)
+        meant = "" if prompt.meant is None else f" ({prompt.meant})"
+        return answered(f"like Gaussian {row}{meant}", Question(), frame, prompt)
 
     def save(selected: Bool[np.ndarray, "n"], name: str, frame: int) -> Path:
         folder = run.path / _EXTRACTED

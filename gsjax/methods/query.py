@@ -1,4 +1,4 @@
-"""A query of features: what is looked for and compared with, its scores, and the threshold of these.
+"""A query of features: its prompt, the scores of features, and the threshold of scores.
 
 Shared by fields (`gsjax.methods.distill`) and scenes that deform (`gsjax.methods.deform`).
 """
@@ -26,8 +26,8 @@ class Threshold(NamedTuple):
     rule: str
 
 
-class Wanted(NamedTuple):
-    """What is looked for, and what it is compared with.
+class Prompt(NamedTuple):
+    """A query in the space of features, and what it is compared with.
 
     Attributes:
         vectors: the vector of the query, then those that it is compared with, in the channels of the features
@@ -62,17 +62,17 @@ class Wanted(NamedTuple):
         return found._replace(rule=self.rule) if compared and given is None else found
 
 
-def read_text(
+def encoded_prompt(
     source: Any,
     text: str,
     negatives: tuple[str, ...] | None = None,
     encoder: Callable[[], LanguageEncoder] | None = None,
-) -> Wanted:
-    """What a text means to the encoder of some features, in the space that the encoder knows.
+) -> Prompt:
+    """The prompt of a text, by the encoder of some features and in its space.
 
     Args:
         source: of the features (`gsjax.engine.teaching.source.Source`); None where it is not known.
-        text: what is looked for: "red can".
+        text: of the query: "red can".
         negatives: texts to compare with (default: those of the source; none where it is not known).
         encoder: loads the encoder (default: that of the source).
 
@@ -90,7 +90,7 @@ def read_text(
         negatives = () if source is None else tuple(source.negatives(text))
     vectors = np.stack([np.asarray(reader.embed_text(one), np.float64) for one in (text, *negatives)])
     least = reader.min_score if source is not None and source.kind == "closed" else None
-    return Wanted(vectors, tuple(negatives), least=least)
+    return Prompt(vectors, tuple(negatives), least=least)
 
 
 def relevancy(cosines: Float[Array, "*n q"], temperature: float = TEMPERATURE) -> Float[Array, "*n"]:

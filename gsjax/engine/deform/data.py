@@ -36,7 +36,7 @@ class DeformData:
         train: indices of frames to learn from.
         test: indices of frames that are held out.
         frames: the frames to learn from, in memory.
-        taught: what the teacher says about the frames; None without a teacher.
+        taught: the teacher's labels of the frames; None without a teacher.
         tool_values: mask values that are tools; those with names of tools where there is none.
     """
 

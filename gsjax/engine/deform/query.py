@@ -24,10 +24,10 @@ from gsjax.io.atomic import write_json, write_npz
 from gsjax.io.pictures import write_png
 from gsjax.io.ply import write_ply
 from gsjax.io.video import VideoWriter
-from gsjax.methods.deform import DeformResult, wanted_like, wanted_text
+from gsjax.methods.deform import DeformResult, feature_prompt, text_prompt
 from gsjax.methods.deform.query import most_likely, prompt_probabilities, region_feature
 from gsjax.methods.protocols import LanguageEncoder
-from gsjax.methods.query import Wanted
+from gsjax.methods.query import Prompt
 from gsjax.rasterize.plan import Plan
 from gsjax.scene.gaussians import Gaussians
 from gsjax.scene.render import render_with_room
@@ -122,9 +122,9 @@ class QueryableScene(Queryable):
     def at(self, frame: int) -> Gaussians:
         return self.result.at(self.result.timeline.times[frame])
 
-    def wanted(self, question: Question, frame: int) -> Wanted:
+    def prompt(self, question: Question, frame: int) -> Prompt:
         if question.text is not None:
-            return wanted_text(self.meaning, question.text, question.negatives, lambda: self._encoder)
+            return text_prompt(self.meaning, question.text, question.negatives, lambda: self._encoder)
         region = question.point * 2 if question.point is not None else question.box
         assert region is not None
         drawn, _ = render_with_room(self.at(frame), self.result.camera(frame))
@@ -134,16 +134,17 @@ class QueryableScene(Queryable):
         except ValueError as error:
             option = "--box" if question.point is None else "--point"
             raise ValueError(f"{option}: {error} (frame {self.result.timeline.frame_ids[frame]})") from None
-        return wanted_like(self.meaning, feature.astype(np.float64))
+        return feature_prompt(self.meaning, feature.astype(np.float64))
 
-    def like(self, row: int, frame: int) -> Wanted:
-        return wanted_like(self.meaning, np.asarray(self._features(frame)[row], np.float64))
+    def like(self, row: int, frame: int) -> Prompt:
+        return feature_prompt(self.meaning, np.asarray(self._features(frame)[row], np.float64))
 
-    def scorer(self, wanted: Wanted, frame: int) -> Callable[[], Float[Array, "n"]]:
-        return partial(wanted.scores, self._features(frame))
+    def scorer(self, prompt: Prompt, frame: int) -> Callable[[], Float[Array, "n"]]:
+        return partial(prompt.scores, self._features(frame))
 
     def about(self, question: Question, frame: int) -> dict[str, Any]:
-        return {"box": question.box, "names": self.result.names, "frame": int(self.result.timeline.frame_ids[frame])}
+        number = int(self.result.timeline.frame_ids[frame])
+        return {"box": question.box, "names": self.result.names, "frame": number}
 
     def draw(self, folder: Path, found: Selection, notes: Notes, console: Console) -> dict[str, int]:
         """Writes masks/FRAME.png (255 where a pixel's own features score above the threshold) and
@@ -151,17 +152,17 @@ class QueryableScene(Queryable):
         and video.mp4 of all: the scene beside the scene without what was found."""
         result, pictured = self.result, self.pictured(found.question, found.frame)
         pixels: dict[str, int] = {}
-        wanted, threshold = found.wanted, found.threshold.value
+        prompt, threshold = found.prompt, found.threshold.value
         with VideoWriter(folder / "video.mp4", _frame_rate(result)) as video:
             for seen in _frames(result, console):
                 assert seen.gaussians.features is not None
-                selected = wanted.scores(seen.gaussians.features) > threshold
+                selected = prompt.scores(seen.gaussians.features) > threshold
                 both = {f"frame {seen.number}": to_uint8(seen.colors)}
                 both["without it"] = _picture(hidden(seen.gaussians, selected), seen)
                 video.write(in_rows(both, 2, _PANEL_HEIGHT))
                 if seen.t in pictured:
                     name = f"{seen.number:06d}"
-                    mask = (np.asarray(wanted.scores(seen.features)) > threshold) & seen.there
+                    mask = (np.asarray(prompt.scores(seen.features)) > threshold) & seen.there
                     pixels[name] = write_mask(folder, name, mask)
                     scenes = {"it alone": hidden(seen.gaussians, ~selected)}
                     changed = found.question.changed(seen.gaussians, np.asarray(selected))
@@ -216,7 +217,7 @@ def label_everything(
         arrays = {"labels": labels, "probabilities": likely, "names": result.names}
         write_npz(new / "selection.npz", arrays)
         write_ply(new / "recolored.ply", recolored(there, shades[labels]), labels=labels)
-        told = {
+        info = {
             "text": None,
             "point": None,
             "features": scene.kind,
@@ -228,8 +229,8 @@ def label_everything(
             "shares": _draw_labels(new, result, scene.pictured(question, frame), console),
             "notes": notes.all,
         }
-        write_json(new / "query.json", told)
-    return told
+        write_json(new / "query.json", info)
+    return info
 
 
 def _draw_labels(

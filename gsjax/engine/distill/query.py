@@ -23,7 +23,7 @@ from gsjax.geometry.cameras import Camera, camera_centers
 from gsjax.geometry.spherical_harmonics import evaluate_sh
 from gsjax.io.pictures import write_png
 from gsjax.methods.distill import FeatureField, frozen_views, pixel_features
-from gsjax.methods.query import Wanted, read_text
+from gsjax.methods.query import Prompt, encoded_prompt
 from gsjax.optim.compiler import host_options
 from gsjax.rasterize.frozen import strip_of
 from gsjax.scene.gaussians import Gaussians
@@ -66,7 +66,7 @@ class QueryableField(Queryable):
     def at(self, frame: int) -> Gaussians:
         return self.run.gaussians
 
-    def wanted(self, question: Question, frame: int) -> Wanted:
+    def prompt(self, question: Question, frame: int) -> Prompt:
         run, source, negatives = self.run, self._source, question.negatives
         if question.text is not None:
             return self._read(question.text, negatives)
@@ -85,15 +85,15 @@ class QueryableField(Queryable):
                 name = names[int((codes @ vector).argmax())]
                 return self._read(name, negatives)._replace(meant=name)
         against = negatives or ()
-        return Wanted(np.stack([vector, *(run.encoder.embed_text(text) for text in against)]), against)
+        return Prompt(np.stack([vector, *(run.encoder.embed_text(text) for text in against)]), against)
 
-    def like(self, row: int, frame: int) -> Wanted:
+    def like(self, row: int, frame: int) -> Prompt:
         stored = self.run.stored
         vector = jnp.matmul(stored.field.lift, stored.features()[row], precision="highest")
-        return Wanted(np.asarray(vector)[None])
+        return Prompt(np.asarray(vector)[None])
 
-    def scorer(self, wanted: Wanted, frame: int) -> Callable[[], Float[Array, "n"]]:
-        return partial(self.run.stored.scores, wanted.vectors)
+    def scorer(self, prompt: Prompt, frame: int) -> Callable[[], Float[Array, "n"]]:
+        return partial(self.run.stored.scores, prompt.vectors)
 
     def about(self, question: Question, frame: int) -> dict[str, Any]:
         image = None if question.image is None else str(question.image)
@@ -154,8 +154,8 @@ class QueryableField(Queryable):
         write_png(folder / "overview.png", in_rows(panels, len(panels) // 2, _PANEL_HEIGHT))
         return pixels
 
-    def _read(self, text: str, negatives: tuple[str, ...] | None) -> Wanted:
-        return read_text(self._source, text, negatives, lambda: self.run.encoder)
+    def _read(self, text: str, negatives: tuple[str, ...] | None) -> Prompt:
+        return encoded_prompt(self._source, text, negatives, lambda: self.run.encoder)
 
     def _of_image(self, path: Path) -> np.ndarray:
         """The vector of a picture."""

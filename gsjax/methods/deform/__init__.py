@@ -37,7 +37,7 @@ from gsjax.methods.deform.graph import (
     graph_of,
     seen_ids,
 )
-from gsjax.methods.deform.meaning import Lesson, Meaning, counted_ids, wanted_like, wanted_text
+from gsjax.methods.deform.meaning import Lesson, Meaning, counted_ids, feature_prompt, text_prompt
 from gsjax.methods.deform.method import Deform, Kept, Problem, batch_of, with_field
 from gsjax.methods.deform.nodes import nodes_of
 from gsjax.methods.deform.poses import refined_viewmats, times_of
@@ -86,6 +86,7 @@ __all__ = [
     "deform_loss",
     "facts_of_sights",
     "feature_loss",
+    "feature_prompt",
     "frame_graphs",
     "graph_loss",
     "graph_nodes",
@@ -101,8 +102,7 @@ __all__ = [
     "seen_ids",
     "start_gaussians",
     "step",
+    "text_prompt",
     "times_of",
-    "wanted_like",
-    "wanted_text",
     "with_field",
 ]

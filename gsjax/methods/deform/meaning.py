@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, Int
 from gsjax.methods.deform.query import prompt_probabilities
 from gsjax.methods.deform.questions import plain_words
 from gsjax.methods.protocols import LanguageEncoder
-from gsjax.methods.query import Wanted, read_text
+from gsjax.methods.query import Prompt, encoded_prompt
 
 _NEARLY = 0.95  # share of the pixels of a teacher's cell that have to count, for the cell to count
 
@@ -78,17 +78,17 @@ def counted_ids(
     return np.where(share > _NEARLY, ids, -1)
 
 
-def wanted_text(
+def text_prompt(
     meaning: Meaning,
     text: str,
     negatives: tuple[str, ...] | None = None,
     encoder: Callable[[], LanguageEncoder] | None = None,
-) -> Wanted:
-    """What a text means: one of the scene's names, or what the encoder of its features reads in it.
+) -> Prompt:
+    """The prompt of a text: one of the scene's names, or any text that the encoder of its features reads.
 
     Args:
         meaning: of the scene's features.
-        text: what is looked for.
+        text: of the query.
         negatives: texts to compare with (default: the source's own). Of no use for names.
         encoder: loads the encoder that reads texts (default: the source's own). Not called for names.
 
@@ -100,22 +100,22 @@ def wanted_text(
     if meaning.source.kind == "classes" or plain_words(text) in map(plain_words, meaning.names):
         if negatives is not None:
             raise ValueError("--negatives: a name is compared with the other names; leave it out")
-        return _among(meaning, meaning.codebook, row_of(meaning.names, text))
+        return _among(meaning, meaning.codebook, _row_of(meaning.names, text))
     try:
         loaded = meaning.source.encoder() if encoder is None else encoder()
     except ValueError as error:
         raise ValueError(f"{error}; or by a name: {', '.join(meaning.names)}") from error
-    wanted = read_text(meaning.source, text, negatives, lambda: loaded)
-    if wanted.vectors.shape[1] != len(meaning.basis):
+    prompt = encoded_prompt(meaning.source, text, negatives, lambda: loaded)
+    if prompt.vectors.shape[1] != len(meaning.basis):
         raise ValueError(
             f"expected texts of {len(meaning.basis)} numbers like these features, found "
-            f"{wanted.vectors.shape[1]}: --weights are those of another encoder"
+            f"{prompt.vectors.shape[1]}: --weights are those of another encoder"
         )
-    return wanted._replace(vectors=_of_length_one(wanted.vectors) @ meaning.basis)
+    return prompt._replace(vectors=_of_length_one(prompt.vectors) @ meaning.basis)
 
 
-def wanted_like(meaning: Meaning, feature: Float[np.ndarray, "c"]) -> Wanted:
-    """What is like a feature: it stands in for the code that is the most like it, and is compared with the
+def feature_prompt(meaning: Meaning, feature: Float[np.ndarray, "c"]) -> Prompt:
+    """The prompt of a feature: it replaces the code that is the most like it, and is compared with the
     others."""
     likely = prompt_probabilities(jnp.asarray(feature), jnp.asarray(meaning.codebook))
     row, vectors = int(np.asarray(likely).argmax()), np.array(meaning.codebook)
@@ -123,26 +123,22 @@ def wanted_like(meaning: Meaning, feature: Float[np.ndarray, "c"]) -> Wanted:
     return _among(meaning, vectors, row)
 
 
-def row_of(names: tuple[str, ...], text: str) -> int:
-    """The row of the name that a text is.
-
-    Raises:
-        ValueError: it is none of them.
-    """
-    known, wanted = [plain_words(name) for name in names], plain_words(text)
-    if wanted not in known:
+def _row_of(names: tuple[str, ...], text: str) -> int:
+    """The row of a name; raises a ValueError for a text that is none of them."""
+    known, name = [plain_words(one) for one in names], plain_words(text)
+    if name not in known:
         raise ValueError(
             f"no class {text!r}; this scene knows names alone, and there are: {', '.join(known)}"
         )
-    return known.index(wanted)
+    return known.index(name)
 
 
-def _among(meaning: Meaning, vectors: Float[np.ndarray, "k c"], row: int) -> Wanted:
+def _among(meaning: Meaning, vectors: Float[np.ndarray, "k c"], row: int) -> Prompt:
     """The vector in a row, compared with the others."""
     others = [other for other in range(len(vectors)) if other != row]
     against = tuple(meaning.names[other] for other in others)
     ordered = _of_length_one(vectors)[[row, *others]]
-    return Wanted(ordered, against, meaning.names[row], rule="better than each other name")
+    return Prompt(ordered, against, meaning.names[row], rule="better than each other name")
 
 
 def _of_length_one(vectors: Float[np.ndarray, "k c"]) -> Float[np.ndarray, "k c"]:

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from gsjax.geometry.cameras import Camera
-from gsjax.methods.deform.meaning import Meaning, wanted_text
+from gsjax.methods.deform.meaning import Meaning, text_prompt
 from gsjax.methods.deform.poses import times_of
 from gsjax.methods.deform.query import prompt_probabilities
 from gsjax.methods.deform.update import DeformingScene, Moving
@@ -99,7 +99,7 @@ class DeformResult:
         negatives: tuple[str, ...] | None = None,
         encoder: Callable[[], LanguageEncoder] | None = None,
     ) -> Float[Array, "n"]:
-        """Scores of Gaussians for a text, at a time; see `gsjax.methods.query.Wanted.scores`.
+        """Scores of Gaussians for a text, at a time; see `gsjax.methods.query.Prompt.scores`.
 
         Args:
             text: one of `names`, or what the encoder of the features reads.
@@ -108,12 +108,12 @@ class DeformResult:
             encoder: loads the encoder that reads texts (default: that of the features).
 
         Raises:
-            ValueError: the scene has no features with a meaning, no class has the name, or nobody reads texts
-                in these features' space.
+            ValueError: the scene has no features with a meaning, no class has the name, or no encoder reads
+                texts in these features' space.
             FileNotFoundError: weights of the encoder are not there.
         """
         meaning = self._expect_features()
-        return wanted_text(meaning, text, negatives, encoder).scores(self.features_at([time])[0])
+        return text_prompt(meaning, text, negatives, encoder).scores(self.features_at([time])[0])
 
     def probabilities(self, time: float = 0.0) -> Float[Array, "n names"]:
         """How likely each Gaussian is each of `names` at a time, 0 to 1; see `prompt_probabilities`.

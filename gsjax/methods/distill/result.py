@@ -16,7 +16,7 @@ from jaxtyping import Array, ArrayLike, Float, Int
 from gsjax.methods.distill.field import FeatureField, at_means, features_of
 from gsjax.methods.distill.query import gaussian_cosines
 from gsjax.methods.protocols import LanguageEncoder
-from gsjax.methods.query import read_text, relevancy
+from gsjax.methods.query import encoded_prompt, relevancy
 from gsjax.scene.feature_grid import FeatureGrid, Located
 
 FORMAT = 1
@@ -103,7 +103,7 @@ class DistillResult:
         which is above 1/2 where the text fits better than each of them.
 
         Args:
-            text: what is looked for: "red can".
+            text: of the query: "red can".
             negatives: texts to compare with (default: those of the source; none where it is not known).
             encoder: reads texts in the space of the teacher's features (default: that of the source).
 
@@ -112,7 +112,7 @@ class DistillResult:
             FileNotFoundError: the encoder's weights are not there.
         """
         reader = None if encoder is None else lambda: encoder
-        return self.scores(read_text(self.source, text, negatives, reader).vectors)
+        return self.scores(encoded_prompt(self.source, text, negatives, reader).vectors)
 
     def write(self, path: str | os.PathLike) -> None:
         """Write field.npz, which `gsjax query` and `gsjax view` read beside the scene.

@@ -25,7 +25,7 @@ from gsjax.engine.teaching.source import Source
 from gsjax.engine.viewables import open_viewable
 from gsjax.io.ply import read_ply, write_ply
 from gsjax.io.video import read_video_frames
-from gsjax.methods.deform import Deform, DeformConfig, Kept, Meaning, wanted_like, with_field
+from gsjax.methods.deform import Deform, DeformConfig, Kept, Meaning, feature_prompt, with_field
 from gsjax.methods.deform.query import (
     most_likely,
     prompt_probabilities,
@@ -77,7 +77,7 @@ def run(taught, tmp_path):
 
 
 def asked(run):
-    return json.loads((run / "query" / "query.json").read_text())
+    return json.loads((run / "query" / "query.json").encoded_prompt())
 
 
 def test_a_name_is_found_and_deleted_in_every_frame(gsjax, run):
@@ -208,7 +208,7 @@ def test_a_run_is_seen_over_time_and_asked(run):
 
 def test_a_run_whose_recording_is_gone(run):
     config = run / "config.yml"
-    config.write_text(config.read_text().replace(SCENE, "/nowhere/recording"))
+    config.write_text(config.encoded_prompt().replace(SCENE, "/nowhere/recording"))
     scene, _ = open_viewable(run, notes := Notes(Console(quiet=True)))
     assert any("its photographs are not shown" in note for note in notes.all)
     assert scene.shots.load_image is None
@@ -247,7 +247,7 @@ def test_a_prompt_of_a_feature_is_told_apart_from_the_other_names():
     rng = np.random.default_rng(0)
     codebook = np.linalg.qr(rng.normal(size=(6, 6)))[0][:3]
     meaning = Meaning(Source("files"), ("a", "b", "c"), codebook, np.eye(6))
-    wanted = wanted_like(meaning, 0.2 * (codebook[2] + 0.4 * codebook[0]))
+    wanted = feature_prompt(meaning, 0.2 * (codebook[2] + 0.4 * codebook[0]))
     assert (wanted.meant, wanted.against) == ("c", ("a", "b"))
     np.testing.assert_allclose(wanted.vectors[1:], codebook[:2], atol=1e-12)
     said = np.asarray(prompt_probabilities(jnp.asarray(codebook), jnp.asarray(wanted.vectors)))

@@ -22,7 +22,7 @@ from gsjax.engine.deform.teacher import GROUPS, basis_of, groups_of
 from gsjax.engine.messages import Notes
 from gsjax.engine.teaching.choice import TeacherChoice
 from gsjax.engine.teaching.source import Source
-from gsjax.methods.deform import Deform, DeformConfig, Meaning, counted_ids, wanted_like, wanted_text
+from gsjax.methods.deform import Deform, DeformConfig, Meaning, counted_ids, feature_prompt, text_prompt
 from tests.cli.deform.test_command import SCENE, SMALL
 from tests.perception.test_foundation import clip_folder, needs_foundation  # noqa: F401
 
@@ -60,7 +60,7 @@ def learned(files, tmp_path_factory):
 
 def query(run, *options):
     assert main(["query", *map(str, (run, *options))]) == 0
-    return json.loads((run / "query" / "query.json").read_text())
+    return json.loads((run / "query" / "query.json").encoded_prompt())
 
 
 def data_of(features, folder, channels=4, **asked):
@@ -70,7 +70,7 @@ def data_of(features, folder, channels=4, **asked):
 
 
 def test_feature_files_are_learned_and_judged_on_their_grid(learned):
-    found = json.loads((learned / "metrics.json").read_text())
+    found = json.loads((learned / "metrics.json").encoded_prompt())
     assert found["features"] == "files"
     assert found["names"] == ["group 1", "group 2"]
     assert [row["f_psnr"] is None for row in found["scores"]] == [False, False]
@@ -156,7 +156,7 @@ def test_the_closed_vocabulary_teaches_and_reads(tmp_path):
     """Tissue is pink and the tool grey; who asks for a colour finds the Gaussians of it."""
     data, said = data_of("closed", tmp_path, 16)
     assert "no foundation model" in said
-    wanted = wanted_text(data.meaning, "grey")
+    wanted = text_prompt(data.meaning, "grey")
     scores = np.asarray(wanted.scores(jnp.asarray(data.lesson.codebook, jnp.float32)))
     threshold = wanted.threshold(scores)
     assert threshold.rule == "the encoder's own"
@@ -165,7 +165,7 @@ def test_the_closed_vocabulary_teaches_and_reads(tmp_path):
     assert (scores[ids[mask == 0]] < threshold.value).all()
     with pytest.raises(ValueError, match="--weights"):
         data.meaning.source.encoder(Path("x"))
-    assert wanted_text(data.meaning, "Group 2").meant == "group 2"  # its names are its own
+    assert text_prompt(data.meaning, "Group 2").meant == "group 2"  # its names are its own
     assert "or one of: group 1, group 2" in data.meaning.hint()
 
 
@@ -239,16 +239,16 @@ def test_clip_teaches_and_reads(tmp_path, request, monkeypatch):
 def test_classes_are_named_and_nothing_else():
     names = ("tissue", "tool")
     meaning = Meaning(Source("classes", dict(enumerate(names, 1))), names, np.eye(2), np.eye(5, 2))
-    assert wanted_text(meaning, "Tool").meant == "tool"
+    assert text_prompt(meaning, "Tool").meant == "tool"
     with pytest.raises(ValueError, match="--negatives: a name is compared with the other names"):
-        wanted_text(meaning, "tool", ("x",))
+        text_prompt(meaning, "tool", ("x",))
     with pytest.raises(ValueError, match="no class 'forceps'"):
-        wanted_text(meaning, "forceps")
+        text_prompt(meaning, "forceps")
 
 
 def test_a_place_is_told_apart_from_the_other_names():
     meaning = Meaning(Source("files"), ("a", "b"), np.eye(2), np.eye(5, 2))
-    wanted = wanted_like(meaning, np.array([0.1, 0.9]))
+    wanted = feature_prompt(meaning, np.array([0.1, 0.9]))
     assert (wanted.meant, wanted.against) == ("b", ("a",))
     scores = np.asarray(wanted.scores(jnp.array([[1.0, 0], [0.1, 0.9], [0, 0]])))
     assert scores[1] > 0.99 > 0.5 > scores[0]
@@ -259,7 +259,7 @@ def test_what_was_asked_for_is_meant_however_alike_the_names_are():
     """Groups of CLIP's features, say, whose cosines are 0.9: a share among all of eight would be 0.28."""
     codebook = np.sqrt(0.9) * np.eye(9)[[0] * 8] + np.sqrt(0.1) * np.eye(9)[1:]
     names = tuple(f"group {n}" for n in range(1, 9))
-    wanted = wanted_like(Meaning(Source("files"), names, codebook, np.eye(9)), 0.3 * codebook[4])
+    wanted = feature_prompt(Meaning(Source("files"), names, codebook, np.eye(9)), 0.3 * codebook[4])
     scores = np.asarray(wanted.scores(jnp.asarray(codebook)))
     assert wanted.threshold(scores).value == 0.5
     np.testing.assert_array_equal(np.flatnonzero(scores > 0.5), [4])

@@ -79,7 +79,7 @@ def test_a_tracked_run_answers_what_only_its_field_can(gsjax, run, pristine):
 def test_a_tracked_run_without_a_field_says_so(gsjax, tracked, option, value):
     code, said = gsjax("query", tracked, "can", option, value)
     assert code == 2
-    assert f"{option}: {tracked} has no field that could be asked so; gsjax distill" in said
+    assert f"{option}: {tracked} has no field that could be queried so; gsjax distill" in said
 
 
 @pytest.mark.parametrize("command", ["query", "grasp"])
