@@ -1,4 +1,4 @@
-"""`gsjax ask`: questions on a deforming scene in plain English, answered by what is measured of it."""
+"""`gsjax ask`: questions about a deforming scene in plain English, answered from its measurements."""
 
 import json
 from dataclasses import dataclass
@@ -24,8 +24,8 @@ from gsjax.methods.deform import (
 )
 
 HELP = (
-    ' As in `gsjax ask RUN "how far is the tool from the tissue in frame 12?"`; without a question it says '
-    "what can be asked. The run is to know what is what: `gsjax deform DATASET --tools draw --out RUN`."
+    ' As in `gsjax ask RUN "how far is the tool from the tissue in frame 12?"`; without a question it lists '
+    "what can be asked. The run needs features with a meaning: `gsjax deform DATASET --tools draw --out RUN`."
 )
 
 
@@ -36,13 +36,13 @@ class Options(Common):
     run: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
     """Folder of a run of `gsjax deform`."""
     question: Annotated[str | None, tyro.conf.Positional, tyro.conf.arg(metavar="[QUESTION]")] = None
-    """In plain English. Unless given, what can be asked is listed."""
+    """The question, in plain English (default: list what can be asked)."""
     json: bool = False
     """Print JSON: the answer, its value and unit, and the facts that it rests on."""
 
 
 def run(options: Options) -> int:
-    """Answer a question, or say what can be asked; returns the exit code.
+    """Answer a question, or list what can be asked; returns the exit code.
 
     Raises:
         ValueError, OSError: there is no such run, it has no meaning, or the question cannot be answered.
@@ -82,7 +82,7 @@ def run(options: Options) -> int:
 
 
 def _used(asked: Question, facts: SceneFacts) -> dict[str, Any]:
-    """The facts that an answer rests on."""
+    """The facts on which an answer rests."""
     steps = zip(range(len(facts.frames)), range(1, len(facts.frames)), strict=False)
     return {
         "unit": facts.unit,
@@ -93,7 +93,7 @@ def _used(asked: Question, facts: SceneFacts) -> dict[str, Any]:
 
 
 def _in_words(result: DeformResult, rows: list[int]) -> str:
-    """Which frames are looked at."""
+    """The frames that are measured, in words."""
     frames = [str(result.timeline.frame_ids[row]) for row in rows]
     if len(rows) == 1:
         return f"frame {frames[0]}"

@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 import yaml
 
-from gsjax.engine.folder import expect_run
+from gsjax.engine.folder import expect_run, is_run
 
 Kind = Literal["fit", "track", "parts", "distill", "deform"]
 EVALUATION = Path("eval", "metrics.json")
@@ -76,6 +76,14 @@ def read_record(path: Path) -> Record:
             f"{path}: the scores of `gsjax eval` are of an earlier scene and are left out; run it again.",
         )
     return Record(path, kind, config, metrics, _lines(path / "metrics.jsonl", kind), evaluation, notes)
+
+
+def kind_of(path: Path) -> Kind | None:
+    """The command that made the run in a folder; None if there is no run, or one of another command."""
+    try:
+        return _kind(path, read_config(path / "config.yml")) if is_run(path) else None
+    except ValueError:
+        return None
 
 
 def digest(file: Path) -> str | None:

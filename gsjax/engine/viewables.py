@@ -3,25 +3,33 @@
 from dataclasses import fields
 from pathlib import Path
 
+import jax.numpy as jnp
 import numpy as np
 import yaml
 
+from gsjax.data.ordered import open_as_sequence
 from gsjax.data.photographs import Photographs
 from gsjax.engine.deform.file import NAME as DEFORMATION
-from gsjax.engine.deform.viewer import viewable_deformation
+from gsjax.engine.deform.file import read_deformation
+from gsjax.engine.deform.query import QueryableScene, probabilities_of
 from gsjax.engine.distill.file import NAME
+from gsjax.engine.distill.query import QueryableField
 from gsjax.engine.distill.saved import AS_IT_WAS, FieldRun, Whereabouts, field_of, open_field_run
-from gsjax.engine.distill.viewer import asking_of
-from gsjax.engine.files import read_drawable
+from gsjax.engine.files import read_drawable, reopen
 from gsjax.engine.folder import expect_run
 from gsjax.engine.messages import Notes, describe
 from gsjax.engine.parts.saved import blend_of, open_parts_run, read_parts
 from gsjax.engine.parts.viewer import Filmed, camera_names, editing_of
 from gsjax.engine.photographs import photographs_of_run
+from gsjax.engine.query import asking_of
 from gsjax.engine.recording import Recording
 from gsjax.engine.track.saved import open_run, read_tracking
+from gsjax.methods.deform import DeformResult
+from gsjax.methods.deform.query import most_likely
 from gsjax.viz.colors import to_uint8
-from gsjax.viz.viewer import Shots, Viewable, moved
+from gsjax.viz.viewer import Motion, Shots, Viewable, moved
+
+_AGAIN = "reconstruct it again with this version of gsjax"
 
 
 def open_viewable(path: Path, notes: Notes, now: Whereabouts = AS_IT_WAS) -> tuple[Viewable, Path]:
@@ -50,7 +58,7 @@ def open_viewable(path: Path, notes: Notes, now: Whereabouts = AS_IT_WAS) -> tup
     expect_run(path)
     if (path / DEFORMATION).is_file():
         _expect_only(("weights",), now, f"{path} is a run that deforms")
-        return viewable_deformation(path, notes, now.weights), path
+        return _of_deformation(path, notes, now.weights), path
     if not (path / "scene.ply").is_file():
         raise FileNotFoundError(
             f"{path}: expected a run with scene.ply, found none: it is not finished, or of a command that "
@@ -85,7 +93,7 @@ def _of_field(path: Path, notes: Notes, now: Whereabouts) -> Viewable:
         shots=None if run.photographs is None else _shots_of(run.photographs),
         antialiased=run.rasterize_mode == "antialiased",
         unit=run.unit,
-        asking=asking_of(run),
+        asking=asking_of(QueryableField(run, many=True)),
     )
 
 
@@ -139,7 +147,32 @@ def _of_fit(path: Path, notes: Notes, now: Whereabouts) -> Viewable:
         shots=shots,
         background=background,
         antialiased=antialiased,
-        asking=None if field is None else asking_of(field),
+        asking=None if field is None else asking_of(QueryableField(field, many=True)),
+    )
+
+
+def _of_deformation(path: Path, notes: Notes, weights: Path | None) -> Viewable:
+    """The scene of a run of `gsjax deform` over time, with its photographs where its recording still is; it
+    can be queried if its features have a meaning."""
+    result = read_deformation(path / DEFORMATION)
+    kind = None if result.meaning is None else result.meaning.source.kind
+    if weights is not None and kind in (None, "classes", "closed"):
+        raise ValueError(f"--weights: {path} has learned nothing of CLIP; leave it out")
+    first, labels, asking, times = result.at(0.0), None, None, result.timeline.times
+    if result.meaning is not None and first.features is not None:
+        asking = asking_of(QueryableScene(path, result, weights))
+        likely = probabilities_of(first.features, jnp.asarray(result.meaning.codebook, jnp.float32))
+        labels = 1 + most_likely(np.asarray(likely))
+    return Viewable(
+        path.absolute().name,
+        first,
+        labels,
+        dict(enumerate(result.names, 1)),
+        motion=Motion(len(times), first.num, lambda frame: result.at(times[frame])),
+        times=times * result.timeline.seconds,
+        shots=_shots_of_deformation(path, result, notes),
+        unit="m" if result.timeline.metric else "",
+        asking=asking,
     )
 
 
@@ -206,3 +239,18 @@ def _shots_of_recording(recording: Recording) -> Shots:
         np.tile([sequence.width, sequence.height], (len(names), 1)),
         load_image=lambda t, v: to_uint8(np.asarray(sequence.image(t, v))),
     )
+
+
+def _shots_of_deformation(path: Path, result: DeformResult, notes: Notes) -> Shots:
+    """The camera in all frames, with its photographs if these are still there."""
+    load = None
+    try:
+        sequence = reopen(path / "config.yml", _AGAIN, opened=open_as_sequence)[0].judged
+        found = (sequence.num_frames, sequence.width, sequence.height)
+        if found != (wanted := (len(result.timeline.times), *result.timeline.size)):
+            raise ValueError(f"expected frames, width and height {wanted} as then, found {found}")
+        load = lambda t, _: sequence.image(t, 0)  # noqa: E731
+    except (ValueError, OSError) as error:
+        notes.warn(f"its photographs are not shown: {describe(error)}")
+    sizes = np.array([result.timeline.size])
+    return Shots(("camera",), result.viewmats[:, None], result.timeline.Ks[:, None], sizes, load_image=load)

@@ -26,12 +26,11 @@ from gsjax.methods.distill import (
     majority_labels,
     pixel_cosines,
     pixel_features,
-    relevancy,
     rendered_features,
     teacher_of_maps,
     teacher_of_objects,
-    threshold_for,
 )
+from gsjax.methods.query import relevancy, threshold_for
 from gsjax.rasterize.frozen import paint, paint_shown
 from gsjax.scene.feature_grid import FeatureGridConfig, locate
 from gsjax.scene.gaussians import gaussians_from_activated

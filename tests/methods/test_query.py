@@ -42,5 +42,5 @@ def test_it_maps_over_queries():
 def test_what_cannot_be_compared_is_refused():
     with pytest.raises(ValueError, match="expected at least one object"):
         find_object(jnp.zeros(2), jnp.zeros((0, 2)))
-    with pytest.raises(ValueError, match=r"expected shape \[2\] as the objects\', found \(3,\)"):
+    with pytest.raises(ValueError, match=r"expected shape \[2\] as the objects', found \(3,\)"):
         find_object(jnp.zeros(3), OBJECTS)

@@ -35,8 +35,8 @@ class DeformData:
         sequence: camera 0 is the one that is learned from; others are only judged.
         train: indices of frames to learn from.
         test: indices of frames that are held out.
-        frames: what the camera saw in the former.
-        taught: what the teacher says about the frames; None without a teacher.
+        frames: the frames to learn from, in memory.
+        taught: the teacher's labels of the frames; None without a teacher.
         tool_values: mask values that are tools; those with names of tools where there is none.
     """
 
@@ -49,7 +49,7 @@ class DeformData:
 
     @property
     def times(self) -> Float[np.ndarray, "t"]:
-        """Of all frames, 0 to 1."""
+        """Times of all frames, 0 to 1."""
         return unit_times(self.sequence)
 
     @property
@@ -64,14 +64,14 @@ class DeformData:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of what features tell apart; none without a teacher."""
+        """Names of the classes or groups of features; none without a teacher."""
         return () if self.meaning is None else self.meaning.names
 
     @property
     def first(self) -> int | None:
-        """Index in `frames` of the one that the canonical scene is to be like: the earliest that shows most
-        of the classes, for what it does not show has no Gaussians of its own. None without classes, or where
-        the scene can start from none of them."""
+        """Index in `frames` of the frame that the canonical scene starts from: the earliest that shows most
+        of the classes, because what it does not show has no Gaussians of its own. None without classes, or
+        where the scene can start from none of these frames."""
         if self.lesson is None or self.meaning is None or self.meaning.source.kind != "classes":
             return None
         shown = np.zeros(len(self.frames), int)
@@ -99,13 +99,13 @@ class DeformData:
         return Labels(self.lesson.ids[self.train.index(t)], self.lesson.codebook)
 
     def frame(self, t: int, camera: int, tools: Tools, mask: Int[np.ndarray, "h w"] | None = None) -> Frame:
-        """What one camera saw in a frame, on the host.
+        """A frame of one camera, on the host.
 
         Args:
             t: index of the frame.
             camera: index of the camera.
             tools: whether pixels of tools count.
-            mask: the frame's own, where it was read before.
+            mask: labels of the frame, if they were read before.
         """
         seen, counts = self.sequence, None
         if tools == "leave-out" and seen.has_masks:
@@ -164,8 +164,8 @@ def deform_data(
             count. "none": no teacher.
         channels: of a Gaussian's feature.
         tool_values: mask values that are tools; those with names of tools where there is none.
-        notes: receives what is odd.
-        console: shows progress.
+        notes: receives oddities of the data.
+        console: shows the progress.
 
     Raises:
         ValueError: there are too many classes, or too few that classes are asked for; features do not fit; or

@@ -1,4 +1,4 @@
-"""Where the depth comes from that `gsjax deform` begins with: the data, two eyes, or nowhere."""
+"""The depth that `gsjax deform` begins with: the data's, matched between two cameras, or none."""
 
 from dataclasses import replace
 from typing import Literal
@@ -14,17 +14,17 @@ DepthSource = Literal["data", "stereo", "plane"]
 
 
 def with_depth(sequence: Sequence, wanted: Depth, plane: float, notes: Notes) -> tuple[Sequence, DepthSource]:
-    """The recording with depth of camera 0, and where that is from: its own, else matched with camera 1, else
-    none, and then the scene begins on a plane. Lengths are metres, as far as the data's are, unless it does.
+    """The recording with depth of camera 0, and its source: the recording's own, else matched with camera 1,
+    else none: the scene then begins on a plane. Lengths are metres if the data's are, except on a plane.
 
     Args:
         sequence: camera 0 is learned from.
-        wanted: which of them; "auto" takes the first of the three that there is.
-        plane: how far before the first camera the plane lies, in the unit of the poses.
-        notes: receives which it is.
+        wanted: the source; "auto" takes the first of the three that exists.
+        plane: distance of the plane from the first camera, in the unit of the poses.
+        notes: receives the source.
 
     Raises:
-        ValueError: depth of the kind that is wanted is not there.
+        ValueError: there is no depth of the wanted kind.
     """
     two = sequence.num_cameras > 1
     if wanted == "data" and not sequence.has_depth:
@@ -74,7 +74,7 @@ def _of_two_eyes(sequence: Sequence, notes: Notes) -> tuple[Sequence, DepthSourc
 
 
 def _of_a_plane(sequence: Sequence, plane: float, notes: Notes) -> tuple[Sequence, DepthSource]:
-    """Nothing that is known in metres is kept, as the scene has another unit."""
+    """The first camera alone, without what is known in metres, because the scene has another unit."""
     notes.add(
         f"There is no depth: the scene began on a plane {plane:g} before the first camera. Its depth is of "
         "no metric unit, nothing but pictures teaches it, and it is not judged."
@@ -89,8 +89,8 @@ def _of_a_plane(sequence: Sequence, plane: float, notes: Notes) -> tuple[Sequenc
         )
     else:
         notes.warn(
-            f"{sequence.name}: the camera moves by {moved:.3g}, and how far the scene is, nothing says; tell "
-            f"about how far with --deform.plane-depth (now {plane:g}), in the unit of the poses"
+            f"{sequence.name}: the camera moves by {moved:.3g}, and the distance of the scene is not known; "
+            f"give about how far it is with --deform.plane-depth (now {plane:g}), in the unit of the poses"
         )
     alone = sequence.select(cameras=[sequence.camera_ids[0]])
     names = alone.names_of_labels  # some of which may be truth's

@@ -21,7 +21,7 @@ def write_deformation(path: str | os.PathLike, result: DeformResult) -> None:
     """Write a deforming scene to `path`, a checkpoint (`gsjax.io.checkpoints`); atomic.
 
     Args:
-        path: where; `.npz` by custom.
+        path: the file; its suffix is `.npz` by custom.
         result: the scene.
     """
     save_checkpoint(path, result)
@@ -63,7 +63,7 @@ def warn_of_partial(path: Path, notes: Notes) -> None:
 
 
 def _misfit(result: DeformResult) -> str | None:
-    """What of a result cannot be, in words; None where all fits."""
+    """The first inconsistency of a result, in words; None if there is none."""
     gaussians, timeline, meaning = result.scene.gaussians, result.timeline, result.meaning
     frames = len(timeline.times)
     if not frames or not frames == len(timeline.frame_ids) == len(timeline.viewmats) == len(timeline.Ks):
@@ -84,7 +84,7 @@ def _misfit(result: DeformResult) -> str | None:
 
 
 def _misfit_of_moving(moving: Moving, count: int) -> str | None:
-    """The same of where the field is evaluated, for this many Gaussians."""
+    """The same of the places where the field is evaluated, for `count` Gaussians."""
     if moving is None:
         return None
     bounded = {"rows": (moving.rows if isinstance(moving, Nodes) else moving, count)}

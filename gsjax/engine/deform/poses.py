@@ -1,4 +1,4 @@
-"""Poses that `gsjax deform` refined: the recording as it was found to be seen, and how far that is off."""
+"""Poses that `gsjax deform` refined: the recording with these, and how far they are from the given ones."""
 
 from dataclasses import replace
 from typing import Any
@@ -12,14 +12,22 @@ from gsjax.io.atomic import write_npz
 from gsjax.methods.deform import DeformingScene, Problem, refined_viewmats, times_of
 
 NAME = "poses.npz"
-"""View matrices that were found, of all frames and cameras, in the folder of a run."""
+"""Refined view matrices of all frames and cameras, in the folder of a run."""
 
 
 def as_refined(
     folder: RunFolder, problem: Problem, scene: DeformingScene, data: DeformData, notes: Notes
 ) -> tuple[DeformData, dict[str, Any] | None]:
-    """The data with poses as they were found, which are also written, and the part of metrics.json on them;
-    the data themselves and None where poses stand as given."""
+    """The data with refined poses, which are also written, and the entry of metrics.json about them; the data
+    as they are and None where poses were not refined.
+
+    Args:
+        folder: of the run.
+        problem: what was learned from.
+        scene: the result.
+        data: the recording, with the poses as given.
+        notes: receives how poses are judged.
+    """
     if scene.twists is None:
         return data, None
     given = data.sequence.viewmats
@@ -29,8 +37,8 @@ def as_refined(
     arrays = {"viewmats": found, "frame_ids": sequence.frame_ids, "camera_ids": sequence.camera_ids}
     write_npz(folder.path / NAME, arrays)
     notes.add(
-        f"Poses were refined ({NAME}), and are judged so: a held-out frame's by what its neighbours in time "
-        "were found to be off by, without a look at its picture."
+        f"Poses were refined ({NAME}), and frames are judged with these: that of a held-out frame by the "
+        "corrections of its neighbours in time, without its picture."
     )
     turned, moved = _apart(given[:, 0], found[:, 0])
     return replace(data, sequence=sequence), {
@@ -40,7 +48,7 @@ def as_refined(
 
 
 def _apart(given: np.ndarray, found: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Degrees between view matrices, and how far apart their cameras are in the unit of the poses."""
+    """Angles between view matrices, degrees, and distances of their cameras, in the unit of the poses."""
     between = found[:, :3, :3] @ np.swapaxes(given[:, :3, :3], 1, 2)
     turned = np.rad2deg(np.arccos(np.clip((np.trace(between, axis1=1, axis2=2) - 1) / 2, -1, 1)))
     centers = [-np.einsum("tji,tj->ti", v[:, :3, :3], v[:, :3, 3]) for v in (given, found)]

@@ -1,250 +1,282 @@
-"""`gsjax query` on a run of `gsjax deform`: the Gaussians that a text, a point or a box means, or what all of
-them are, at every time."""
+"""Queries of a run of `gsjax deform`: the Gaussians that a text, a point or a box means, or what all of them
+are, at every time."""
 
-from collections.abc import Callable
-from dataclasses import dataclass
-from functools import partial
+from collections.abc import Callable, Iterator, Sequence
+from functools import cached_property, partial
 from pathlib import Path
 from time import perf_counter
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Array, Bool, Float
 from rich.console import Console
+from rich.progress import track
 
-from gsjax.engine.deform.pictures import draw, draw_labels, probabilities_of
 from gsjax.engine.folder import OF_QUERY, replaced_folder
 from gsjax.engine.messages import Notes
+from gsjax.engine.pictures import frame_rate
+from gsjax.engine.query import SCENE_CAPTIONS, Queryable, Question, Selection, write_mask
 from gsjax.engine.recording import parse_frames
-from gsjax.engine.selected import Changes, write_scenes, write_selection
+from gsjax.geometry.cameras import Camera
 from gsjax.io.atomic import write_json, write_npz
+from gsjax.io.pictures import write_png
 from gsjax.io.ply import write_ply
-from gsjax.methods.deform import DeformResult, Prompt, feature_prompt, text_prompt
-from gsjax.methods.deform.query import most_likely, region_feature
+from gsjax.io.video import VideoWriter
+from gsjax.methods.deform import DeformResult, feature_prompt, text_prompt
+from gsjax.methods.deform.query import most_likely, prompt_probabilities, region_feature
+from gsjax.methods.protocols import LanguageEncoder
+from gsjax.methods.query import Prompt
+from gsjax.rasterize.plan import Plan
 from gsjax.scene.gaussians import Gaussians
 from gsjax.scene.render import render_with_room
-from gsjax.viz.colors import INVALID, label_color
+from gsjax.scene.selection import hidden
+from gsjax.viz.colors import INVALID, in_rows, label_color, overlay_labels, to_uint8
 from gsjax.viz.viewer.drawing import recolored
 
+_PANEL_HEIGHT = 240  # pixels, at least
+_OPAQUE = 0.5  # a pixel in which less of the scene shows is of nothing
 
-@dataclass(frozen=True)
-class DeformQuestion:
-    """A query of a deforming scene: one of text, point and box; without any, what everything is.
+probabilities_of = jax.jit(prompt_probabilities)
+"""`prompt_probabilities` of Gaussians or of a picture, compiled."""
+
+
+class _Seen(NamedTuple):
+    """A frame of the scene.
 
     Attributes:
-        text: one of the scene's names, or a text for the encoder of its features.
-        point: x, y in pixels of a frame, as the scene was learned.
-        box: x0, y0, x1, y1, likewise.
-        frame: the recording's number of the frame in which point and box lie, and whose Gaussians are written
-            (default: the first).
-        frames: those that pictures are made of, as a Python slice (default: the held-out ones).
-        threshold: of the score (default: by a rule).
-        negatives: texts that a text is held against, where an encoder reads it (default: the encoder's own).
-        weights: folder of CLIP's, where they are now.
+        t: its index.
+        number: the recording's own number of it.
+        gaussians: the scene in it.
+        camera: its camera.
+        plan: that it was drawn with.
+        colors: rendered, 0 to 1.
+        features: rendered, on the device.
+        there: where something of the scene is drawn.
     """
 
-    text: str | None = None
-    point: tuple[float, float] | None = None
-    box: tuple[float, float, float, float] | None = None
-    frame: int | None = None
-    frames: str | None = None
-    threshold: float | None = None
-    negatives: tuple[str, ...] | None = None
-    weights: Path | None = None
-
-    @property
-    def region(self) -> tuple[float, float, float, float] | None:
-        """The box; a point is one without extent."""
-        return self.box if self.point is None else self.point * 2
-
-    @property
-    def words(self) -> str:
-        """The query in short."""
-        if self.point is not None:
-            return "what is at {:g},{:g}".format(*self.point)
-        if self.box is not None:
-            return "what is in {:g},{:g} to {:g},{:g}".format(*self.box)
-        return "what is what" if self.text is None else repr(self.text)
+    t: int
+    number: int
+    gaussians: Gaussians
+    camera: Camera
+    plan: Plan
+    colors: Float[np.ndarray, "h w 3"]
+    features: Float[Array, "h w c"]
+    there: Bool[np.ndarray, "h w"]
 
 
-def answer_deformation(
-    path: Path,
-    result: DeformResult,
-    question: DeformQuestion,
-    changes: Changes,
-    folder: Path,
-    notes: Notes,
-    console: Console,
+class QueryableScene(Queryable):
+    """A scene that deforms."""
+
+    def __init__(self, path: Path, result: DeformResult, weights: Path | None = None):
+        """
+        Args:
+            path: of the run.
+            result: its scene.
+            weights: folder of CLIP's weights (default: where they were).
+
+        Raises:
+            ValueError: the scene has no features with a meaning.
+        """
+        meaning, gaussians = result.meaning, result.scene.gaussians
+        if meaning is None or gaussians.features is None:
+            raise ValueError(
+                f"{path}: expected a scene that knows what is what in it, found none with features: there "
+                "was one class among the pixels that counted; reconstruct it with --tools draw, or with "
+                "--features"
+            )
+        self.result, self.meaning, self._weights = result, meaning, weights
+        super().__init__(
+            path,
+            meaning.source.kind,
+            meaning.hint(weights),
+            np.arange(gaussians.num),
+            gaussians.num,
+            frame_ids=tuple(result.timeline.frame_ids.tolist()),
+        )
+
+    def frame_of(self, question: Question) -> int:
+        self.pictured(question, 0)
+        if question.frame is None:
+            return 0
+        known = self.result.timeline.frame_ids.tolist()
+        if question.frame not in known:
+            raise ValueError(f"--frame: expected one of {known[0]} to {known[-1]}, found {question.frame}")
+        return known.index(question.frame)
+
+    def pictured(self, question: Question, frame: int) -> list[int]:
+        """Indices of the frames to draw: the one in question, and those that the question names.
+
+        Raises:
+            ValueError: it names none.
+        """
+        if question.frames is None:
+            return sorted({frame, *self.result.timeline.held_out.tolist()})
+        count = len(self.result.timeline.times)
+        chosen = range(count)[parse_frames(question.frames)]
+        if not chosen:
+            raise ValueError(f"--frames: {question.frames} holds no frame of the run, which has {count}")
+        return sorted({frame, *chosen})
+
+    def at(self, frame: int) -> Gaussians:
+        return self.result.at(self.result.timeline.times[frame])
+
+    def prompt(self, question: Question, frame: int) -> Prompt:
+        if question.text is not None:
+            return text_prompt(self.meaning, question.text, question.negatives, lambda: self._encoder)
+        region = question.point * 2 if question.point is not None else question.box
+        assert region is not None
+        drawn, _ = render_with_room(self.at(frame), self.result.camera(frame))
+        assert drawn.features is not None
+        try:
+            feature = region_feature(np.asarray(drawn.features[0]), np.asarray(drawn.alphas[0]), region)
+        except ValueError as error:
+            option = "--box" if question.point is None else "--point"
+            raise ValueError(f"{option}: {error} (frame {self.result.timeline.frame_ids[frame]})") from None
+        return feature_prompt(self.meaning, feature.astype(np.float64))
+
+    def like(self, row: int, frame: int) -> Prompt:
+        return feature_prompt(self.meaning, np.asarray(self._features(frame)[row], np.float64))
+
+    def scorer(self, prompt: Prompt, frame: int) -> Callable[[], Float[Array, "n"]]:
+        return partial(prompt.scores, self._features(frame))
+
+    def about(self, question: Question, frame: int) -> dict[str, Any]:
+        number = int(self.result.timeline.frame_ids[frame])
+        return {"box": question.box, "names": self.result.names, "frame": number}
+
+    def draw(self, folder: Path, found: Selection, notes: Notes, console: Console) -> dict[str, int]:
+        """Writes masks/FRAME.png (255 where a pixel's own features score above the threshold) and
+        frames/FRAME.png (the scene, it without what was found, that alone, recoloured, moved) of some frames,
+        and video.mp4 of all: the scene beside the scene without what was found."""
+        result, pictured = self.result, self.pictured(found.question, found.frame)
+        pixels: dict[str, int] = {}
+        prompt, threshold = found.prompt, found.threshold.value
+        with VideoWriter(folder / "video.mp4", _frame_rate(result)) as video:
+            for seen in _frames(result, console):
+                assert seen.gaussians.features is not None
+                selected = prompt.scores(seen.gaussians.features) > threshold
+                both = {f"frame {seen.number}": to_uint8(seen.colors)}
+                both["without it"] = _picture(hidden(seen.gaussians, selected), seen)
+                video.write(in_rows(both, 2, _PANEL_HEIGHT))
+                if seen.t in pictured:
+                    name = f"{seen.number:06d}"
+                    mask = (np.asarray(prompt.scores(seen.features)) > threshold) & seen.there
+                    pixels[name] = write_mask(folder, name, mask)
+                    scenes = {"it alone": hidden(seen.gaussians, ~selected)}
+                    changed = found.question.changed(seen.gaussians, np.asarray(selected))
+                    scenes |= {SCENE_CAPTIONS[edit]: scene for edit, scene in changed.items()}
+                    panels = both | {words: _picture(scene, seen) for words, scene in scenes.items()}
+                    write_png(folder / "frames" / f"{name}.png", in_rows(panels, 2, _PANEL_HEIGHT))
+        return pixels
+
+    def _features(self, frame: int) -> Float[Array, "n c"]:
+        """Features of all Gaussians; those that do not change are the same in all frames."""
+        features = self.at(frame if self.result.meaning_changes else 0).features
+        assert features is not None
+        return features
+
+    @cached_property
+    def _encoder(self) -> LanguageEncoder:
+        return self.meaning.source.encoder(self._weights)
+
+
+def label_everything(
+    scene: QueryableScene, question: Question, folder: Path, notes: Notes, console: Console
 ) -> dict[str, Any]:
-    """Answer a query and write what is found into a folder; returns the content of query.json.
+    """Label all Gaussians, and write the result into a folder; returns the content of query.json.
 
         query/
-          query.json          the query; the Gaussians that are meant: count, place, size; pixels by frame
-          selection.npz       as a field's, of the frame in question (rows of the run's scene.ply)
-          object.ply          what was found, in that frame; without.ply the scene without it, recolored.ply
-                              with it in another colour, moved.ply with it elsewhere
-          masks/FRAME.png     255 where a pixel's own features mean it
-          frames/FRAME.png    the scene, what was found alone, the scene without it, recoloured, perhaps moved
-          video.mp4           the scene and the scene without it, in all frames
-
-    Without a prompt: selection.npz has labels [N] and probabilities [N,k], recolored.ply the Gaussians in the
-    colours of their labels, masks/FRAME.png are label maps, and the film has these over it. Label 1 is the
-    first of the names; 0 is nothing.
+          query.json          the number of Gaussians of each name, and its share of each picture
+          selection.npz       labels [N], 1 for the first of the names, 0 for none; probabilities [N,k]
+          recolored.ply       the Gaussians in the colours of their labels
+          masks/FRAME.png     label maps; frames/FRAME.png and video.mp4 have them over the scene
 
     Args:
-        path: of the run.
-        result: its scene.
-        question, changes, folder, notes, console: as for a field's `answer`.
+        scene: the scene.
+        question: the frame of recolored.ply, and those to draw.
+        folder: for the result, which replaces an earlier one once it is complete.
+        notes: for query.json.
+        console: shows the progress.
 
     Raises:
-        ValueError: the question cannot be understood, or means nothing of the scene.
-        FileExistsError: something is in the folder that is no answer.
+        ValueError: a frame is not there.
+        FileExistsError: the folder holds something else than a result of a query.
     """
-    t = _frame(result, question.frame)
-    shown = sorted({t, *_pictured(result, question)})
-    there = result.at(result.timeline.times[t])
-    if result.meaning is None or there.features is None:
-        raise ValueError(
-            f"{path}: expected a scene that knows what is what in it, found none with features: there "
-            "was one class among the pixels that counted; reconstruct it with --tools draw, or with "
-            "--features"
-        )
-    about = {
-        "text": question.text,
-        "point": question.point,
-        "box": question.box,
-        "features": result.meaning.source.kind,
-        "names": result.names,
-        "frame": int(result.timeline.frame_ids[t]),
-        "of": there.num,
-    }
-    if question.text is None and question.region is None:
-        codebook = jnp.asarray(result.meaning.codebook, jnp.float32)
-        likely, about["query_seconds"] = _timed(lambda: probabilities_of(there.features, codebook))
-        with replaced_folder(folder, OF_QUERY) as new:
-            found = _write_labels(new, result, there, likely)
-            answer = about | found | {"shares": draw_labels(new, result, shown, console), "notes": notes.all}
-            write_json(new / "query.json", answer)
-        return answer
-    prompt = prompt_of(result, question, t, there)
-    scores, about["query_seconds"] = _timed(lambda: prompt.scores(there.features))
-    threshold = prompt.threshold(scores, question.threshold)
-    selected = scores > threshold.value
-    _check_count(question, selected, scores, threshold.value, about["frame"], notes)
-    with replaced_folder(folder, OF_QUERY) as new:
-        every, scenes = np.arange(there.num), changes.of(there, selected)
-        write_selection(new / "selection.npz", there, selected, scores, every, there.num)
-        write_scenes(new, there, selected, scenes)
-        pixels = draw(new, result, shown, prompt, threshold.value, changes, console)
-        means = np.asarray(there.means)[selected]
-        answer = about | {
-            "meant": prompt.name,
-            "against": prompt.negatives,
-            "threshold": threshold.value,
-            "rule": threshold.rule,
-            "gaussians": int(selected.sum()),
-            "best_score": float(scores.max()),
-            "center": means.mean(axis=0),
-            "size": np.ptp(means, axis=0),
-            "pixels": pixels,
-            "notes": notes.all,
-        }
-        write_json(new / "query.json", answer)
-    return answer
-
-
-def _timed(score: Callable[[], Float[jax.Array, "*n"]]) -> tuple[Float[np.ndarray, "*n"], float]:
-    """Scores, and the seconds that they took, without compiling."""
-    jax.block_until_ready(score())
+    frame, result = scene.frame_of(question), scene.result
+    there, codebook = scene.at(frame), jnp.asarray(scene.meaning.codebook, jnp.float32)
+    jax.block_until_ready(probabilities_of(there.features, codebook))  # compiles
     begun = perf_counter()
-    return np.asarray(score()), perf_counter() - begun
-
-
-def _check_count(
-    question: DeformQuestion,
-    selected: Bool[np.ndarray, "n"],
-    scores: Float[np.ndarray, "n"],
-    threshold: float,
-    frame: int,
-    notes: Notes,
-) -> None:
-    """Raises a ValueError where nothing is meant, and warns where everything is."""
-    if not selected.any():
-        raise ValueError(
-            f"{question.words} means nothing of this scene in frame {frame}: the best score is "
-            f"{scores.max():.3f}, and more than {threshold:g} is asked for; try a lower --threshold"
-        )
-    if selected.all():
-        words = f"{question.words} means all {len(selected)} Gaussians"
-        notes.warn(f"{words}; a higher --threshold would tell them apart")
-
-
-def _write_labels(
-    folder: Path, result: DeformResult, there: Gaussians, likely: Float[np.ndarray, "n k"]
-) -> dict[str, Any]:
-    """Writes what all Gaussians most likely are; returns the number of each name, and its colour in
-    recolored.ply."""
+    likely = np.asarray(probabilities_of(there.features, codebook))
+    seconds = perf_counter() - begun
     labels = 1 + most_likely(likely)
-    write_npz(folder / "selection.npz", {"labels": labels, "probabilities": likely, "names": result.names})
     colors = {name: label_color(label) for label, name in enumerate(result.names, 1)}
     shades = np.array([INVALID, *colors.values()], np.float32) / 255
-    write_ply(folder / "recolored.ply", recolored(there, shades[labels]), labels=labels)
-    counts = {name: int((labels == label).sum()) for label, name in enumerate(result.names, 1)}
-    return {"classes": counts, "colors": colors}
+    with replaced_folder(folder, OF_QUERY) as new:
+        arrays = {"labels": labels, "probabilities": likely, "names": result.names}
+        write_npz(new / "selection.npz", arrays)
+        write_ply(new / "recolored.ply", recolored(there, shades[labels]), labels=labels)
+        info = {
+            "text": None,
+            "point": None,
+            "features": scene.kind,
+            **scene.about(question, frame),
+            "of": there.num,
+            "query_seconds": seconds,
+            "classes": {name: int((labels == label).sum()) for label, name in enumerate(result.names, 1)},
+            "colors": colors,
+            "shares": _draw_labels(new, result, scene.pictured(question, frame), console),
+            "notes": notes.all,
+        }
+        write_json(new / "query.json", info)
+    return info
 
 
-def prompt_of(result: DeformResult, question: DeformQuestion, t: int, there: Gaussians) -> Prompt:
-    """A text, a point or a box in the scene's channels.
-
-    Args:
-        result: of a run.
-        question: the query.
-        t: index of the frame in question.
-        there: the scene at that frame.
-
-    Raises:
-        ValueError: the text cannot be read, or nothing of the scene lies there.
-        FileNotFoundError: weights are not there.
-    """
+def _draw_labels(
+    folder: Path, result: DeformResult, pictured: Sequence[int], console: Console
+) -> dict[str, dict[str, float]]:
+    """Writes label maps masks/FRAME.png and frames/FRAME.png of some frames, and video.mp4 of all: the scene
+    beside what each pixel most likely is. Returns, by frame, the share of the picture that each name has."""
     assert result.meaning is not None
-    if question.region is None:
-        assert question.text is not None
-        source = result.meaning.source
-        encoder = partial(source.encoder, question.weights)
-        return text_prompt(result.meaning, question.text, question.negatives, encoder)
-    drawn, _ = render_with_room(there, result.camera(t))
-    assert drawn.features is not None
-    try:
-        feature = region_feature(np.asarray(drawn.features[0]), np.asarray(drawn.alphas[0]), question.region)
-    except ValueError as error:
-        option = "--point" if question.box is None else "--box"
-        raise ValueError(f"{option}: {error} (frame {result.timeline.frame_ids[t]})") from None
-    return feature_prompt(result.meaning, feature.astype(np.float64))
+    codebook = jnp.asarray(result.meaning.codebook, jnp.float32)
+    shares: dict[str, dict[str, float]] = {}
+    with VideoWriter(folder / "video.mp4", _frame_rate(result)) as video:
+        for seen in _frames(result, console):
+            likely = np.asarray(probabilities_of(seen.features, codebook))
+            labels = np.where(seen.there, 1 + most_likely(likely), 0)
+            colors = to_uint8(seen.colors)
+            over = overlay_labels(colors, labels)
+            panel = in_rows({f"frame {seen.number}": colors, "what is what": over}, 2, _PANEL_HEIGHT)
+            video.write(panel)
+            if seen.t in pictured:
+                name = f"{seen.number:06d}"
+                write_png(folder / "masks" / f"{name}.png", labels.astype(np.uint8))
+                write_png(folder / "frames" / f"{name}.png", panel)
+                shares[name] = {
+                    word: float((labels == label).mean()) for label, word in enumerate(result.names, 1)
+                }
+    return shares
 
 
-def _frame(result: DeformResult, frame: int | None) -> int:
-    """The index of a frame.
-
-    Raises:
-        ValueError: the run had none of this number.
-    """
-    known = result.timeline.frame_ids.tolist()
-    if frame is None:
-        return 0
-    if frame not in known:
-        raise ValueError(f"--frame: expected one of {known[0]} to {known[-1]}, found {frame}")
-    return known.index(frame)
+def _frame_rate(result: DeformResult) -> float:
+    """Pictures a second of a film of all frames."""
+    return frame_rate(result.timeline.times * result.timeline.seconds)
 
 
-def _pictured(result: DeformResult, question: DeformQuestion) -> list[int]:
-    """Indices of the frames that pictures are made of."""
-    if question.frames is None:
-        return result.timeline.held_out.tolist()
-    chosen = list(range(len(result.timeline.times))[parse_frames(question.frames)])
-    if not chosen:
-        raise ValueError(
-            f"--frames: {question.frames} holds no frame of the run, which has {len(result.timeline.times)}"
-        )
-    return chosen
+def _frames(result: DeformResult, console: Console) -> Iterator[_Seen]:
+    """All frames, one after the other."""
+    plan = None
+    for t in track(range(len(result.timeline.times)), "drawing", console=console, transient=True):
+        gaussians, camera = result.at(result.timeline.times[t]), result.camera(t)
+        drawn, plan = render_with_room(gaussians, camera, plan)
+        assert drawn.features is not None
+        there = np.asarray(drawn.alphas[0]) > _OPAQUE
+        scene, number = (gaussians, camera, plan), int(result.timeline.frame_ids[t])
+        yield _Seen(t, number, *scene, np.asarray(drawn.colors[0]), drawn.features[0], there)
+
+
+def _picture(gaussians: Gaussians, seen: _Seen) -> np.ndarray:
+    """Colours of a scene that stands as another does; drawn as that was, with features, for compiling takes
+    longer than drawing these."""
+    return to_uint8(np.asarray(render_with_room(gaussians, seen.camera, seen.plan)[0].colors[0]))

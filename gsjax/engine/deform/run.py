@@ -46,22 +46,22 @@ class Options(TeacherOptions, OfDataset):
     preset: Literal["surst", "clin"] = "surst"
     """Recipe whose settings are the defaults of --deform: SurstSplat's or GaussianClin's."""
     tools: Tools = "leave-out"
-    """Tools, which are known by the names of mask values, or without names are all values but 0: leave them
-    out, or draw them too."""
+    """Leave tools out, or draw them too. Tools are known by the names of mask values; without names all
+    values but 0 are tools."""
     tool_values: Annotated[tuple[int, ...], tyro.conf.arg(metavar="VALUE")] = ()
-    """Mask values that are tools, whatever their names are."""
+    """Mask values that are tools, whatever their names."""
     depth: Depth = "auto"
     """Source of the depth: data (files), stereo (the camera to learn from and the next one are matched) or
     plane (none: the scene begins on one, and its depth has no unit). auto: the first of these that exists."""
     deform: DeformConfig = field(default_factory=lambda: PRESETS["surst"])
-    """How it is learned."""
+    """Settings of the scene and its training."""
 
 
 def run(options: Options) -> int:
     """Reconstruct a deforming scene and report on it; returns the exit code.
 
     Raises:
-        ValueError, OSError: what was asked cannot be done; everything learned before that is on disk.
+        ValueError, OSError: the options cannot be followed; everything learned before that is on disk.
     """
     options = checked(options)
     choice = _teacher(options)
@@ -98,7 +98,7 @@ def run(options: Options) -> int:
         data, refined = as_refined(folder, problem, run.params, data, notes)
         write_deformation(folder.path / NAME, result)
         write_ply(folder.scene, jax.device_get(result.at(0.0)))
-        with stage(console, "looking at held-out frames"):
+        with stage(console, "scoring held-out frames"):
             judged = judge(folder, result, run.plans[PLAN], data, options.tools)
         note_if_cut_short(progress, schedule, run.step, notes)
         _warn_of_oddities(progress, judged, notes)
@@ -125,7 +125,7 @@ def run(options: Options) -> int:
 
 
 def _warn_of_oddities(progress: Progress, judged: Mapping[str, Any], notes: Notes) -> None:
-    """Warns of skipped steps, and of a scene that hardly learned to move, or what is what."""
+    """Warns of skipped steps, and of a scene that hardly learned motion or classes."""
     if progress.skipped:
         notes.warn(f"{progress.skipped} steps met numbers that are not finite and changed nothing")
     tracks = judged["tracks"]
@@ -137,7 +137,7 @@ def _warn_of_oddities(progress: Progress, judged: Mapping[str, Any], notes: Note
 
 
 def _recording(options: Options, notes: Notes) -> tuple[Sequence, DepthSource]:
-    """The recording, the camera that is learned from first, with its depth, and where that is from."""
+    """The recording with its depth, the camera to learn from first, and the source of the depth."""
     chosen = (options.frames, options.read, options.scale)
     whole = open_recording(options.dataset, (), (), *chosen, opened=open_as_sequence).judged
     if is_photographs(options.dataset) and not is_recording(options.dataset):

@@ -43,7 +43,7 @@ class Labels(NamedTuple):
 
 
 class Taught(NamedTuple):
-    """What a teacher says about a recording.
+    """A teacher's labels of a recording.
 
     Attributes:
         lesson: labels of the frames to learn from.

@@ -61,7 +61,7 @@ def run(options: Options) -> int:
         if options.features == "auto":
             console.print(f"[bold]features[/]  {teaching.source.kind}: {teaching.about}", soft_wrap=True)
         method, values = Distill(options.distill), asdict(settings)
-        with stage(console, "looking which Gaussians each view shows"):
+        with stage(console, "listing the Gaussians that each view shows"):
             problem, run = method.start(
                 scene.gaussians,
                 [photographs.camera(i) for i in scene.taught],
@@ -91,7 +91,7 @@ def run(options: Options) -> int:
         steps, result = ticks.run.step, ticks.result
         with atomic_write(folder.path / NAME) as temporary:
             result.write(temporary)
-        with stage(console, "asking it about views"):
+        with stage(console, "scoring views"):
             judged = judge(folder, scene, teaching, result, options.distill, notes)
         note_if_cut_short(progress, schedule, steps, notes)
         _note_oddities(scene, progress, notes)

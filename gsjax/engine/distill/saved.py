@@ -9,7 +9,6 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-import yaml
 from jaxtyping import Int
 
 from gsjax.data.photographs import Photographs
@@ -28,7 +27,7 @@ _OF_IMAGES = ("images", "scale", "frames", "cameras", "eval_cameras", "test_ever
 
 @dataclass(frozen=True)
 class Whereabouts:
-    """Where the things are now that a field belongs to (default: where they were).
+    """Current places of a field's scene, photographs and encoder (default: where they were).
 
     Attributes:
         scene: the scene's PLY file.
@@ -93,18 +92,6 @@ class FieldRun:
 def field_of(path: Path) -> Path | None:
     """The folder of the field at `path`, or in the run there; None where there is none."""
     return next((folder for folder in (path, path / FOLDER) if (folder / NAME).is_file()), None)
-
-
-def unfinished_field_of(path: Path) -> Path | None:
-    """The folder at `path`, or in the run there, of a distillation that has not written a field; or None."""
-    return next((f for f in (path, path / FOLDER) if is_run(f) and _is_of_distill(f / "config.yml")), None)
-
-
-def _is_of_distill(config: Path) -> bool:
-    try:
-        return {"scene", "features", "distill"} <= set(yaml.safe_load(config.read_text(encoding="utf-8")))
-    except (yaml.YAMLError, UnicodeDecodeError, TypeError):
-        return False
 
 
 def open_field_run(

@@ -1,4 +1,4 @@
-"""`gsjax query` on a run of `gsjax track`: which object a text means, and where it is in every frame."""
+"""The query of a run of `gsjax track`: the object that a text means, and where it is in every frame."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -18,11 +18,11 @@ from gsjax.engine.folder import OF_QUERY, replaced_folder
 from gsjax.engine.messages import Notes
 from gsjax.engine.options import ClipWeights, Common, ObjectText
 from gsjax.engine.pictures import frame_rate
+from gsjax.engine.query import write_mask
 from gsjax.engine.track.saved import SavedRun, open_run
 from gsjax.engine.track.views import views
 from gsjax.engine.views import View
 from gsjax.io.atomic import write_json, write_npz
-from gsjax.io.pictures import write_png
 from gsjax.io.video import VideoWriter
 from gsjax.methods.protocols import LanguageEncoder
 from gsjax.methods.track import find_object
@@ -35,14 +35,14 @@ _VIDEO_HEIGHT = 480  # smaller pictures are enlarged
 
 @dataclass(frozen=True)
 class ObjectQuery(Common, ClipWeights, ObjectText):
-    """The question to a run, and how it is understood."""
+    """A query of a run for an object, and the encoder that reads it."""
 
     run: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
     """Folder of a run of `gsjax track`."""
     text: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="TEXT")]
     """Which object: "red can"."""
     camera: Annotated[int | None, tyro.conf.arg(metavar="ID")] = None
-    """Id of the camera to show it from; default: the first held-out one, else the first tracked."""
+    """Id of the camera to show it from (default: the first held-out one, else the first tracked)."""
 
 
 class Answer(NamedTuple):
@@ -50,10 +50,10 @@ class Answer(NamedTuple):
 
     Attributes:
         group: its label in the run's files, 1 to K.
-        name: what it is called.
+        name: its name.
         scores: cosine of each object, by name.
-        margin: how far it lies above the next.
-        min_score: the score that was asked for.
+        margin: difference of its cosine and the next one.
+        min_score: the least cosine that means an object.
         rows: its Gaussians, as rows of scene.ply.
     """
 
@@ -91,18 +91,16 @@ def ask_for_object(options: ObjectQuery, console: Console) -> None:
             with VideoWriter(new / "video.mp4", frame_rate(recording.tracked.times)) as video:
                 for view in progress(views(saved.tracking, recording), saved, console):
                     mask = view.groups == answer.group
-                    pixels.append(int(mask.sum()))
                     frame_id = recording.tracked.frame_ids[view.t]
-                    write_png(new / "masks" / f"{frame_id:06d}.png", np.where(mask, 255, 0).astype(np.uint8))
+                    pixels.append(write_mask(new, f"{frame_id:06d}", mask))
                     video.write(show(view, mask, answer.group))
-            found = {"text": options.text, "encoder": options.encoder, "camera": camera}
-            found |= {"group": answer.group, "label": saved.tracking.scene.label_ids[answer.group]}
-            found |= {"name": answer.name, "scores": answer.scores, "margin": answer.margin}
-            found |= {"min_score": answer.min_score, "pixels": pixels, "notes": notes.all}
-            write_json(new / "query.json", found)
+            found = answer._asdict() | {"label": saved.tracking.scene.label_ids[answer.group]}
+            found |= {"text": options.text, "encoder": options.encoder, "camera": camera}
+            del found["rows"]  # in selection.npz
+            write_json(new / "query.json", found | {"pixels": pixels, "notes": notes.all})
     hidden = sum(count == 0 for count in pixels)
     unseen = f"; camera {camera} does not see it in {hidden} of {len(pixels)} frames" if hidden else ""
-    score = f"cosine {answer.scores[answer.name]:.2f}, and {answer.min_score:.2f} is asked for"
+    score = f"cosine {answer.scores[answer.name]:.2f}, and {answer.min_score:.2f} is required"
     print(f"{answer.name}: {len(answer.rows)} Gaussians ({score}){unseen}")
     print(f"query   {folder}")
 
@@ -120,10 +118,10 @@ def ask(options: ObjectQuery, console: Console, notes: Notes) -> tuple[SavedRun,
     """
     _check_encoder(options)
     saved = open_run(options.run)
-    saved.seen_by(options.camera)  # one that is not there need not wait for the rest either
+    saved.seen_by(options.camera)  # these two first: a wrong camera or word is reported at once
     encoder = _encoder(options, saved)
-    wanted = encoder.embed_text(options.text)  # first: a word that nobody knows need not wait for the rest
-    with console.status("looking at the first frame"):
+    wanted = encoder.embed_text(options.text)
+    with console.status("encoding the first frame"):
         view = next(views(saved.tracking, saved.seen_by(saved.mask_camera)))[0]
         objects = encoder.embed_objects(to_uint8(view.image), view.groups, len(saved.names))
     min_score = encoder.min_score if options.min_score is None else options.min_score
@@ -134,7 +132,7 @@ def ask(options: ObjectQuery, console: Console, notes: Notes) -> tuple[SavedRun,
         listed = ", ".join(f"{name} {score:.2f}" for name, score in _ranked(scores))
         raise ValueError(
             f"{options.text!r} means none of the objects of {saved.path}: its best cosine is "
-            f"{max(scores.values()):.2f}, and {min_score:.2f} is asked for. There are: {listed}"
+            f"{max(scores.values()):.2f}, and {min_score:.2f} is required. There are: {listed}"
         )
     if margin < _CLOSE:
         second = _ranked(scores)[1][0]
@@ -145,34 +143,24 @@ def ask(options: ObjectQuery, console: Console, notes: Notes) -> tuple[SavedRun,
 
 
 def show(view: View, mask: Bool[np.ndarray, "h w"], group: int) -> np.ndarray:
-    """What the camera saw, with the object in its colours and the rest dimmed; small pictures enlarged.
+    """The image of a camera with the object in its colours and the rest dimmed; small pictures are enlarged.
 
     Args:
         view: of one camera.
         mask: where the object is.
         group: that of the object, for its colour.
     """
-    size = enlarged(mask.shape[1], mask.shape[0])
+    height, width = mask.shape
+    factor = max(1, -(-_VIDEO_HEIGHT // height))
+    size = (width * factor, height * factor)
     image = cv2.resize(to_uint8(view.image), size, interpolation=cv2.INTER_CUBIC)
     # Smooth outlines: a mask's share of each pixel is interpolated, not the mask.
     soft = cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_CUBIC)
     return highlight(image, soft > 0.5, label_color(group))
 
 
-def enlarged(width: int, height: int) -> tuple[int, int]:
-    """The size of a video of pictures of this size."""
-    factor = max(1, -(-_VIDEO_HEIGHT // height))
-    return width * factor, height * factor
-
-
 def progress(frames: Iterator[list[View]], saved: SavedRun, console: Console) -> Iterator[View]:
-    """The one view of each frame, with a progress bar.
-
-    Args:
-        frames: the views of each frame, one camera.
-        saved: the run.
-        console: for the bar.
-    """
+    """The one view of each frame of a run, with a progress bar on the console."""
     count = saved.tracking.num_frames
     for frame in track(frames, "rendering", total=count, console=console, transient=True):
         yield frame[0]

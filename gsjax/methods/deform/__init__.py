@@ -36,7 +36,7 @@ from gsjax.methods.deform.graph import (
     graph_of,
     seen_ids,
 )
-from gsjax.methods.deform.meaning import Lesson, Meaning, Prompt, counted_ids, feature_prompt, text_prompt
+from gsjax.methods.deform.meaning import Lesson, Meaning, counted_ids, feature_prompt, text_prompt
 from gsjax.methods.deform.method import Deform, Kept, Problem, batch_of, with_field
 from gsjax.methods.deform.nodes import nodes_of
 from gsjax.methods.deform.poses import refined_viewmats, times_of
@@ -73,7 +73,6 @@ __all__ = [
     "Meaning",
     "Moving",
     "Problem",
-    "Prompt",
     "PromptedAnswerer",
     "Question",
     "QuestionType",

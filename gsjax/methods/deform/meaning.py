@@ -6,15 +6,14 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import cv2
-import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Bool, Float, Int
 
-from gsjax.methods.deform.query import prompt_cosines, prompt_probabilities
+from gsjax.methods.deform.query import prompt_probabilities
 from gsjax.methods.deform.questions import plain_words
-from gsjax.methods.distill import Threshold, relevancy, threshold_for
 from gsjax.methods.protocols import LanguageEncoder
+from gsjax.methods.query import Prompt, encoded_prompt
 
 _LEAST_SHARE = 0.95  # of the pixels of a teacher's cell that count, for the cell to count
 
@@ -79,56 +78,6 @@ def counted_ids(
     return np.where(share > _LEAST_SHARE, ids, -1)
 
 
-class Prompt(NamedTuple):
-    """A prompt and the negatives that it is compared with.
-
-    Attributes:
-        vectors: unit vectors of prompt and negatives, mapped to the scene's channels.
-        row: row of the prompt.
-        name: its own or its nearest name; None for a text that an encoder reads.
-        negatives: the texts or names of the other rows.
-        min_score: the encoder's own threshold of a cosine; None if it has none.
-    """
-
-    vectors: Float[np.ndarray, "k c"]
-    row: int
-    name: str | None
-    negatives: tuple[str, ...]
-    min_score: float | None = None
-
-    def scores(self, features: Float[Array, "*n c"]) -> Float[Array, "*n"]:
-        """Scores of Gaussians or pixels, higher for a better match: the cosine without negatives, else the
-        smallest share against one negative, 1/2 where both match equally (`relevancy`). A softmax over all
-        would be small for names with similar features.
-
-        Args:
-            features: features of Gaussians, or rendered ones.
-        """
-        order = [self.row, *(row for row in range(len(self.vectors)) if row != self.row)]
-        return _scores(features, jnp.asarray(self.vectors[order], jnp.float32))
-
-    def threshold(self, scores: Float[np.ndarray, "n"], given: float | None = None) -> Threshold:
-        """The score above which Gaussians are selected, and the rule that it comes from.
-
-        Args:
-            scores: scores of all Gaussians.
-            given: the user's threshold (default: by a rule).
-
-        Raises:
-            ValueError: the given threshold selects everything or nothing, whatever the scores.
-        """
-        alone = len(self.vectors) == 1
-        low, what = (-1, "a cosine") if alone else (0, "a share against others")
-        if given is not None and not low <= given < 1:
-            raise ValueError(f"--threshold: expected {low} to below 1, {what}, found {given:g}")
-        if given is None and alone and self.min_score is not None:
-            return Threshold(self.min_score, "the encoder's own")
-        found = threshold_for(scores, not alone, given)
-        if given is None and not alone and self.name is not None:
-            return found._replace(rule="better than each other name")
-        return found
-
-
 def text_prompt(
     meaning: Meaning,
     text: str,
@@ -149,24 +98,21 @@ def text_prompt(
             another dimension, or negatives are given for a name.
         FileNotFoundError: the encoder's weights are missing.
     """
-    source = meaning.source
-    if source.kind == "classes" or plain_words(text) in map(plain_words, meaning.names):
+    if meaning.source.kind == "classes" or plain_words(text) in map(plain_words, meaning.names):
         if negatives is not None:
-            raise ValueError("--negatives: a name is held against the other names; leave it out")
+            raise ValueError("--negatives: a name is compared with the other names; leave it out")
         return _name_prompt(meaning, meaning.codebook, _row_of(meaning.names, text))
     try:
-        reader = source.encoder() if encoder is None else encoder()
+        loaded = meaning.source.encoder() if encoder is None else encoder()
     except ValueError as error:
         raise ValueError(f"{error}; or by a name: {', '.join(meaning.names)}") from error
-    against = source.negatives(text) if negatives is None else negatives
-    texts = np.stack([np.asarray(reader.embed_text(one), np.float64) for one in (text, *against)])
-    if texts.shape[1] != len(meaning.basis):
+    prompt = encoded_prompt(meaning.source, text, negatives, lambda: loaded)
+    if prompt.vectors.shape[1] != len(meaning.basis):
         raise ValueError(
-            f"expected texts of {len(meaning.basis)} numbers like these features, found {texts.shape[1]}: "
-            "--weights are those of another encoder"
+            f"expected texts of {len(meaning.basis)} numbers like these features, found "
+            f"{prompt.vectors.shape[1]}: --weights are those of another encoder"
         )
-    min_score = reader.min_score if source.kind == "closed" else None
-    return Prompt(_normalized(texts) @ meaning.basis, 0, None, against, min_score)
+    return prompt._replace(vectors=_normalized(prompt.vectors) @ meaning.basis)
 
 
 def feature_prompt(meaning: Meaning, feature: Float[np.ndarray, "c"]) -> Prompt:
@@ -188,14 +134,12 @@ def _row_of(names: tuple[str, ...], text: str) -> int:
 
 
 def _name_prompt(meaning: Meaning, vectors: Float[np.ndarray, "k c"], row: int) -> Prompt:
-    negatives = tuple(name for other, name in enumerate(meaning.names) if other != row)
-    return Prompt(_normalized(vectors), row, meaning.names[row], negatives)
+    """The prompt of the vector in a row; the other rows are its negatives."""
+    others = [other for other in range(len(vectors)) if other != row]
+    negatives = tuple(meaning.names[other] for other in others)
+    ordered = _normalized(vectors)[[row, *others]]
+    return Prompt(ordered, negatives, meaning.names[row], rule="better than each other name")
 
 
 def _normalized(vectors: Float[np.ndarray, "k c"]) -> Float[np.ndarray, "k c"]:
     return vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-12)
-
-
-@jax.jit
-def _scores(features: Float[Array, "*n c"], directions: Float[Array, "k c"]) -> Float[Array, "*n"]:
-    return relevancy(prompt_cosines(features, directions))

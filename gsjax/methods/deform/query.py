@@ -1,11 +1,11 @@
 """Gaussians of a deforming scene that match a prompt (SurstSplat, section 2.4; GaussianClin, section 3.4)."""
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-_LEAST_NORM = 1e-6
+from gsjax.methods.query import directions
+
 _LEAST_ALPHA = 0.5  # mean alpha below which a region shows nothing of the scene
 
 
@@ -22,19 +22,7 @@ def prompt_probabilities(
         prompts: the candidates, in the channels of the features.
         temperature: temperature of the softmax.
     """
-    return jax.nn.softmax(prompt_cosines(features, _directions(prompts)) / temperature, axis=-1)
-
-
-def prompt_cosines(features: Float[Array, "*n c"], directions: Float[Array, "k c"]) -> Float[Array, "*n k"]:
-    """Cosines of features of any length and vectors of length 1 in the source's space; 0 for features of
-    length 0."""
-    return _directions(features) @ directions.T
-
-
-def _directions(features: Float[Array, "*n c"]) -> Float[Array, "*n c"]:
-    squared = jnp.sum(features**2, axis=-1, keepdims=True)
-    there = squared > _LEAST_NORM**2
-    return jnp.where(there, features / jnp.sqrt(jnp.where(there, squared, 1.0)), 0.0)
+    return jax.nn.softmax(directions(features) @ directions(prompts).T / temperature, axis=-1)
 
 
 def most_likely(probabilities: Float[np.ndarray, "*n k"]) -> Int[np.ndarray, "*n"]:

@@ -29,13 +29,10 @@ from gsjax.methods.distill.field import (
 from gsjax.methods.distill.inverse import learned_inverse
 from gsjax.methods.distill.method import Distill, Problem, frozen_views, view_batch
 from gsjax.methods.distill.query import (
-    Threshold,
     back_projected_cosines,
     gaussian_cosines,
     pixel_cosines,
     pixel_features,
-    relevancy,
-    threshold_for,
 )
 from gsjax.methods.distill.result import DistillResult
 from gsjax.methods.distill.teacher import Teacher, teacher_of_maps, teacher_of_objects, with_maps
@@ -53,7 +50,6 @@ __all__ = [
     "FeatureField",
     "Problem",
     "Teacher",
-    "Threshold",
     "active_table",
     "back_projected_cosines",
     "distill_loss",
@@ -67,12 +63,10 @@ __all__ = [
     "majority_labels",
     "pixel_cosines",
     "pixel_features",
-    "relevancy",
     "rendered_features",
     "step",
     "teacher_of_maps",
     "teacher_of_objects",
-    "threshold_for",
     "view_batch",
     "with_maps",
 ]

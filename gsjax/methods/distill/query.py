@@ -4,15 +4,11 @@ The score is the cosine, as the paper's printed quotient F'.q / |F'.q| is always
 2D: W f_i is compared with q, through W^T q and W^T W. The paper's own method, which maps q back to the
 field's channels by an inverse of the convolution, is there for comparison (`back_projected_cosines`).
 
-With negatives, the score is the query's smallest share in a softmax with one negative (Kerr et al. 2023,
-"LERF", section 3.4): 1/2 where both match equally.
+`gsjax.methods.query` turns cosines into scores against negatives.
 """
-
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float, Int
 
 from gsjax.methods.distill.field import FeatureField, RenderedFeatures, rendered_features
@@ -20,17 +16,7 @@ from gsjax.rasterize.frozen import FrozenView, paint, paint_shown
 from gsjax.rasterize.plan import Plan
 from gsjax.scene.feature_grid import Located
 
-TEMPERATURE = 0.1
-EVEN = 0.5
-"""The threshold with negatives: the query matches better than each of them."""
 _LEAST_NORM = 1e-12
-
-
-class Threshold(NamedTuple):
-    """The score above which Gaussians are selected, and the rule that it comes from."""
-
-    value: float
-    rule: str
 
 
 def gaussian_cosines(
@@ -96,42 +82,6 @@ def back_projected_cosines(
     features = parts.channels_of(_of_gaussians(parts))
     back = jnp.matmul(queries, inverse.T, precision="highest")
     return jnp.matmul(_normalised(features), _normalised(back).T, precision="highest")
-
-
-def relevancy(cosines: Float[Array, "*n q"], temperature: float = TEMPERATURE) -> Float[Array, "*n"]:
-    """The score of the first query: its cosine without negatives, else its smallest share against one.
-
-    Args:
-        cosines: cosines of the query, then those of negatives.
-        temperature: difference of cosines at which the shares are e : 1.
-    """
-    if cosines.shape[-1] == 1:
-        return cosines[..., 0]
-    ahead = cosines[..., 0] - cosines[..., 1:].max(axis=-1)
-    return jax.nn.sigmoid(ahead / temperature)
-
-
-def threshold_for(
-    scores: Float[np.ndarray, "n"], against_negatives: bool, given: float | None = None
-) -> Threshold:
-    """The given threshold; else 1/2 with negatives; else Otsu's, which splits the scores into two classes of
-    the least variance within each. On the host.
-
-    Args:
-        scores: scores of Gaussians.
-        against_negatives: whether the scores are shares against negatives.
-        given: threshold to use (default: by the rules above).
-    """
-    if given is not None:
-        return Threshold(float(given), "given")
-    if against_negatives:
-        return Threshold(EVEN, "better than each negative")
-    scores = scores[np.isfinite(scores)]
-    if not len(scores) or scores.max() - scores.min() < 1e-6:
-        return Threshold(float("inf"), "Otsu; all scores are alike")
-    from skimage.filters import threshold_otsu  # slow to import; see tests/test_import.py
-
-    return Threshold(float(threshold_otsu(scores)), "Otsu")
 
 
 def _of_gaussians(parts: RenderedFeatures) -> Float[Array, "n r"]:

@@ -15,8 +15,9 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Int
 
 from gsjax.methods.distill.field import FeatureField, features_of
-from gsjax.methods.distill.query import gaussian_cosines, relevancy
+from gsjax.methods.distill.query import gaussian_cosines
 from gsjax.methods.protocols import LanguageEncoder
+from gsjax.methods.query import encoded_prompt, relevancy
 from gsjax.scene.feature_grid import FeatureGrid, Located, locate
 
 FORMAT = 1
@@ -124,31 +125,8 @@ class DistillResult:
             ValueError: the encoder is unknown, does not read the text, or has another dimension.
             FileNotFoundError: the encoder's weights are missing.
         """
-        return self.scores(self.text_vectors(text, negatives, encoder)[0])
-
-    def text_vectors(
-        self,
-        text: str,
-        negatives: tuple[str, ...] | None = None,
-        encoder: LanguageEncoder | None = None,
-    ) -> tuple[Float[np.ndarray, "q d"], tuple[str, ...]]:
-        """The vectors of a text and negatives, as `scores` takes them, and the negatives.
-
-        Args:
-            text, negatives, encoder: as for `query`.
-
-        Raises:
-            ValueError, FileNotFoundError: as for `query`.
-        """
-        if encoder is None and self.source is None:
-            raise ValueError(
-                "encoder: expected one that reads texts in the space of this field's features, found none, "
-                "and the source of the features is unknown; pass one, or use `scores`"
-            )
-        reader: LanguageEncoder = self.source.encoder() if encoder is None else encoder
-        if negatives is None:
-            negatives = () if self.source is None else tuple(self.source.negatives(text))
-        return np.stack([reader.embed_text(one) for one in (text, *negatives)]), tuple(negatives)
+        loaded = None if encoder is None else lambda: encoder
+        return self.scores(encoded_prompt(self.source, text, negatives, loaded).vectors)
 
     def write(self, path: str | os.PathLike) -> None:
         """Write field.npz, which `gsjax query` and `gsjax view` read beside the scene."""

@@ -6,6 +6,8 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from gsjax.methods.query import directions
+
 
 class Match(NamedTuple):
     """The result of a query.
@@ -41,13 +43,7 @@ def find_object(
     if text_embedding.shape != (size,):
         found = text_embedding.shape
         raise ValueError(f"text_embedding: expected shape [{size}] as the objects', found {found}")
-    scores = _unit(object_embeddings) @ _unit(text_embedding)
+    scores = directions(object_embeddings) @ directions(text_embedding)
     best = jnp.argmax(scores)
     rest = jnp.where(jnp.arange(count) == best, -jnp.inf, scores)
     return Match(best, scores, scores[best] - rest.max(), scores[best] >= min_score)
-
-
-def _unit(vectors: Float[Array, "*k d"]) -> Float[Array, "*k d"]:
-    """Vectors scaled to length 1; zeros stay zeros."""
-    length = jnp.linalg.norm(vectors, axis=-1, keepdims=True)
-    return jnp.where(length > 0, vectors / jnp.where(length > 0, length, 1.0), 0.0)

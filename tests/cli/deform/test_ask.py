@@ -61,7 +61,7 @@ def test_an_answer_is_a_sentence(gsjax, scene):
     code, said = gsjax("ask", scene, "Where is the tool in frame 6?")
     assert code == 0
     assert "The centre of tool is in the middle left of the picture." in said
-    assert "looking at frame 6" in said
+    assert "measuring frame 6" in said
 
 
 def test_json_has_the_value_and_what_it_rests_on(scene, capsys):

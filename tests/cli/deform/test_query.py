@@ -21,11 +21,12 @@ from gsjax.engine.deform.file import read_deformation, write_deformation
 from gsjax.engine.folder import RunFolder
 from gsjax.engine.messages import Notes
 from gsjax.engine.teaching.choice import TeacherChoice
+from gsjax.engine.teaching.source import Source
 from gsjax.engine.viewables import open_viewable
 from gsjax.io.ply import read_ply, write_ply
 from gsjax.io.video import read_video_frames
-from gsjax.methods.deform import Deform, DeformConfig, Kept, with_field
-from gsjax.methods.deform.query import most_likely, region_feature
+from gsjax.methods.deform import Deform, DeformConfig, Kept, Meaning, feature_prompt, with_field
+from gsjax.methods.deform.query import most_likely, prompt_probabilities, region_feature
 from gsjax.scene.deformation import DeformationConfig
 from tests.cli.deform.test_command import SCENE
 
@@ -72,7 +73,7 @@ def run(taught, tmp_path):
 
 
 def asked(run):
-    return json.loads((run / "query" / "query.json").read_text())
+    return json.loads((run / "query" / "query.json").encoded_prompt())
 
 
 def test_a_name_is_found_and_deleted_in_every_frame(gsjax, run):
@@ -148,10 +149,10 @@ def test_without_a_prompt_all_are_named(gsjax, run):
         (("--box", "9,9,3"), "--box: expected X0,Y0,X1,Y1 in pixels, found '9,9,3'"),
         (("tool", "--frame", 10), "--frame: expected one of 0 to 9, found 10"),
         (("tool", "--frames", "20:"), "--frames: 20: holds no frame of the run, which has 10"),
-        (("tool", "--threshold", 1), "--threshold: expected 0 to below 1"),
+        (("tool", "--threshold", 1), "--threshold: expected a finite number below 1"),
         (("tool", "--threshold", 0.99999), "best score"),
         (("tool", "--camera", 1), "--camera: a run of `gsjax deform` has no use for it"),
-        (("tool", "--negatives", "tissue"), "--negatives: a name is held against"),
+        (("tool", "--negatives", "tissue"), "--negatives: a name is compared with"),
         (("--point", "3,3", "--negatives", "tissue"), "--negatives: expected a TEXT too"),
         (("tool", "--image", "x.png"), "--image: a run of `gsjax deform` has no use for it"),
         (("tool", "--min-score", 0.1), "--min-score: a run of `gsjax deform` has no use for it"),
@@ -203,7 +204,7 @@ def test_a_run_is_seen_over_time_and_asked(run):
 
 def test_a_run_whose_recording_is_gone(run):
     config = run / "config.yml"
-    config.write_text(config.read_text().replace(SCENE, "/nowhere/recording"))
+    config.write_text(config.encoded_prompt().replace(SCENE, "/nowhere/recording"))
     scene, _ = open_viewable(run, notes := Notes(Console(quiet=True)))
     assert any("its photographs are not shown" in note for note in notes.all)
     assert scene.shots.load_image is None
@@ -241,6 +242,17 @@ def test_features_that_change_are_those_of_the_frame(run):
 def test_nothing_is_most_likely_where_all_are_equally_likely():
     likely = np.array([[0.2, 0.8], [0.6, 0.4], [0.5, 0.5]])
     np.testing.assert_array_equal(most_likely(likely), [1, 0, -1])
+
+
+def test_the_prompt_of_a_feature_has_the_other_names_as_negatives():
+    rng = np.random.default_rng(0)
+    codebook = np.linalg.qr(rng.normal(size=(6, 6)))[0][:3]
+    meaning = Meaning(Source("files"), ("a", "b", "c"), codebook, np.eye(6))
+    prompt = feature_prompt(meaning, 0.2 * (codebook[2] + 0.4 * codebook[0]))
+    assert (prompt.name, prompt.negatives) == ("c", ("a", "b"))
+    np.testing.assert_allclose(prompt.vectors[1:], codebook[:2], atol=1e-12)
+    likely = np.asarray(prompt_probabilities(jnp.asarray(codebook), jnp.asarray(prompt.vectors)))
+    np.testing.assert_array_equal(most_likely(likely), [1, 2, 0])
 
 
 def test_a_region_is_the_mean_of_its_pixels():

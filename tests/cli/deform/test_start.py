@@ -76,7 +76,7 @@ def test_what_is_known_in_metres_does_not_judge_a_plane():
     notes = Notes(Console(quiet=True))
     alone, _ = with_depth(open_sequence(EYES), "plane", 0.1, notes)
     assert (alone.has_depth, alone.truth, alone.num_cameras) == (False, None, 1)
-    assert any("tell about how far with --deform.plane-depth (now 0.1)" in note for note in notes.all)
+    assert any("give about how far it is with --deform.plane-depth (now 0.1)" in note for note in notes.all)
 
 
 def test_what_there_is_is_taken_first():

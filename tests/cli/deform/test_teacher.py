@@ -60,7 +60,7 @@ def learned(files, tmp_path_factory):
 
 def query(run, *options):
     assert main(["query", *map(str, (run, *options))]) == 0
-    return json.loads((run / "query" / "query.json").read_text())
+    return json.loads((run / "query" / "query.json").encoded_prompt())
 
 
 def data_of(features, folder, channels=4, **asked):
@@ -70,7 +70,7 @@ def data_of(features, folder, channels=4, **asked):
 
 
 def test_feature_files_are_learned_and_judged_on_their_grid(learned):
-    found = json.loads((learned / "metrics.json").read_text())
+    found = json.loads((learned / "metrics.json").encoded_prompt())
     assert found["features"] == "files"
     assert found["names"] == ["group 1", "group 2"]
     assert [row["f_psnr"] is None for row in found["scores"]] == [False, False]
@@ -239,8 +239,8 @@ def test_clip_teaches_and_reads(tmp_path, request, monkeypatch):
 def test_classes_are_named_and_nothing_else():
     names = ("tissue", "tool")
     meaning = Meaning(Source("classes", dict(enumerate(names, 1))), names, np.eye(2), np.eye(5, 2))
-    assert text_prompt(meaning, "Tool").row == 1
-    with pytest.raises(ValueError, match="--negatives: a name is held against the other names"):
+    assert text_prompt(meaning, "Tool").name == "tool"
+    with pytest.raises(ValueError, match="--negatives: a name is compared with the other names"):
         text_prompt(meaning, "tool", ("x",))
     with pytest.raises(ValueError, match="no class 'forceps'"):
         text_prompt(meaning, "forceps")

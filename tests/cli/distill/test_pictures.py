@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gsjax.engine.distill import pictures as field_pictures
+from gsjax.engine.distill import query as field_query
 from gsjax.engine.distill import scores as field_scores
 from gsjax.engine.distill.judge import draw_features, feature_colors
 from gsjax.engine.distill.saved import short_names
@@ -89,7 +89,7 @@ def test_a_scene_has_one_colour_a_gaussian_from_one_camera():
     pose, K = np.eye(4), np.array([[20.0, 0, 12], [0, 20, 9], [0, 0, 1]])
     pose[2, 3] = 4
     camera = Camera(jnp.asarray(pose[None], float), jnp.asarray(K[None], float), 24, 18)
-    drawn, painted = (Drawer()(g, camera).colors for g in (shiny, field_pictures._seen_from(shiny, camera)))
+    drawn, painted = (Drawer()(g, camera).colors for g in (shiny, field_query._seen_from(shiny, camera)))
     assert drawn.max() > 0.2
     np.testing.assert_allclose(painted, drawn, atol=1e-5)
 

@@ -10,7 +10,7 @@ import equinox as eqx
 import numpy as np
 import pytest
 
-from gsjax.engine.distill import pictures as field_pictures
+from gsjax.engine.distill import query as field_query
 from gsjax.engine.teaching.source import Source
 from gsjax.io.ply import read_ply, write_ply
 from gsjax.perception.closed_vocabulary import ClosedVocabulary
@@ -94,13 +94,13 @@ def test_a_text_gives_gaussians_masks_and_scenes(gsjax, field, scene, pristine):
 
 def test_the_scene_is_read_once_and_drawn_by_one_program(gsjax, field, scene, monkeypatch):
     """Without something it has as many Gaussians as with it."""
-    drawers, drawer, read = [], field_pictures.Drawer, []
+    drawers, drawer, read = [], field_query.Drawer, []
 
     def kept(*args, **options):
         drawers.append(drawer(*args, **options))
         return drawers[-1]
 
-    monkeypatch.setattr(field_pictures, "Drawer", kept)
+    monkeypatch.setattr(field_query, "Drawer", kept)
     for module in ("gsjax.engine.files", "gsjax.engine.distill.scene"):
         monkeypatch.setattr(f"{module}.read_ply", lambda file: read.append(file) or read_ply(file))
     code, said = gsjax("query", field, "carton", "--move", 0, 0, 0.01)

@@ -138,7 +138,7 @@ def test_an_answer_that_is_not_whole_leaves_the_one_before(gsjax, field, monkeyp
     def stopped(*args, **options):
         raise problem
 
-    monkeypatch.setattr("gsjax.engine.distill.pictures.in_rows", stopped)
+    monkeypatch.setattr("gsjax.engine.distill.query.in_rows", stopped)
     code, _ = gsjax("query", field, "carton", "--camera", 0)
     assert code == (130 if problem is KeyboardInterrupt else 2)
     assert told_of(field) == before

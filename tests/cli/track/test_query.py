@@ -79,7 +79,7 @@ def test_a_tracked_run_answers_what_only_its_field_can(gsjax, run, pristine):
 def test_a_tracked_run_without_a_field_says_so(gsjax, tracked, option, value):
     code, said = gsjax("query", tracked, "can", option, value)
     assert code == 2
-    assert f"{option}: {tracked} has no field that could be asked so; gsjax distill" in said
+    assert f"{option}: {tracked} has no field that could be queried so; gsjax distill" in said
 
 
 @pytest.mark.parametrize("command", ["query", "grasp"])
@@ -115,7 +115,7 @@ def test_a_second_query_leaves_nothing_of_the_first(gsjax, run):
         (("can", "--encoder", "clip"), "expected --weights PATH as well"),
         (("can", "--weights", "x"), "--weights: the closed vocabulary has none"),
         (("can", "--encoder", "clip", "--weights", "x"), "x: expected a folder of CLIP's weights"),
-        (("can", "--min-score", "0.9"), "and 0.90 is asked for"),
+        (("can", "--min-score", "0.9"), "and 0.90 is required"),
     ],
 )
 def test_what_cannot_be_answered(gsjax, tracked, command, options, says):

@@ -80,7 +80,7 @@ def test_what_was_found_is_kept_and_nothing_written_over(fitted, asked, notes, m
     def full(*args, **options):
         raise OSError("no space")
 
-    monkeypatch.setattr("gsjax.engine.selected.write_ply", full)
+    monkeypatch.setattr("gsjax.engine.query.write_ply", full)
     with pytest.raises(OSError, match="no space"):
         asking.save(selected, "x", 0)
     assert sorted(asked.joinpath("extracted").iterdir()) == paths

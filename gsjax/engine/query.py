@@ -1,0 +1,354 @@
+"""The query of Gaussians, for `gsjax query` and for the viewer: the question, the Gaussians that match, and
+the files about them. A kind of run adds how it is asked and drawn (`Queryable`): a field, or a scene that
+deforms."""
+
+import math
+import re
+import threading
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import count
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+from rich.console import Console
+
+from gsjax.engine.folder import OF_QUERY, replaced_folder
+from gsjax.engine.messages import Notes
+from gsjax.io.atomic import write_json, write_new, write_npz
+from gsjax.io.pictures import write_png
+from gsjax.io.ply import write_ply
+from gsjax.methods.query import Prompt, Threshold
+from gsjax.scene.gaussians import Gaussians
+from gsjax.scene.selection import only, shifted, tinted
+from gsjax.viz.viewer import Answer, Asking
+
+SCENE_CAPTIONS = {"recolored": "recoloured", "moved": "moved"}
+"""Captions of the scenes of `Question.changed`, by the names of their files."""
+_EXTRACTED = "extracted"  # folder of parts that the viewer saved, in that of the run
+_HIGHEST = 1.0  # highest score: a cosine is from -1 to 1, a share against others from 0 to 1
+
+
+@dataclass(frozen=True)
+class Question:
+    """A query: one of text, image, point and box, how it is scored, and the changes to what is found. Without
+    any of the four everything is labelled, where features have names.
+
+    Attributes:
+        text: "red can".
+        image: a picture of the thing; where it has an alpha channel, only what is opaque.
+        point: x, y in pixels of a photograph or frame, as they were learned from.
+        box: x0, y0, x1, y1, likewise.
+        camera: short name of the photograph of the point, and of the only mask to draw.
+        frame: the recording's number of the frame of point and box, whose Gaussians are written (default: the
+            first).
+        frames: frames to draw, as a Python slice (default: the held-out ones).
+        threshold: score above which a Gaussian is selected (default: by a rule).
+        negatives: texts to compare with (default: the encoder's own).
+        color: RGB, 0 to 1, of what is found in recolored.ply.
+        move: shift of it in moved.ply, metres; None writes none.
+
+    Raises:
+        ValueError: no score can be above the threshold, or each is; a colour or a shift is out of range.
+    """
+
+    text: str | None = None
+    image: Path | None = None
+    point: tuple[float, float] | None = None
+    box: tuple[float, float, float, float] | None = None
+    camera: str | None = None
+    frame: int | None = None
+    frames: str | None = None
+    threshold: float | None = None
+    negatives: tuple[str, ...] | None = None
+    color: tuple[float, float, float] = (1.0, 0.25, 0.6)
+    move: tuple[float, float, float] | None = None
+
+    def __post_init__(self):
+        if self.threshold is not None and not -math.inf < self.threshold < _HIGHEST:
+            raise ValueError(
+                f"--threshold: expected a finite number below {_HIGHEST:g}, which no score is above, found "
+                f"{self.threshold:g}"
+            )
+        if any(not 0 <= value <= 1 for value in self.color):
+            raise ValueError(f"--color: expected three numbers of 0 to 1, found {_spaced(self.color)}")
+        if self.move is not None and not all(map(math.isfinite, self.move)):
+            raise ValueError(f"--move: expected three finite numbers, found {_spaced(self.move)}")
+
+    @property
+    def words(self) -> str:
+        """The query in short."""
+        if self.point is not None:
+            camera = "" if self.camera is None else f" of {self.camera}"
+            return f"what is at {self.point[0]:g},{self.point[1]:g}{camera}"
+        if self.box is not None:
+            return "what is in {:g},{:g} to {:g},{:g}".format(*self.box)
+        return repr(self.text) if self.image is None else f"what {self.image.name} shows"
+
+    def changed(self, gaussians: Gaussians, selected: Bool[np.ndarray, "n"]) -> dict[str, Gaussians]:
+        """Scenes with the selected Gaussians changed, by the names of their files."""
+        there = jnp.asarray(selected)
+        scenes = {"recolored": jax.jit(tinted)(gaussians, there, jnp.asarray(self.color))}
+        if self.move is not None:
+            scenes["moved"] = jax.jit(shifted)(gaussians, there, jnp.asarray(self.move))
+        return scenes
+
+
+@dataclass(frozen=True, eq=False)
+class Selection:
+    """The result of a query.
+
+    Attributes:
+        question: the query.
+        frame: index of the frame whose Gaussians were scored.
+        prompt: of the query.
+        scores: of all Gaussians.
+        threshold: score above which they are selected.
+        seconds: time that it took to score all Gaussians.
+    """
+
+    question: Question
+    frame: int
+    prompt: Prompt
+    scores: Float[np.ndarray, "n"]
+    threshold: Threshold
+    seconds: float
+
+    @property
+    def selected(self) -> Bool[np.ndarray, "n"]:
+        """The Gaussians that score above the threshold."""
+        return self.scores > self.threshold.value
+
+
+@dataclass(eq=False)
+class Queryable(ABC):
+    """A run whose Gaussians can be queried.
+
+    Attributes:
+        path: folder of the run, or of the field.
+        kind: the encoder of its features.
+        hint: what can be asked for, in words.
+        rows: row of the scene's file of each Gaussian.
+        num_rows: number of rows in that file, including Gaussians that cannot be drawn.
+        labels: label of each Gaussian; None without.
+        frame_ids: numbers of the frames; None of a scene that stands still.
+    """
+
+    path: Path
+    kind: str
+    hint: str
+    rows: Int[np.ndarray, "n"]
+    num_rows: int
+    labels: Int[np.ndarray, "n"] | None = None
+    frame_ids: tuple[int, ...] | None = None
+
+    @abstractmethod
+    def frame_of(self, question: Question) -> int:
+        """The index of the frame in question, once all that the question names is there.
+
+        Raises:
+            ValueError: something is not there.
+        """
+
+    @abstractmethod
+    def at(self, frame: int) -> Gaussians:
+        """The scene in a frame."""
+
+    @abstractmethod
+    def prompt(self, question: Question, frame: int) -> Prompt:
+        """The prompt of a question.
+
+        Raises:
+            ValueError: the question cannot be answered.
+            FileNotFoundError: weights of the encoder are not there.
+        """
+
+    @abstractmethod
+    def like(self, row: int, frame: int) -> Prompt:
+        """The prompt for what is similar to a Gaussian, by its row."""
+
+    @abstractmethod
+    def scorer(self, prompt: Prompt, frame: int) -> Callable[[], Float[Array, "n"]]:
+        """A function that scores all Gaussians."""
+
+    @abstractmethod
+    def about(self, question: Question, frame: int) -> dict[str, Any]:
+        """Entries of query.json that this kind of run has beside those of `answer`."""
+
+    @abstractmethod
+    def draw(self, folder: Path, found: Selection, notes: Notes, console: Console) -> dict[str, int]:
+        """Write pictures of a selection; returns the number of pixels in each mask.
+
+        Args:
+            folder: for the pictures.
+            found: the result of a query.
+            notes: receives warnings.
+            console: shows the progress.
+        """
+
+
+def select(run: Queryable, question: Question, frame: int, prompt: Prompt | None = None) -> Selection:
+    """Score all Gaussians of a run.
+
+    Args:
+        run: the run.
+        question: the query.
+        frame: index of the frame.
+        prompt: of the query (default: that of the question).
+
+    Raises:
+        ValueError, FileNotFoundError: as `Queryable.prompt`.
+    """
+    prompt = run.prompt(question, frame) if prompt is None else prompt
+    score = run.scorer(prompt, frame)
+    jax.block_until_ready(score())  # compiles
+    begun = perf_counter()
+    scores, seconds = np.asarray(score()), perf_counter() - begun
+    threshold = prompt.threshold(scores, question.threshold)
+    return Selection(question, frame, prompt, scores, threshold, seconds)
+
+
+def answer(
+    run: Queryable, question: Question, folder: Path, notes: Notes, console: Console
+) -> dict[str, Any]:
+    """Query a run, and write the result into a folder; returns the content of query.json.
+
+        query/
+          query.json          the query, the rule of its threshold, how many Gaussians, where and how large
+          selection.npz       indices [n], rows of the scene's PLY file; their scores [n] and means [n,3]; and
+                              all_scores, one for each row of the file, NaN for one that cannot be drawn
+          object.ply          what was found; without.ply the scene without it, recolored.ply with it in
+                              another colour, moved.ply with it elsewhere
+          masks/, ...         pictures (`Queryable.draw`)
+
+    Args:
+        run: the run or field.
+        question: the query.
+        folder: for the result, which replaces an earlier one once it is complete.
+        notes: receives warnings.
+        console: shows the progress.
+
+    Raises:
+        ValueError: the query cannot be answered, or selects nothing of the scene.
+        FileExistsError: the folder holds something else than a result of a query.
+    """
+    frame = run.frame_of(question)
+    gaussians = run.at(frame)
+    found = select(run, question, frame)
+    selected = found.selected
+    _check_count(run, found, notes)
+    with replaced_folder(folder, OF_QUERY) as new:
+        _write_selection(new / "selection.npz", run, gaussians, found)
+        for name, kept in (("object", selected), ("without", ~selected)):
+            if kept.any():
+                _write_part(new / f"{name}.ply", gaussians, kept, run.labels)
+        for name, scene in question.changed(gaussians, selected).items():
+            write_ply(new / f"{name}.ply", scene, labels=run.labels)
+        pixels = run.draw(new, found, notes, console)
+        means = np.asarray(gaussians.means)[selected]
+        info = {
+            "text": question.text,
+            "point": question.point,
+            "features": run.kind,
+            **run.about(question, frame),
+            "meant": found.prompt.name,
+            "against": found.prompt.negatives,
+            "threshold": found.threshold.value,
+            "rule": found.threshold.rule,
+            "gaussians": len(means),
+            "of": len(selected),
+            "best_score": float(found.scores.max()),
+            "center": means.mean(axis=0),
+            "size": np.ptp(means, axis=0),
+            "query_seconds": found.seconds,
+            "pixels": pixels,
+            "notes": notes.all,
+        }
+        write_json(new / "query.json", info)
+    return info
+
+
+def asking_of(run: Queryable) -> Asking:
+    """Queries of a run for the viewer's page, which saves to `extracted/` in the run's folder."""
+    one_by_one = threading.Lock()
+
+    def answered(words: str, question: Question, frame: int, prompt: Prompt) -> Answer:
+        found = select(run, question, frame, prompt)
+        return Answer(words, found.scores, *found.threshold, found.seconds)
+
+    def ask(text: str, frame: int) -> Answer:
+        question = Question(text=text)
+        with one_by_one:  # several pages may query before the encoder is loaded
+            prompt = run.prompt(question, frame)
+        return answered(text, question, frame, prompt)
+
+    def like(row: int, frame: int) -> Answer:
+        prompt = run.like(row, frame)
+        meant = "" if prompt.name is None else f" ({prompt.name})"
+        return answered(f"like Gaussian {row}{meant}", Question(), frame, prompt)
+
+    def save(selected: Bool[np.ndarray, "n"], name: str, frame: int) -> Path:
+        folder = run.path / _EXTRACTED
+        folder.mkdir(exist_ok=True)
+        called = name if run.frame_ids is None else f"{name} frame {run.frame_ids[frame]}"
+        stem = "_".join(re.findall(r"[^\W_]+", called.lower())) or "selection"
+        files = (folder / (f"{stem}.ply" if number == 1 else f"{stem}_{number}.ply") for number in count(1))
+        gaussians = run.at(frame)
+        return write_new(files, lambda path: _write_part(path, gaussians, selected, run.labels))
+
+    return Asking(run.hint, ask, like, save)
+
+
+def write_mask(folder: Path, name: str, mask: Bool[np.ndarray, "h w"]) -> int:
+    """Writes masks/NAME.png, 255 where something shows; returns the number of these pixels.
+
+    Args:
+        folder: of the query.
+        name: of the camera or the frame.
+        mask: where it shows.
+    """
+    write_png(folder / "masks" / f"{name}.png", np.where(mask, 255, 0).astype(np.uint8))
+    return int(mask.sum())
+
+
+def _check_count(run: Queryable, found: Selection, notes: Notes) -> None:
+    """Raises a ValueError where nothing is selected, and warns where everything is."""
+    selected, threshold, words = found.selected, found.threshold, found.question.words
+    if not selected.any():
+        where = "" if run.frame_ids is None else f" in frame {run.frame_ids[found.frame]}"
+        raise ValueError(
+            f"{words} means nothing of this scene{where}: the best score is "
+            f"{found.scores.max():.3f}, and more than {threshold.value:.5g} is required ({threshold.rule}); "
+            "try a lower --threshold"
+        )
+    if selected.all():
+        notes.warn(
+            f"{words} means all {len(selected)} Gaussians; a higher --threshold would select some of them"
+        )
+
+
+def _write_selection(path: Path, run: Queryable, gaussians: Gaussians, found: Selection) -> None:
+    """Writes selection.npz, by rows of the scene's file."""
+    selected, scores = found.selected, found.scores.astype(np.float32)
+    all_scores = np.full(run.num_rows, np.nan, np.float32)
+    all_scores[run.rows] = scores
+    means = np.asarray(gaussians.means)[selected]
+    arrays = {"indices": run.rows[selected], "scores": scores[selected], "means": means}
+    write_npz(path, arrays | {"all_scores": all_scores})
+
+
+def _write_part(
+    path: Path, gaussians: Gaussians, kept: Bool[np.ndarray, "n"], labels: Int[np.ndarray, "n"] | None
+) -> None:
+    """Writes some Gaussians as a PLY file, with their labels where there are any."""
+    write_ply(path, only(gaussians, kept), labels=None if labels is None else labels[kept])
+
+
+def _spaced(numbers: tuple[float, ...]) -> str:
+    return " ".join(f"{number:g}" for number in numbers)
