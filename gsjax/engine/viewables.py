@@ -253,4 +253,5 @@ def _shots_of_deformation(path: Path, result: DeformResult, notes: Notes) -> Sho
     except (ValueError, OSError) as error:
         notes.warn(f"its photographs are not shown: {describe(error)}")
     sizes = np.array([result.timeline.size])
-    return Shots(("camera",), result.viewmats[:, None], result.timeline.Ks[:, None], sizes, load_image=load)
+    viewmats, Ks = result.timeline.viewmats[:, None], result.timeline.Ks[:, None]
+    return Shots(("camera",), viewmats, Ks, sizes, load_image=load)
