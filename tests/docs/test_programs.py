@@ -23,10 +23,10 @@ PARTS = PartsConfig(
     grid=FeatureGridConfig(2, 4, 16, 8, 2, 8),
 )
 SHORTER = {
-    "fit": {"steps=500, cap=5000": "steps=4, cap=300"},
+    "fit": {"steps=500, cap=5000": "steps=4, cap=300, coarse_until=0.0"},
     "track": {"gsjax.TrackConfig()": "TRACK", "frames=4": "frames=2"},
     "parts": {"gsjax.PartsConfig()": "PARTS", "frames=[0, 5, 10, 15]": "frames=[0, 5]"},
-    "distill": {"steps=500, cap=5000": "steps=4, cap=300", "iterations=200": "iterations=3"},
+    "distill": {"steps=500, cap=5000": "steps=4, cap=300, coarse_until=0.0", "iterations=200": "iterations=3"},
     "deform": {"warmup=100, iterations=200": "warmup=2, iterations=3, nodes=64"},
 }
 """Less to do for each program: text of it, and what stands for it here."""
@@ -74,7 +74,7 @@ def test_all_use_the_same_words(verb):
 def test_it_runs(verb, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(first_fit, "TrackConfig", lambda: TRACK)
-    monkeypatch.setattr(parts_start, "FIT", replace(parts_start.FIT, steps=4, cap=400))
+    monkeypatch.setattr(parts_start, "FIT", replace(parts_start.FIT, steps=4, cap=4000, coarse_until=0.0))
     text = program(verb).text
     for long, short in SHORTER[verb].items():
         assert long in text, f"gsjax.{verb}: expected {long!r}, which is shortened here"
