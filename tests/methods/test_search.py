@@ -109,12 +109,12 @@ def test_a_suspect_that_jumps_is_followed_before_it_is_relocated(jumped):
         return search(jnp.zeros((1, 1, 6)), points, centers, given[2], *how, lambda _: nowhere)
 
     followed = searched(usual=jnp.array([0.05]))
-    np.testing.assert_allclose(followed.found.twists[0, :3], shift, atol=1e-3)
-    assert not followed.recovered[0]
+    np.testing.assert_allclose(followed.estimate.twists[0, :3], shift, atol=1e-3)
+    assert not followed.relocation_tried[0]
     for changes in ({"usual": jnp.array([0.9])}, {"usual": jnp.array([0.05]), "lost": yes}):
         elsewhere = searched(**changes)
         np.testing.assert_allclose(elsewhere.relocation.twists[0], 1.0)
-        assert elsewhere.recovered[0]
+        assert elsewhere.relocation_tried[0]
 
 
 def test_groups_that_agree_worst_or_have_waited_longest_are_searched_for_first(jumped):
