@@ -160,7 +160,7 @@ def show(view: View, mask: Bool[np.ndarray, "h w"], group: int) -> np.ndarray:
 
 
 def progress(frames: Iterator[list[View]], saved: SavedRun, console: Console) -> Iterator[View]:
-    """The one view of each frame of a run, with a progress bar on the console."""
+    """The one view of each frame of a saved run, with a progress bar on the console."""
     count = saved.tracking.num_frames
     for frame in track(frames, "rendering", total=count, console=console, transient=True):
         yield frame[0]
