@@ -121,7 +121,7 @@ def run(options: Options) -> int:
             _query_deformation(options, console)
             return 0
         _expect_none_of(f"is for a run of `gsjax deform`, which {options.run} is not", options.deform)
-        if field is not None and not (tracked and not needs_field):
+        if field is not None and (needs_field or not tracked):
             _query_field(options, field, console)
             return 0
         if field is None and not tracked:
@@ -253,8 +253,8 @@ def _question(options: Options) -> Question:
         frames=deform.frames,
         threshold=gaussians.threshold,
         negatives=gaussians.negatives,
+        color=gaussians.color or Question.color,
         move=gaussians.move,
-        **({} if gaussians.color is None else {"color": gaussians.color}),
     )
 
 

@@ -17,7 +17,7 @@ _READ_ERRORS = (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zli
 
 
 def cache_folder() -> Path:
-    """Where outputs are kept by default; what lies there may be deleted."""
+    """The default folder of outputs; its content may be deleted."""
     return Path(user_cache_dir("gsjax", appauthor=False)) / "features"
 
 
@@ -25,7 +25,7 @@ class FeatureCache:
     """A folder of outputs. A damaged one is computed again, and one that cannot be written is not kept.
 
     Attributes:
-        found, asked: how many outputs were there, and how many had to be computed.
+        found, asked: number of outputs that were there, and of those that had to be computed.
     """
 
     def __init__(self, folder: Path | None = None):
@@ -36,15 +36,15 @@ class FeatureCache:
         self._folder = folder or cache_folder()
         self.found = self.asked = 0
 
-    def __call__(self, who: str, shown: Arrays, ask: Callable[[], Arrays]) -> dict[str, np.ndarray]:
-        """The output of `who` for some inputs.
+    def __call__(self, key: str, inputs: Arrays, compute: Callable[[], Arrays]) -> dict[str, np.ndarray]:
+        """An output for some inputs.
 
         Args:
-            who: everything else that the output depends on: the encoder, its weights, its settings.
-            shown: the inputs.
-            ask: computes the output.
+            key: everything else that the output depends on: the encoder, its weights, its settings.
+            inputs: arrays.
+            compute: computes the output.
         """
-        path = self._folder / f"{content_digest(who, shown)}.npz"
+        path = self._folder / f"{content_digest(key, inputs)}.npz"
         try:
             with np.load(path, allow_pickle=False) as stored:
                 output = dict(stored)
@@ -52,7 +52,7 @@ class FeatureCache:
             return output
         except _READ_ERRORS:
             pass
-        output = dict(ask())
+        output = dict(compute())
         self.asked += 1
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -71,10 +71,10 @@ def folder_digest(folder: Path) -> str:
     return digest.hexdigest()
 
 
-def content_digest(who: str, shown: Arrays) -> str:
-    """SHA-256 over an encoder and its inputs, as for `FeatureCache`."""
-    digest = hashlib.sha256(json.dumps(who).encode())
-    for name, array in sorted(shown.items()):
+def content_digest(key: str, inputs: Arrays) -> str:
+    """SHA-256 over a key and arrays, as for `FeatureCache`."""
+    digest = hashlib.sha256(json.dumps(key).encode())
+    for name, array in sorted(inputs.items()):
         array = np.ascontiguousarray(array)
         digest.update(f"{name}|{array.dtype.str}|{array.shape}|".encode())
         digest.update(array.tobytes())

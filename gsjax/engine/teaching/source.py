@@ -82,7 +82,7 @@ class Source:
             raise FileNotFoundError(f"{error}; --weights says where they are now") from error
 
     def hint(self, weights: Path | None = None) -> str:
-        """What can be asked for, in words.
+        """The queries that the encoder reads, in words.
 
         Args:
             weights: as for `encoder`.
