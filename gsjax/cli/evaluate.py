@@ -156,7 +156,7 @@ def _check(record: Record) -> None:
         )
     if not (record.path / "scene.ply").is_file():
         raise ValueError(
-            f"{record.path}: expected a scene.ply to score, found none: the run goes on still, or was "
+            f"{record.path}: expected a scene.ply to score, found none: the run is still going on, or was "
             "killed; gsjax fit --resume finishes it"
         )
 

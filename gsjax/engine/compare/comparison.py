@@ -107,7 +107,7 @@ def compare(records: Sequence[Record], same_views: Callable[[list[Record], str],
         group.best = _best(kind, members, scores, comparable)
     for label, record in labelled.items():
         if not record.complete:
-            words = "was stopped" if record.metrics else "goes on still, or was killed"
+            words = "was stopped" if record.metrics else "is still going on, or was killed"
             notes.append(f"{label} {words}: it is shown, and not among the best.")
     if kind == "fit":
         notes += _what_eval_adds(labelled)

@@ -185,7 +185,7 @@ def deform_data(
         train, test = ([t for t in some if t not in unknown] for some in (train, test))
         if unknown:
             numbers = ", ".join(str(sequence.frame_ids[t]) for t in unknown)
-            notes.warn(f"frames {numbers} have no mask to tell where tools are, and are left out")
+            notes.warn(f"frames {numbers} have no mask of tools and are left out")
         if not train:
             raise ValueError(
                 f"{sequence.name}: expected masks of frames to learn from, found none (--tools draw)"

@@ -56,19 +56,19 @@ def _of_two_eyes(sequence: Sequence, notes: Notes) -> tuple[Sequence, DepthSourc
     except ValueError as error:
         raise ValueError(
             f"{sequence.name}: cameras {sequence.camera_ids[0]} and {sequence.camera_ids[1]} cannot be "
-            f"matched: {error}; --depth plane begins without them"
+            f"matched: {error}; --depth plane starts without them"
         ) from error
     assert first is not None
     covered = float((first > 0).mean())
     if covered < 0.2:
         notes.warn(
             f"{sequence.name}: matching both eyes found depth in {covered:.0%} of the first frame's pixels; "
-            "are poses right, and pictures taken at the same time? --depth plane begins without it"
+            "check the poses, and that images were taken at the same time; --depth plane starts without it"
         )
     notes.add(
         f"Depth is matched between cameras {sequence.camera_ids[0]} and {sequence.camera_ids[1]} (in "
-        f"{covered:.0%} of the first frame's pixels): what is judged as depth is how far the scene is from "
-        "what was matched, and the other camera has been seen in the frames that were learned from."
+        f"{covered:.0%} of the first frame's pixels): depth errors are relative to the matched depth, and the "
+        "other camera is not held out in the training frames."
     )
     return replace(sequence, load_depth=load), "stereo"
 
@@ -76,21 +76,21 @@ def _of_two_eyes(sequence: Sequence, notes: Notes) -> tuple[Sequence, DepthSourc
 def _of_a_plane(sequence: Sequence, plane: float, notes: Notes) -> tuple[Sequence, DepthSource]:
     """The first camera alone, without what is known in metres, because the scene has another unit."""
     notes.add(
-        f"There is no depth: the scene began on a plane {plane:g} before the first camera. Its depth is of "
-        "no metric unit, nothing but pictures teaches it, and it is not judged."
+        f"There is no depth: the scene starts on a plane {plane:g} in front of the first camera. Its depth "
+        "has no metric unit, is learned from images alone, and is not scored."
     )
     rotations, shifts = sequence.viewmats[:, 0, :3, :3], sequence.viewmats[:, 0, :3, 3]
     centers = -np.einsum("tji,tj->ti", rotations, shifts)
     moved = float(np.linalg.norm(centers - centers[0], axis=1).max())
     if moved == 0:
         notes.add(
-            "The camera has one pose in all frames; if it moved, that passes as the scene's motion. gsjax "
-            "poses finds poses of a video, where most of what is seen stands still."
+            "The camera has one pose in all frames; if it moved, its motion appears as motion of the scene. "
+            "`gsjax poses` finds the poses of a video whose scene is mostly static."
         )
     else:
         notes.warn(
             f"{sequence.name}: the camera moves by {moved:.3g}, and the distance of the scene is not known; "
-            f"give about how far it is with --deform.plane-depth (now {plane:g}), in the unit of the poses"
+            f"pass its approximate distance with --deform.plane-depth (now {plane:g}), in the unit of the poses"
         )
     alone = sequence.select(cameras=[sequence.camera_ids[0]])
     names = alone.names_of_labels  # some of which may be truth's

@@ -77,7 +77,7 @@ def run(options: Options) -> int:
         data = deform_data(sequence, *how, options.tool_values, notes, console)
         if data.meaning is None and choice.features != NO_TEACHER:
             only = "One class among the pixels that count" if data.sequence.has_masks else "No masks"
-            only += ": colours are learned, and no meaning or graph"
+            only += ": colours alone are learned, without meaning or graph"
             notes.add(f"{only}.")
             console.print(f"{only}; for gsjax query and ask: --tools draw, or --features", soft_wrap=True)
         method, metric = Deform(options.deform), source != "plane"
@@ -89,7 +89,7 @@ def run(options: Options) -> int:
             run, progress = load_run(folder.resume, run, progress)
             notes.add(f"Resumed after {run.step} steps of an earlier run.")
             if (folder.path / "query").exists():
-                notes.warn(f"{folder.path / 'query'} is an answer of the scene as it was; ask again")
+                notes.warn(f"{folder.path / 'query'} answers a query of the earlier scene; query again")
         folder.write_config(settings)  # from here on an earlier run is gone
         row, ticks = means_of("psnr", *_LOSSES), drive(method, problem, run)
         schedule = Schedule("reconstructing", method.total(problem), row, _in_words)
@@ -103,7 +103,7 @@ def run(options: Options) -> int:
         note_if_cut_short(progress, schedule, run.step, notes)
         _warn_of_oddities(progress, judged, notes)
         if not data.test:
-            notes.add("No frame is held out: nothing was judged that the scene had not learned from.")
+            notes.add("No frame is held out: all scores are of training frames.")
         found = {
             "kind": "deform",
             "dataset": data.sequence.name,
@@ -130,10 +130,10 @@ def _warn_of_oddities(progress: Progress, judged: Mapping[str, Any], notes: Note
         notes.warn(f"{progress.skipped} steps met numbers that are not finite and changed nothing")
     tracks = judged["tracks"]
     if tracks is not None and tracks["median_mm"] > _HARDLY * tracks["still_median_mm"]:
-        notes.warn("tracks are hardly better than if nothing moved; more steps (--deform.iterations)?")
+        notes.warn("tracks are hardly better than those of a static scene; more steps (--deform.iterations)?")
     unlike = [f"{one['class']} {one['iou']:.2f}" for one in judged["classes"] if one["iou"] < _UNLIKE]
     if unlike:
-        notes.warn(f"what is drawn hardly overlaps what was seen (IoU): {', '.join(unlike)}; more steps?")
+        notes.warn(f"rendered classes hardly overlap the recorded ones (IoU): {', '.join(unlike)}; more steps?")
 
 
 def _recording(options: Options, notes: Notes) -> tuple[Sequence, DepthSource]:
@@ -151,7 +151,7 @@ def _recording(options: Options, notes: Notes) -> tuple[Sequence, DepthSource]:
     first = options.cameras or tuple(c for c in whole.camera_ids if c not in judge)[:1]
     if not first or first == judge:
         raise ValueError(
-            f"--eval-cameras: expected another camera than that to learn from, found {list(judge)} for both"
+            f"--eval-cameras: expected a camera other than the training camera, found {list(judge)} for both"
         )
     others = [camera for camera in whole.camera_ids if camera not in (*first, *judge)]
     sequence = whole.select(cameras=[*first, *judge, *others])
@@ -166,7 +166,7 @@ def _of_photographs(photographs: Photographs, facing: Float[np.ndarray, "4 4"]) 
         return words
     away = float(np.median(photographs.cloud.points @ facing[2, :3] + facing[2, 3]))
     return (
-        f"{words} The points that came with their poses lie {away:.3g} before the first, in the poses' unit."
+        f"{words} Their sparse points lie {away:.3g} in front of the first camera, in the unit of the poses."
     )
 
 

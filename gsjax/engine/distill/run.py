@@ -152,4 +152,4 @@ def _note_oddities(scene: FieldScene, progress: Progress, notes: Notes) -> None:
     if progress.skipped:
         notes.warn(f"{progress.skipped} steps met numbers that are not finite and changed nothing")
     if not len(scene.held_out):
-        notes.add("No view is held out: nothing was judged that the field had not seen.")
+        notes.add("No view is held out: all scores are of training views.")

@@ -33,9 +33,8 @@ class SceneAndImages:
     """Folder of a run of `gsjax fit`, `gsjax track` (its first frame) or `gsjax parts` (its canonical frame);
     or a PLY file of any program, with --images and --out."""
     images: str | None = None
-    """Photographs of a PLY file's scene, posed in its world: a folder, as for `gsjax fit`, from which
-    --frames, --cameras, --eval-cameras and --test-every choose. For a run, which has chosen: where they are
-    now."""
+    """Photographs of a PLY file's scene, posed in its world, from which --frames, --cameras, --eval-cameras and
+    --test-every select. For a run: the present location of its photographs."""
 
 
 @dataclass(frozen=True)
@@ -52,7 +51,7 @@ class FieldScene:
         gaussians: the scene.
         photographs: of the scene, posed as it was fitted.
         taught: indices of the photographs to learn from.
-        held_out: indices of those that the field is only judged by.
+        held_out: indices of those that are only used for scores.
         rasterize_mode: as the scene was fitted: "classic" or "antialiased".
     """
 
@@ -86,7 +85,7 @@ def open_scene(options: SceneOptions, gaussians: Gaussians | None = None) -> Fie
         if given:
             flag = f"--{given[0].replace('_', '-')}"
             raise ValueError(
-                f"{flag}: {path} is a run, which has its photographs chosen and split; leave it out"
+                f"{flag}: {path} is a run, whose photographs are already selected and split; leave it out"
             )
         scene = scene_of_run(path, options.images, gaussians)
     if not scene.gaussians.num:
@@ -112,7 +111,7 @@ def scene_of_run(path: Path, images: str | None = None, gaussians: Gaussians | N
     record = read_record(path)
     file = path / "scene.ply"
     if not file.is_file():
-        raise FileNotFoundError(f"{path}: expected a scene.ply, found none: the run goes on still, or failed")
+        raise FileNotFoundError(f"{path}: expected a scene.ply, found none: the run is still going on, or failed")
     gaussians = _read(file) if gaussians is None else gaussians
     if record.kind == "track":
         if images is not None:
@@ -143,7 +142,7 @@ def scene_of_file(
     Args:
         file: the scene.
         images: a dataset.
-        read: what its layout leaves open.
+        read: options of its reader.
         test_every: hold out every n-th photograph where the data has no split.
         gaussians: the scene's, if they were read already.
         **chosen: as for `choose_photographs`.

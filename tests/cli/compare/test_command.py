@@ -172,7 +172,7 @@ def test_unfinished_runs_are_marked_and_never_best(make, gsjax_compare):
     assert by_run(found, "steps")["going_on"] == 150
     assert by_run(found, "num_gaussians")["going_on"] == 600
     assert by_run(found, "minutes")["going_on"] == 1.5
-    assert any("going_on goes on still, or was killed" in note for note in found["notes"])
+    assert any("going_on is still going on, or was killed" in note for note in found["notes"])
     assert any("stopped was stopped" in note for note in found["notes"])
 
 

@@ -68,7 +68,7 @@ def test_a_clip_begins_on_a_plane(gsjax, clip, tmp_path):
     assert found["test"]["psnr_masked"] > 18
     assert (run / "test" / "000001.png").is_file()
     notes = " ".join(found["notes"])
-    assert "the scene began on a plane 1 before the first camera" in notes
+    assert "the scene starts on a plane 1 in front of the first camera" in notes
     assert "The camera has one pose in all frames" in notes
 
 
