@@ -67,8 +67,8 @@ def _of_two_eyes(sequence: Sequence, notes: Notes) -> tuple[Sequence, DepthSourc
         )
     notes.add(
         f"Depth is matched between cameras {sequence.camera_ids[0]} and {sequence.camera_ids[1]} (in "
-        f"{covered:.0%} of the first frame's pixels): depth errors are relative to the matched depth, and the "
-        "other camera is not held out in the training frames."
+        f"{covered:.0%} of the first frame's pixels): depth errors are relative to the matched depth, and "
+        "the other camera is not held out in the training frames."
     )
     return replace(sequence, load_depth=load), "stereo"
 
@@ -90,7 +90,7 @@ def _of_a_plane(sequence: Sequence, plane: float, notes: Notes) -> tuple[Sequenc
     else:
         notes.warn(
             f"{sequence.name}: the camera moves by {moved:.3g}, and the distance of the scene is not known; "
-            f"pass its approximate distance with --deform.plane-depth (now {plane:g}), in the unit of the poses"
+            f"pass it, roughly, with --deform.plane-depth (now {plane:g}), in the unit of the poses"
         )
     alone = sequence.select(cameras=[sequence.camera_ids[0]])
     names = alone.names_of_labels  # some of which may be truth's

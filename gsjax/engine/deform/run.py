@@ -133,7 +133,9 @@ def _warn_of_oddities(progress: Progress, judged: Mapping[str, Any], notes: Note
         notes.warn("tracks are hardly better than those of a static scene; more steps (--deform.iterations)?")
     unlike = [f"{one['class']} {one['iou']:.2f}" for one in judged["classes"] if one["iou"] < _UNLIKE]
     if unlike:
-        notes.warn(f"rendered classes hardly overlap the recorded ones (IoU): {', '.join(unlike)}; more steps?")
+        notes.warn(
+            f"rendered classes hardly overlap the recorded ones (IoU): {', '.join(unlike)}; more steps?"
+        )
 
 
 def _recording(options: Options, notes: Notes) -> tuple[Sequence, DepthSource]:

@@ -33,8 +33,8 @@ class SceneAndImages:
     """Folder of a run of `gsjax fit`, `gsjax track` (its first frame) or `gsjax parts` (its canonical frame);
     or a PLY file of any program, with --images and --out."""
     images: str | None = None
-    """Photographs of a PLY file's scene, posed in its world, from which --frames, --cameras, --eval-cameras and
-    --test-every select. For a run: the present location of its photographs."""
+    """Photographs of a PLY file's scene, posed in its world, of which --frames, --cameras, --eval-cameras
+    and --test-every select some. For a run: the present location of its photographs."""
 
 
 @dataclass(frozen=True)
@@ -111,7 +111,9 @@ def scene_of_run(path: Path, images: str | None = None, gaussians: Gaussians | N
     record = read_record(path)
     file = path / "scene.ply"
     if not file.is_file():
-        raise FileNotFoundError(f"{path}: expected a scene.ply, found none: the run is still going on, or failed")
+        raise FileNotFoundError(
+            f"{path}: expected a scene.ply, found none: the run is still going on, or failed"
+        )
     gaussians = _read(file) if gaussians is None else gaussians
     if record.kind == "track":
         if images is not None:
