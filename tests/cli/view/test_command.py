@@ -246,7 +246,7 @@ def test_a_port_in_use(view, ply, monkeypatch):
 def test_an_open_address_is_warned_of(view, ply):
     code, said = view(ply, "--host", "0.0.0.0", "--port", "0")
     assert code == 130
-    assert "everyone who reaches this machine over the network can look" in said
+    assert "can view the scene, and save screenshots and films here" in said
 
 
 def test_a_page_is_served_until_ctrl_c(ply):

@@ -133,5 +133,5 @@ def test_what_moves_says_where_its_field_is_asked(tracked, notes):
     field = write_made_field(tracked / "field", tracked / "scene.ply", None, source, labels, CODES)
     scene, _ = open_viewable(tracked, notes)
     assert scene.asking is None
-    assert any(f"gsjax view {field} shows what its field is of" in note for note in notes.all)
+    assert any(f"gsjax view {field} shows the scene of its field" in note for note in notes.all)
     assert open_viewable(field, notes)[0].asking is not None
