@@ -14,7 +14,7 @@ from gsjax.engine.folder import expect_run, is_run
 Kind = Literal["fit", "track", "parts", "distill", "deform"]
 EVALUATION = Path("eval", "metrics.json")
 """Path of the scores of `gsjax eval`, within the folder of a run."""
-_SCORES: dict[Kind, tuple[str, ...]] = {
+_REQUIRED: dict[Kind, tuple[str, ...]] = {
     "fit": ("dataset", "size", "photographs", "views", "seconds", "steps", "num_gaussians", "machine"),
     "track": (
         *("dataset", "image", "frames", "tracked_cameras", "held_out_cameras", "objects", "iou"),
@@ -68,7 +68,7 @@ def read_record(path: Path) -> Record:
     expect_run(path)
     config = read_config(path / "config.yml")
     kind = _kind(path, config)
-    metrics = _object(path / "metrics.json", _SCORES[kind])
+    metrics = _object(path / "metrics.json", _REQUIRED[kind])
     evaluation, notes = _object(path / EVALUATION, ("scene_sha256", "lpips", "views")), ()
     if evaluation is not None and evaluation.get("scene_sha256") != digest(path / "scene.ply"):
         evaluation = None

@@ -173,7 +173,8 @@ class Plan:
 
 
 HEADROOM = 1.3
-"""How many times as much as is needed a plan holds, unless a caller knows better."""
+"""Capacity of a plan as a multiple of what is needed; `parts` and `track` have `config.headroom`, the viewer its
+own value, and `gsjax.plan` and `plan_render` an argument."""
 
 Drawn = TypeVar("Drawn")
 

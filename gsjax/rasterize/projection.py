@@ -15,7 +15,7 @@ from gsjax.rasterize.lanes import columns_in_lanes, flat, in_lanes
 from gsjax.rasterize.plan import Plan
 
 MIN_COMPENSATION = 0.005  # floor of the antialiasing factor
-HEADROOM = 1e8  # factor by which drawn variances and determinants stay below the largest float
+OVERFLOW_MARGIN = 1e8  # factor by which drawn variances and determinants stay below the largest float
 
 
 class Projected(NamedTuple):
@@ -159,7 +159,7 @@ def project_gaussians(
     squared = sum(c * c for c in values[1])
     sound &= (squared >= MIN_SQUARED_NORM) & jnp.isfinite(squared)
     # The gradient of 1 / det contains its square. A det of 0, infinity or NaN fails too.
-    large = [HEADROOM * c for c in (*variances, det)]  # allows for factors in the gradients
+    large = [OVERFLOW_MARGIN * c for c in (*variances, det)]  # allows for factors in the gradients
     has_area = _all_finite([u, v, *conics, *large, 1 / (det * det)])
     in_range = (z > plan.near_plane) & (z < plan.far_plane)
     culled = flat(~sound | (in_range & ~has_area), n).sum(dtype=jnp.int32)

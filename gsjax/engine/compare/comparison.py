@@ -196,15 +196,11 @@ def _fit_scores(members: Mapping[str, Record], views: list[str]) -> dict[str, di
     judged = {label: _held_out(record) for label, record in members.items()}
     scores: dict[str, dict[str, float | None]] = {}
     for label, record in members.items():
-        found, last = record.metrics, record.curve[-1] if record.curve else {}
-        seconds = last.get("seconds")
-        if found is not None:
-            seconds = found["seconds"]["fit"] + found["seconds"]["compile"]
-        scores[label] = {
-            "num_gaussians": last.get("alive") if found is None else found["num_gaussians"],
-            "minutes": None if seconds is None else seconds / 60,
-            "steps": last.get("step") if found is None else found["steps"],
-        }
+        scores[label] = _scores(record)
+        if record.metrics is None and record.curve:  # it has not come to its scores yet
+            last = record.curve[-1]
+            scores[label] |= {"num_gaussians": last["alive"], "steps": last["step"]}
+            scores[label] |= {"minutes": last["seconds"] / 60}
     for key in _OF_VIEWS:
         known = {
             label: {v for v, row in rows.items() if _is_known(row.get(key))} for label, rows in judged.items()

@@ -33,8 +33,8 @@ from gsjax.engine.teaching.choice import NO_TEACHER, TeacherChoice, TeacherOptio
 from gsjax.io.ply import write_ply
 from gsjax.methods.deform import PRESETS, Deform, DeformConfig
 from gsjax.methods.deform.method import PLAN
+from gsjax.methods.deform.update import LOSSES
 
-_LOSSES = ("rgb", "depth", "feature", "node", "structure", "spatial", "temporal", "planes")
 _HARDLY = 0.95  # of the error of a scene that stands still
 _UNLIKE = 0.6  # an IoU
 
@@ -91,7 +91,7 @@ def run(options: Options) -> int:
             if (folder.path / "query").exists():
                 notes.warn(f"{folder.path / 'query'} answers a query of the earlier scene; query again")
         folder.write_config(settings)  # from here on an earlier run is gone
-        row, ticks = means_of("psnr", *_LOSSES), drive(method, problem, run)
+        row, ticks = means_of("psnr", *LOSSES), drive(method, problem, run)
         schedule = Schedule("reconstructing", method.total(problem), row, _in_words)
         watch(ticks, progress, schedule, folder, console, minutes=options.minutes)
         run, result = ticks.run, ticks.result

@@ -23,6 +23,8 @@ from gsjax.scene.gaussians import Gaussians
 from gsjax.scene.render import render
 from gsjax.scene.time_encodings import HexPlane
 
+LOSSES = ("rgb", "depth", "feature", "node", "structure", "spatial", "temporal", "planes")
+"""Names in `info` of the losses, which are recorded during a run."""
 _FINAL_RATE = 0.1
 _WEIGHT_DECAY = 1e-5  # of AdamW (SurstSplat, section 3)
 
