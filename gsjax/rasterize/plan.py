@@ -173,8 +173,8 @@ class Plan:
 
 
 HEADROOM = 1.3
-"""Capacity of a plan as a multiple of what is needed; `parts` and `track` have `config.headroom`, the viewer has
-its own value, and `gsjax.plan` and `plan_render` an argument."""
+"""Capacity of a plan as a multiple of what is needed; `parts` and `track` have `config.headroom`, the viewer
+has its own value, and `gsjax.plan` and `plan_render` an argument."""
 
 Drawn = TypeVar("Drawn")
 
