@@ -189,7 +189,7 @@ def test_what_is_not_alike_is_left_out_and_said(make, gsjax_compare):
     assert "LPIPS is of different weights and not compared" in notes
     assert "run on different machines; time is not compared" in notes
     assert "LPIPS is absent for c, evaluated without weights" in notes
-    assert f"{d}: what `gsjax eval` found is of an earlier scene" in notes
+    assert f"{d}: the scores of `gsjax eval` are of an earlier scene" in notes
     assert "MS-SSIM and LPIPS are absent for d: gsjax eval RUN adds them" in notes
 
 

@@ -43,7 +43,7 @@ def test_what_a_run_writes(deformed):
         picture = cv2.imread(str(deformed / "test" / f"{frame:06d}.png"))
         assert picture.shape == (52, 64, 3)
         assert picture.std() > 5
-    assert "frames a second" in (deformed / "report.html").read_text()
+    assert "rendering rate" in (deformed / "report.html").read_text()
     assert read_ply(deformed / "scene.ply")[0].num == found["num_gaussians"]
     told = read_deformation(deformed / "deformation.npz")
     assert told.names == ("tissue", "tool")

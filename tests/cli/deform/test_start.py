@@ -76,7 +76,7 @@ def test_what_is_known_in_metres_does_not_judge_a_plane():
     notes = Notes(Console(quiet=True))
     alone, _ = with_depth(open_sequence(EYES), "plane", 0.1, notes)
     assert (alone.has_depth, alone.truth, alone.num_cameras) == (False, None, 1)
-    assert any("give about how far it is with --deform.plane-depth (now 0.1)" in note for note in notes.all)
+    assert any("pass it, roughly, with --deform.plane-depth (now 0.1)" in note for note in notes.all)
 
 
 def test_what_there_is_is_taken_first():
@@ -90,7 +90,7 @@ def test_what_there_is_is_taken_first():
         with_depth(dark, "auto", 1.0, notes)
     assert "found depth in 0% of the first frame's pixels" in notes.all[-1]
     together = replace(blind, viewmats=blind.viewmats[:, [0, 0]])
-    with pytest.raises(ValueError, match=r"cameras 0 and 1 cannot be matched: .* --depth plane begins"):
+    with pytest.raises(ValueError, match=r"cameras 0 and 1 cannot be matched: .* --depth plane starts"):
         with_depth(together, "auto", 1.0, notes)
 
 
