@@ -77,7 +77,7 @@ def run(taught, tmp_path):
 
 
 def asked(run):
-    return json.loads((run / "query" / "query.json").encoded_prompt())
+    return json.loads((run / "query" / "query.json").read_text())
 
 
 def test_a_name_is_found_and_deleted_in_every_frame(gsjax, run):
@@ -208,7 +208,7 @@ def test_a_run_is_seen_over_time_and_asked(run):
 
 def test_a_run_whose_recording_is_gone(run):
     config = run / "config.yml"
-    config.write_text(config.encoded_prompt().replace(SCENE, "/nowhere/recording"))
+    config.write_text(config.read_text().replace(SCENE, "/nowhere/recording"))
     scene, _ = open_viewable(run, notes := Notes(Console(quiet=True)))
     assert any("its photographs are not shown" in note for note in notes.all)
     assert scene.shots.load_image is None

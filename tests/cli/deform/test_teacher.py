@@ -60,7 +60,7 @@ def learned(files, tmp_path_factory):
 
 def query(run, *options):
     assert main(["query", *map(str, (run, *options))]) == 0
-    return json.loads((run / "query" / "query.json").encoded_prompt())
+    return json.loads((run / "query" / "query.json").read_text())
 
 
 def data_of(features, folder, channels=4, **asked):
@@ -70,7 +70,7 @@ def data_of(features, folder, channels=4, **asked):
 
 
 def test_feature_files_are_learned_and_judged_on_their_grid(learned):
-    found = json.loads((learned / "metrics.json").encoded_prompt())
+    found = json.loads((learned / "metrics.json").read_text())
     assert found["features"] == "files"
     assert found["names"] == ["group 1", "group 2"]
     assert [row["f_psnr"] is None for row in found["scores"]] == [False, False]
