@@ -64,7 +64,7 @@ def run(options: Options) -> int:
         return 0
     asked = parse_question(options.question, result.names)
     rows = rows_of(asked, result.timeline.frame_ids.tolist())
-    with stage(console, f"looking at {_in_words(result, rows)}"):
+    with stage(console, f"measuring {_in_words(result, rows)}"):
         # The depth of the first frame is the unit of lengths in a scene of unknown scale.
         facts = scene_facts(result, rows if result.timeline.metric or 0 in rows else [0, *rows])
     answer = TemplatedAnswerer()(options.question, facts)

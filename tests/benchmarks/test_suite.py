@@ -343,4 +343,4 @@ def test_a_broken_baseline_is_named(monkeypatch, tmp_path, capfd):
 def test_outside_a_checkout_it_says_so(monkeypatch, tmp_path, capfd):
     monkeypatch.chdir(tmp_path)
     assert main(["bench"]) == 2
-    assert "go to a checkout of gsjax" in capfd.readouterr().err
+    assert "run it in a checkout of gsjax" in capfd.readouterr().err

@@ -144,7 +144,7 @@ def test_mask_that_is_all_background(refused, recording):
         (("--cameras", "0", "7"), "--cameras: table has no camera 7; it has [0, 1, 2]."),
         (("--eval-cameras", "9"), "--eval-cameras: table has no camera 9"),
         (("--cameras", "0", "0"), "camera 0 is named twice"),
-        (("--cameras", "0", "--eval-cameras", "0"), "camera 0 stands in --cameras too"),
+        (("--cameras", "0", "--eval-cameras", "0"), "camera 0 is in --cameras too"),
         (("--cameras", "0", "--mask-camera", "2"), "camera 2 is not tracked; the tracked ones are [0]."),
         (("--eval-cameras", "0", "1", "2"), "--cameras: none is left"),
         (("--frames", "60:90"), "--frames: 60:90 holds no frame of table, which has 0 to 3."),
@@ -222,7 +222,7 @@ def test_pixels_that_are_not_finite(sound, pristine, still, monkeypatch):
 
 def test_one_frame_only(sound, pristine, tmp_path, still):
     said, found = sound(pristine, "--frames", "2:3", "--eval-cameras", "2")
-    assert "1 of 1 frames, no updates" in said
+    assert "(1 of 1 requested)" in said
     assert found["frames"]["first_id"] == found["frames"]["last_id"] == 2
     assert found["update_hz"] is None
     with np.load(tmp_path / "run" / "trajectory.npz") as saved:

@@ -77,7 +77,7 @@ def test_ctrl_c_in_a_fresh_run_does_not_bring_back_what_it_forgot(toy, gsjax):
     Path("stop").touch()
     code, _, err = gsjax("run", "toy", "--fresh")
     assert code == 130
-    assert "after 2 of 4 cells; the same command without --fresh goes on" in err
+    assert "after 2 of 4 cells; the same command without --fresh continues" in err
     Path("stop").unlink()
     calls()
     gsjax("run", "toy")
