@@ -7,7 +7,7 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
-from gsjax.engine.summary import ARROWS, Card, Media, Summary, Table, format_number
+from gsjax.engine.summary import ARROWS, Card, Media, Summary, Table
 from gsjax.io.atomic import atomic_write
 
 _MIME = {
@@ -89,7 +89,7 @@ def _table(table: Table) -> str:
         return "".join(f"<{tag}{kind}>{text}</{tag}>" for kind, text in zip(classes, texts, strict=True))
 
     def texts(row: Mapping[str, Any]) -> list[str]:
-        return [_text(format_number(row.get(column.key), column.decimals)) for column in columns]
+        return [_text(column.text(row)) for column in columns]
 
     body = ""
     for i, row in enumerate(table.rows):

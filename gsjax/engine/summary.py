@@ -31,6 +31,10 @@ class Column(NamedTuple):
     wide: bool = False
     better: Better | None = None
 
+    def text(self, row: Mapping[str, Any]) -> str:
+        """The cell of a row, as it is shown."""
+        return format_number(row.get(self.key), self.decimals)
+
 
 class Score(NamedTuple):
     """A headline figure of a method: a card of its report, and a column of `gsjax compare`.

@@ -7,7 +7,7 @@ from rich.console import Console
 from rich.table import Table as Grid
 from rich.text import Text
 
-from gsjax.engine.summary import ARROWS, Card, Column, Summary, Table, format_number
+from gsjax.engine.summary import ARROWS, Card, Column, Summary, Table
 
 _WIDE = 130  # columns of a terminal that has room for every column of a table
 _LOG_WIDTH = 200
@@ -85,13 +85,11 @@ def _grid(table: Table, width: int) -> Grid:
         )
     for i, row in enumerate(table.rows):
         styles = ("bold green" if (i, column.key) in table.best else "" for column in columns)
-        texts = (format_number(row.get(column.key), column.decimals) for column in columns)
-        grid.add_row(*map(Text, texts, styles))
+        grid.add_row(*map(Text, (column.text(row) for column in columns), styles))
     if table.means:
         grid.add_section()
     for row in table.means:
-        texts = (format_number(row.get(column.key), column.decimals) for column in columns)
-        grid.add_row(*map(Text, texts), style="bold")
+        grid.add_row(*(Text(column.text(row)) for column in columns), style="bold")
     grid.add_row()
     return grid
 
