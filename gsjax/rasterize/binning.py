@@ -45,14 +45,14 @@ def bin_gaussians(projected: Projected, tile_mask: Bool[Array, "tiles"] | None, 
     Equal depths keep the order of the input. Tiles outside `tile_mask`, if given, get empty lists.
     """
     projected = jax.lax.stop_gradient(projected)
-    by_depth = _depth_order(projected, plan)
+    by_depth = depth_order(projected, plan)
     first_row, num_rows = _rows(projected, tile_mask, plan)
     first_row, num_rows = first_row[by_depth], num_rows[by_depth]
-    rows = _total(num_rows)
+    rows = total(num_rows)
     enough_rows = rows <= plan.capacity // 2
     num_rows = jnp.where(enough_rows, num_rows, 0)
     spans = _spans(projected, tile_mask, by_depth, first_row, num_rows, plan)
-    pairs = _total(spans.count)
+    pairs = total(spans.count)
     overflow = ~enough_rows | (pairs > plan.capacity)
     needed = jnp.where(enough_rows, jnp.maximum(pairs, 2 * rows), _bounding_pairs(projected, plan))
     count = jnp.where(overflow, 0, spans.count)  # a call that overflowed draws nothing and reports it
@@ -82,14 +82,14 @@ def needed_capacity(
         plan: its capacity determines how many rows fit.
     """
     first_row, num_rows = _rows(projected, tile_mask, plan)
-    rows = _total(num_rows)
+    rows = total(num_rows)
     num_rows = jnp.where(rows <= plan.capacity // 2, num_rows, 0)
     unordered = jnp.arange(num_rows.shape[0], dtype=jnp.int32)
     spans = _spans(projected, tile_mask, unordered, first_row, num_rows, plan)
-    return jnp.maximum(_total(spans.count), _doubled(rows))
+    return jnp.maximum(total(spans.count), _doubled(rows))
 
 
-def _total(counts: Int[Array, "*n"]) -> Int[Array, ""]:
+def total(counts: Int[Array, "*n"]) -> Int[Array, ""]:
     """Sum that saturates at the largest int32: real scenes have reached 2.2e9 pairs."""
     estimate = counts.astype(jnp.float32).sum()
     return jnp.where(estimate > _TOO_MANY, jnp.iinfo(jnp.int32).max, counts.sum(dtype=jnp.int32))
@@ -99,7 +99,7 @@ def _doubled(rows: Int[Array, ""]) -> Int[Array, ""]:
     return jnp.where(rows > _TOO_MANY // 2, jnp.iinfo(jnp.int32).max, 2 * rows)
 
 
-def _depth_order(projected: Projected, plan: Plan) -> Int[Array, "n"]:
+def depth_order(projected: Projected, plan: Plan) -> Int[Array, "n"]:
     """Visible Gaussians by depth, then the others."""
     depths = jnp.where(projected.visible, projected.depths, jnp.inf)
     if depths.dtype != jnp.float32:
@@ -139,7 +139,7 @@ def _bounding_pairs(projected: Projected, plan: Plan) -> Int[Array, ""]:
     """An upper bound on the needed capacity, from bounding boxes alone."""
     (left, right), (top, bottom) = _box(projected, 0, plan), _box(projected, 1, plan)
     columns, rows = right - left, bottom - top
-    return jnp.maximum(_total(columns * rows), _doubled(_total(rows)))
+    return jnp.maximum(total(columns * rows), _doubled(total(rows)))
 
 
 def _spans(projected: Projected, tile_mask, by_depth, first_row, num_rows, plan: Plan) -> _Spans:

@@ -20,6 +20,7 @@ import numpy as np
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Float, Int
 
+from gsjax.rasterize import fused
 from gsjax.rasterize.compositing import (
     CHUNK,
     SATURATION,
@@ -55,15 +56,22 @@ def composite(
     return _composite(splats, lists, reads, plan)
 
 
+def _forward(splats: Splats, lists: Lists, reads, plan: Plan):
+    def in_kernels(splats, lists, _, lanes):
+        return fused.composite_forward(splats, lists, plan, lanes)
+
+    return fused.by_platform(partial(composite_forward, plan=plan), in_kernels, splats, lists, reads)
+
+
 @partial(jax.custom_vjp, nondiff_argnums=(3,))
 def _composite(splats: Splats, lists: Lists, reads, plan: Plan):
-    return composite_forward(splats, lists, reads, plan)
+    return _forward(splats, lists, reads, plan)
 
 
 def _composite_fwd(splats, lists, reads, plan):
     shapes_move = any(leaf.perturbed for leaf in (splats.means2d, splats.conics, splats.opacities))
     splats, lists, reads = jax.tree.map(lambda leaf: leaf.value, (splats, lists, reads))
-    values, transmittance, reads = composite_forward(splats, lists, reads, plan)
+    values, transmittance, reads = _forward(splats, lists, reads, plan)
     image = (values, transmittance) if shapes_move else None
     return (values, transmittance, reads), (splats, lists, reads, image)
 
@@ -74,9 +82,12 @@ def _composite_bwd(plan: Plan, residuals, cotangents):
         jnp.zeros(d.shape, d.dtype) if isinstance(d, SymbolicZero) else d for d in cotangents[:2]
     )
     if image is None:
-        d_values = _values_gradients(splats, lists, reads, d_values, plan)
+        either = (partial(f, plan=plan) for f in (_values_gradients, fused.values_gradients))
+        d_values = fused.by_platform(*either, splats, lists, reads, d_values)
         return Splats(None, None, None, d_values), None, None  # type: ignore[arg-type]
-    return _gradients(splats, lists, reads, image, (d_values, d_transmittance), plan), None, None
+    either = (partial(f, plan=plan) for f in (_gradients, fused.gradients))
+    cotangents = (d_values, d_transmittance)
+    return fused.by_platform(*either, splats, lists, reads, image, cotangents), None, None
 
 
 def _gradients(splats: Splats, lists: Lists, reads, image, cotangents, plan: Plan) -> Splats:

@@ -14,11 +14,12 @@ from jaxtyping import Array, Bool, Float, Int
 
 from gsjax.geometry.cameras import camera_centers
 from gsjax.geometry.spherical_harmonics import evaluate_sh, num_sh_bases
+from gsjax.rasterize import fused
 from gsjax.rasterize.binning import bin_gaussians, needed_capacity
 from gsjax.rasterize.checks import check_inputs, is_concrete
 from gsjax.rasterize.compositing import Lists, Splats, untile
 from gsjax.rasterize.gradients import composite
-from gsjax.rasterize.lanes import LANES
+from gsjax.rasterize.lanes import LANES, slots
 from gsjax.rasterize.plan import OPTION_NAMES, UNSET, Plan, resolve
 from gsjax.rasterize.projection import Projected, project_gaussians
 
@@ -312,20 +313,35 @@ def _draw(projected: Projected, values: Float[Array, "views n channels"], mask, 
         unread = jnp.zeros((num_views, plan.num_tiles), jnp.int32)
         return tiles, jnp.ones(tiles.shape[::2], tiles.dtype), _Counts(unread, zeros, zeros > 0, zeros)
 
-    bin_view = partial(bin_gaussians, plan=plan)
-    binned = jax.vmap(bin_view, in_axes=(0, None if mask is None else 0))(projected, mask)
-    view = jnp.arange(num_views, dtype=jnp.int32)[:, None]
-    lists = Lists(
-        ids=(binned.ids + view * n).ravel(),
-        starts=(binned.starts + view * binned.ids.shape[1]).ravel(),
-        counts=binned.counts.ravel(),
-    )
+    lists, pairs, needed, overflow = _bin_views(projected, mask, plan)
     rows = (projected.means2d, projected.conics, projected.opacities, values)
     splats = Splats(*(a.reshape(num_views * n, *a.shape[2:]) for a in rows))
     reads = None if reads is None else reads.ravel()
     tiles, transmittance, reads = composite(splats, lists, reads, plan)
     reads = reads.reshape(num_views, plan.num_tiles)
-    return tiles, transmittance, _Counts(reads, binned.pairs, binned.overflow, binned.needed)
+    return tiles, transmittance, _Counts(reads, pairs, overflow, needed)
+
+
+def _bin_views(projected: Projected, mask, plan: Plan):
+    """The lists of all views, one after the other, and the pairs, needed capacity and overflow of each."""
+    views, n = projected.depths.shape
+
+    def in_xla(projected, mask):
+        bin_view = partial(bin_gaussians, plan=plan)
+        binned = jax.vmap(bin_view, in_axes=(0, None if mask is None else 0))(projected, mask)
+        view = jnp.arange(views, dtype=jnp.int32)[:, None]
+        lists = Lists(
+            ids=(binned.ids + view * n).ravel(),
+            starts=(binned.starts + view * binned.ids.shape[1]).ravel(),
+            counts=binned.counts.ravel(),
+        )
+        return lists, binned.pairs, binned.needed, binned.overflow
+
+    def in_kernels(projected, mask, lanes):
+        del lanes  # these kernels have one thread per Gaussian
+        return fused.tile_lists(projected, mask, plan, views * slots(plan.capacity).size)
+
+    return fused.by_platform(in_xla, in_kernels, jax.lax.stop_gradient(projected), mask)
 
 
 def _finish(image, alphas, views: _Views, projected: Projected, counts: _Counts, plan: Plan, batch):
