@@ -31,7 +31,12 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 from jaxtyping import install_import_hook
 
 # Before the first import of gsjax. The numeric tower lets an int stand for a float, as type checkers do.
-install_import_hook("gsjax", "beartype.beartype(conf=beartype.BeartypeConf(is_pep484_tower=True))")
+# Kernels are left out: Warp compiles their source.
+KERNELS = "gsjax.rasterize.kernels"
+PATHS = (path.relative_to(ROOT).with_suffix("") for path in (ROOT / "gsjax").rglob("*.py"))
+MODULES = [".".join(path.parts).removesuffix(".__init__") for path in PATHS]
+CHECKED = [name for name in MODULES if not (name + ".").startswith(KERNELS) and not KERNELS.startswith(name)]
+install_import_hook(CHECKED, "beartype.beartype(conf=beartype.BeartypeConf(is_pep484_tower=True))")
 
 import hypothesis
 import jax

@@ -192,15 +192,19 @@ def project_gaussians(
     if offset:
         means2d = [c + d for c, d in zip(means2d, kept(offset, (0.0, 0.0)), strict=True)]
 
+    # Without the barrier XLA:GPU computes the whole projection once more for every column that is stacked.
+    columns = (means2d, conics, local[2], opacities, kept((half_x, half_y), (0.0, 0.0)))
+    means2d, conics, depths, opacities, extents = jax.lax.optimization_barrier(columns)
+
     def stacked(columns):
         return jnp.stack([flat(c, n) for c in columns], axis=-1)
 
     return Projected(
         means2d=stacked(means2d),
         conics=stacked(conics),
-        depths=flat(local[2], n),
+        depths=flat(depths, n),
         opacities=flat(opacities, n),
-        extents=stacked(kept((half_x, half_y), (0.0, 0.0))),
+        extents=stacked(extents),
         visible=flat(visible, n),
         culled=culled,
     )
