@@ -8,12 +8,16 @@ cannot be imported is left out, and named.
 """
 
 import argparse
+import os
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
+
+os.environ.setdefault("SCIPY_ARRAY_API", "1")  # splax wants it set before the first import of scipy
+os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")  # PyTorch needs a share of the memory
 
 import jax
 import jax.numpy as jnp

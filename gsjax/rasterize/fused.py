@@ -11,7 +11,7 @@ from importlib.util import find_spec
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float, Int, UInt
 
 from gsjax.rasterize.binning import depth_order, total
 from gsjax.rasterize.compositing import Lists, Splats, chunk_length
@@ -104,9 +104,11 @@ def _summed(splats: Splats, lists: Lists, reads, d_values, behind, plan: Plan, l
     """Sums over the pixels of each Gaussian: dL/dpower times dx, dy, dx^2, dx dy, dy^2 and 1 [n, 6], where
     (dx, dy) leads from its centre to the pixel, and the gradients of its values [n, channels].
 
-    Without `behind`, the light of each pass that reaches a pixel times its gradient, only the latter.
+    `behind` is what each pass composites, and in the first one the transmittance, times its gradient
+    [passes, tiles, pixels]. Without it the first result is empty.
     """
     from gsjax.rasterize.kernels import compositing as kernels
+    from gsjax.rasterize.kernels.sums import row_sums
 
     n, channels = splats.values.shape
     shapes, passes = _shapes(splats, plan), _passes(splats.values)
@@ -120,7 +122,7 @@ def _summed(splats: Splats, lists: Lists, reads, d_values, behind, plan: Plan, l
         values, d_values, behind = at
         records = _records(shapes, values)
         rows = kernels.backward(form, shapes_move, records, *lists[:2], reads, d_values, behind, plan)
-        sums = kernels.row_sums(rows, order, first, lanes)
+        sums = row_sums(rows, order, first, lanes)
         return moments + sums[:, : moments.shape[1]], sums[:, moments.shape[1] :]
 
     start = jnp.zeros((n, _SHAPE if shapes_move else 0), jnp.float32)
@@ -167,15 +169,20 @@ def _records(shapes: Float[Array, "n 6"], values: Float[Array, "n values"]) -> F
 
 def _by_gaussian(lists: Lists, reads: Int[Array, "tiles"], n: int, lanes: int):
     """The entries that were read in order of their Gaussian, and where each Gaussian's begin [n + 1]."""
-    from gsjax.rasterize.kernels import compositing as kernels
+    from gsjax.rasterize.kernels.sums import read_ids
 
-    keys = kernels.read_ids(lists.ids, lists.starts, reads, n, lanes)
+    keys = read_ids(lists.ids, lists.starts, reads, n, lanes)
     keys, order = jax.lax.sort_key_val(keys, jnp.arange(len(lists.ids), dtype=jnp.int32))
     return order, edges(keys, n)
 
 
-def edges(keys: Array, n: int) -> Int[Array, "n_plus_1"]:
-    """Where 0, 1, ... n begin in sorted keys. One program: a loop would be launched step by step."""
+def edges(keys: UInt[Array, "entries"], n: int) -> Int[Array, "n_plus_1"]:
+    """Where 0, 1, ... n begin in sorted keys. One program: a GPU would launch a loop step by step.
+
+    Args:
+        keys: sorted keys.
+        n: the largest key whose begin is wanted.
+    """
     return jnp.searchsorted(keys, jnp.arange(n + 1, dtype=keys.dtype), method="scan_unrolled").astype(
         jnp.int32
     )

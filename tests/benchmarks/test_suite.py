@@ -344,3 +344,24 @@ def test_outside_a_checkout_it_says_so(monkeypatch, tmp_path, capfd):
     monkeypatch.chdir(tmp_path)
     assert main(["bench"]) == 2
     assert "run it in a checkout of gsjax" in capfd.readouterr().err
+
+
+def test_peers_are_compared_with_gsplat():
+    from benchmarks.peers import Row, table
+
+    rows = [
+        Row("garden-0", by, "forward", 2.0, 2.5, ms, 1.0) for by, ms in (("kernels", 0.5), ("gsplat", 1.0))
+    ]
+    lines = table(rows).splitlines()
+    assert lines[2].endswith("| kernels | 2.000 | 2.500 | 0.500 | 0.50 |")
+    assert lines[3].endswith("| gsplat | 2.000 | 2.500 | 1.000 | 1.00 |")
+
+
+def test_a_peer_that_is_not_there_is_named_and_left_out():
+    from benchmarks.peers import measure
+    from benchmarks.workloads import ball_workload
+
+    rows = []
+    notes = measure(ball_workload(100, (32, 24)), ["kernels", "gsplat"], rows.append)
+    assert rows == []
+    assert [note.split(":")[0] for note in notes] == ["ball-1e2-32x24, kernels", "ball-1e2-32x24, gsplat"]
