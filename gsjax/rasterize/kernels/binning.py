@@ -4,6 +4,9 @@ In XLA this takes gathers, scatters and running sums over all rows of tiles and 
 `gsjax.rasterize.binning` for the geometry, which is the same here.
 """
 
+# Warp's types are values.
+# pyright: reportInvalidTypeForm=false, reportGeneralTypeIssues=false
+
 from functools import cache
 from typing import NamedTuple
 
@@ -54,10 +57,10 @@ def _kernels(form: _Form, key_type: str):
     @wp.func
     def ellipse(
         g: int,
-        means2d: wp.array2d(dtype=wp.float32),
-        extents: wp.array2d(dtype=wp.float32),
-        conics: wp.array2d(dtype=wp.float32),
-        opacities: wp.array(dtype=wp.float32),
+        means2d: wp.array2d[wp.float32],
+        extents: wp.array2d[wp.float32],
+        conics: wp.array2d[wp.float32],
+        opacities: wp.array[wp.float32],
     ) -> _Ellipse:
         e = _Ellipse()
         e.u = means2d[g, 0]
@@ -96,15 +99,15 @@ def _kernels(form: _Form, key_type: str):
 
     @wp.kernel(module="unique", enable_backward=False, module_options=_OPTIONS)
     def count(
-        means2d: wp.array2d(dtype=wp.float32),
-        extents: wp.array2d(dtype=wp.float32),
-        conics: wp.array2d(dtype=wp.float32),
-        opacities: wp.array(dtype=wp.float32),
-        visible: wp.array(dtype=wp.bool),
-        by_depth: wp.array(dtype=wp.int32),
-        mask: wp.array(dtype=wp.bool),
+        means2d: wp.array2d[wp.float32],
+        extents: wp.array2d[wp.float32],
+        conics: wp.array2d[wp.float32],
+        opacities: wp.array[wp.float32],
+        visible: wp.array[wp.bool],
+        by_depth: wp.array[wp.int32],
+        mask: wp.array[wp.bool],
         n: int,
-        counts: wp.array(dtype=wp.int32),
+        counts: wp.array[wp.int32],
     ):
         thread = wp.tid()
         view = thread // n
@@ -124,17 +127,17 @@ def _kernels(form: _Form, key_type: str):
 
     @wp.kernel(module="unique", enable_backward=False, module_options=_OPTIONS)
     def list_tiles(
-        means2d: wp.array2d(dtype=wp.float32),
-        extents: wp.array2d(dtype=wp.float32),
-        conics: wp.array2d(dtype=wp.float32),
-        opacities: wp.array(dtype=wp.float32),
-        visible: wp.array(dtype=wp.bool),
-        by_depth: wp.array(dtype=wp.int32),
-        mask: wp.array(dtype=wp.bool),
-        starts: wp.array(dtype=wp.int32),
+        means2d: wp.array2d[wp.float32],
+        extents: wp.array2d[wp.float32],
+        conics: wp.array2d[wp.float32],
+        opacities: wp.array[wp.float32],
+        visible: wp.array[wp.bool],
+        by_depth: wp.array[wp.int32],
+        mask: wp.array[wp.bool],
+        starts: wp.array[wp.int32],
         n: int,
-        keys: wp.array(dtype=Key),
-        ids: wp.array(dtype=wp.int32),
+        keys: wp.array[Key],
+        ids: wp.array[wp.int32],
     ):
         thread = wp.tid()
         view = thread // n

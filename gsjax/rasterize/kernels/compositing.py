@@ -97,15 +97,15 @@ def _forward(form: Form):
 
     @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
     def forward(
-        records: wp.array(dtype=wp.float32),
-        ids: wp.array(dtype=wp.int32),
-        starts: wp.array(dtype=wp.int32),
-        counts: wp.array(dtype=wp.int32),
+        records: wp.array[wp.float32],
+        ids: wp.array[wp.int32],
+        starts: wp.array[wp.int32],
+        counts: wp.array[wp.int32],
         tiles_x: int,
         num_tiles: int,
-        values: wp.array3d(dtype=wp.float32),
-        transmittance: wp.array2d(dtype=wp.float32),
-        reads: wp.array(dtype=wp.int32),
+        values: wp.array3d[wp.float32],
+        transmittance: wp.array2d[wp.float32],
+        reads: wp.array[wp.int32],
     ):
         thread = wp.tid()
         tile, lane = thread // lanes, thread % lanes
@@ -187,15 +187,15 @@ def _backward(form: Form, shapes_move: bool):
 
     @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
     def backward(
-        records: wp.array(dtype=wp.float32),
-        ids: wp.array(dtype=wp.int32),
-        starts: wp.array(dtype=wp.int32),
-        reads: wp.array(dtype=wp.int32),
-        d_values: wp.array3d(dtype=wp.float32),
-        total: wp.array2d(dtype=wp.float32),
+        records: wp.array[wp.float32],
+        ids: wp.array[wp.int32],
+        starts: wp.array[wp.int32],
+        reads: wp.array[wp.int32],
+        d_values: wp.array3d[wp.float32],
+        total: wp.array2d[wp.float32],
         tiles_x: int,
         num_tiles: int,
-        rows: wp.array2d(dtype=wp.float32),
+        rows: wp.array2d[wp.float32],
     ):
         thread = wp.tid()
         tile, lane = thread // lanes, thread % lanes

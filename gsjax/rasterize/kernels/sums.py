@@ -14,10 +14,10 @@ def _read_ids(lanes: int):
 
     @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
     def read_ids(
-        ids: wp.array(dtype=wp.int32),
-        starts: wp.array(dtype=wp.int32),
-        reads: wp.array(dtype=wp.int32),
-        copies: wp.array(dtype=wp.uint32),
+        ids: wp.array[wp.int32],
+        starts: wp.array[wp.int32],
+        reads: wp.array[wp.int32],
+        copies: wp.array[wp.uint32],
     ):
         thread = wp.tid()
         tile = thread // lanes
@@ -37,11 +37,11 @@ def _row_sums(length: int, lanes: int):
 
     @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
     def row_sums(
-        rows: wp.array2d(dtype=wp.float32),
-        order: wp.array(dtype=wp.int32),
-        first: wp.array(dtype=wp.int32),
+        rows: wp.array2d[wp.float32],
+        order: wp.array[wp.int32],
+        first: wp.array[wp.int32],
         n: int,
-        sums: wp.array2d(dtype=wp.float32),
+        sums: wp.array2d[wp.float32],
     ):
         thread = wp.tid()
         g, lane = thread // lanes, thread % lanes

@@ -3,6 +3,9 @@
 On a CPU, where one thread does the work of a warp, the same functions do it alone.
 """
 
+# Warp's types are values.
+# pyright: reportInvalidTypeForm=false
+
 from functools import cache
 
 import warp as wp
@@ -61,8 +64,8 @@ def reader(fours: int):
     @wp.func_native(snippet)
     def read(
         stage: bool,
-        records: wp.array(dtype=wp.float32),
-        ids: wp.array(dtype=wp.int32),
+        records: wp.array[wp.float32],
+        ids: wp.array[wp.int32],
         first: int,
         end: int,
         lane: int,
@@ -112,6 +115,6 @@ def writer(length: int, lanes: int):
 """
 
     @wp.func_native(snippet)
-    def write(sums: Sums, lane: int, rows: wp.array2d(dtype=wp.float32), row: int): ...
+    def write(sums: Sums, lane: int, rows: wp.array2d[wp.float32], row: int): ...
 
     return write, Sums
