@@ -14,5 +14,5 @@ __all__ = ["HELP", "Options", "options_for", "run"]
 
 
 def options_for(arguments: list[str]) -> tuple[type[Options], list[str]]:
-    """The options whose defaults are those of the recipe that is named."""
+    """The options, with the defaults of the preset named in the arguments."""
     return preset_options(Options, arguments, "deform", PRESETS)

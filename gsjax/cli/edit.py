@@ -35,10 +35,10 @@ class Options(Common, Overwriting):
     op: Annotated[tuple[str, ...], tyro.conf.UseAppendAction, tyro.conf.arg(metavar="OP:KEY=VALUE,...")] = ()
     """An edit, after those of the script: "speed:parts=drawer,factor=2"."""
     out: Path | None = None
-    """Folder for the film; default: RUN/edit/NAME, with the name of the script, or without one ops, ops_2 and
-    so on."""
+    """Folder for the film; default: RUN/edit/NAME, where NAME is the script's name or, without a script, ops,
+    ops_2 and so on."""
     camera: Annotated[int | None, tyro.conf.arg(metavar="ID")] = None
-    """Id of the camera to film from; default: the one in which the edits change most."""
+    """Id of the camera to film from; default: the one whose pictures the edits change most."""
     ply: bool = False
     """Write the Gaussians of each frame too, as ply/000000.ply and so on."""
 

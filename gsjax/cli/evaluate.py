@@ -148,11 +148,11 @@ def scores(seen: Compared, weights: LpipsWeights | None, exposed: bool = False) 
 
 
 def _check(record: Record) -> None:
-    """Raises a ValueError where the run is no fit, or has no scene."""
+    """Raises ValueError if the run is not a fit, or has no scene."""
     if record.kind != "fit":
         raise ValueError(
             f"{record.path}: expected a run of `gsjax fit`, found one of `gsjax {record.kind}`, whose frames "
-            "were scored when it ended; they stand in its metrics.json"
+            "were scored when it ended; see its metrics.json"
         )
     if not (record.path / "scene.ply").is_file():
         raise ValueError(
@@ -171,15 +171,17 @@ def _choose(options: Options, record: Record) -> Chosen:
     try:
         photographs = photographs_of_run(config, dataset)
     except DataError as error:
-        raise ValueError(f"{error} It was read for the fit; --images says where it is now") from error
+        raise ValueError(
+            f"{error} The fit read it from there; if it was moved, give its new place with --images"
+        ) from error
     train, held_out = split(photographs, config["test_every"])
     names = [photographs.names[i] for i in held_out]
     known = (record.metrics or {}).get("views")
     if known and len(held_out) and names != [row["view"] for row in known]:
         raise ValueError(
             f"{dataset}: expected the photographs of the fit, which held out "
-            f"{_listed(row['view'] for row in known)}, found others ({_listed(names)} would be held out); "
-            "--images says where they are"
+            f"{_listed(row['view'] for row in known)}, found others, which would hold out {_listed(names)}; "
+            "give the folder of the fit's photographs with --images"
         )
     if options.views == "held-out" and not len(held_out):
         raise ValueError(
@@ -232,8 +234,8 @@ def _say_what_is_missing(
     learned = [words for name, words in _PER_PHOTOGRAPH.items() if record.config["fit"].get(name)]
     if learned and any(row["split"] == _TRAIN for row in rows):
         notes.add(
-            f"The fit learned {' and '.join(learned)} for each photograph, which scene.ply does not hold: "
-            "training views are scored without."
+            f"The fit learned {' and '.join(learned)} for each photograph, which scene.ply does not "
+            "contain: training views are scored without them."
         )
 
 

@@ -1,4 +1,4 @@
-"""`gsjax grasp`: the best antipodal grasp of the object that a text means, in every frame of a run."""
+"""`gsjax grasp`: the best antipodal grasp of the object named by a text, in every frame of a run."""
 
 from gsjax.engine.track.grasp import Options, run
 

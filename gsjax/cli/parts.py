@@ -1,4 +1,4 @@
-"""`gsjax parts`: find the parts of a moving scene in a recording by synchronised cameras."""
+"""`gsjax parts`: find the parts of a moving scene recorded by synchronised cameras."""
 
 from gsjax.engine.parts.run import Options, run
 

@@ -39,16 +39,17 @@ class GaussianOptions:
     point: Annotated[str | None, tyro.conf.arg(metavar="X,Y")] = None
     """A pixel of --camera, or of --frame, that shows the thing to find."""
     threshold: float | None = None
-    """Score above which a Gaussian is selected: a cosine (-1 to 1), or against negatives or names a share
-    (0 to 1). Default: 1/2 against these; for a text of the closed vocabulary its own; else the threshold
-    that divides the scores best into two classes (Otsu)."""
+    """Score above which a Gaussian is selected: a cosine (-1 to 1), or, compared with negatives or names, a
+    share (0 to 1). Default: 1/2 for a share; for a text of the closed vocabulary, its own threshold; else
+    the one that best divides the scores into two classes (Otsu)."""
     color: Annotated[tuple[float, float, float] | None, tyro.conf.arg(metavar="R G B")] = None
-    """RGB, 0 to 1, of what was found in recolored.ply (default: pink)."""
+    """RGB, 0 to 1, that recolored.ply gives to what was found (default: pink)."""
     negatives: Annotated[tuple[str, ...] | None, tyro.conf.arg(metavar="TEXT [TEXT ...]")] = None
     """Negatives to compare with. Default for a text: all other classes; with CLIP "object", "things",
     "stuff", "texture"."""
     move: Annotated[tuple[float, float, float] | None, tyro.conf.arg(metavar="X Y Z")] = None
-    """Shift along each axis, in the scene's unit, of what was found, for moved.ply (default: not written)."""
+    """Move what was found by this much along each axis, in the scene's unit, and write moved.ply (default:
+    not written)."""
 
 
 @dataclass(frozen=True)
@@ -94,22 +95,23 @@ class Options(Common):
     """Camera (or photograph) to show it from, and of a --point. Default: for a tracked run the first held-out
     one, else the first; for a field all."""
     weights: Path | None = None
-    """Folder of CLIP's weights, in the layout of Hugging Face; for features of CLIP, where they are now."""
+    """Folder of CLIP's weights, in Hugging Face's layout. For CLIP features: where the weights are now, if
+    they were moved."""
     gaussians: Annotated[GaussianOptions, tyro.conf.OmitArgPrefixes] = GaussianOptions()
     """For a field, or a run of `gsjax deform`."""
     field: Annotated[FieldOptions, tyro.conf.OmitArgPrefixes] = FieldOptions()
-    """For a field alone."""
+    """Only for a field."""
     deform: Annotated[DeformOptions, tyro.conf.OmitArgPrefixes] = DeformOptions()
-    """For a run of `gsjax deform` alone."""
+    """Only for a run of `gsjax deform`."""
     track: Annotated[TrackOptions, tyro.conf.OmitArgPrefixes] = TrackOptions()
-    """For a run of `gsjax track` alone, when its objects are queried and not its field."""
+    """Only for a run of `gsjax track` whose objects, not its field, are queried."""
 
 
 def run(options: Options) -> int:
     """Answer, and write query/ into the run folder; returns the exit code.
 
     Raises:
-        ValueError, OSError: there is no such run or encoder, or the text means none of the objects.
+        ValueError, OSError: there is no such run or encoder, or no object matches the text.
     """
     expect_folder(options.run)
     console, field = Console(stderr=True, highlight=False), field_of(options.run)
@@ -153,12 +155,12 @@ def _expect_track(path: Path) -> None:
         if kind_of(folder) == "distill":
             raise ValueError(
                 f"{folder}: expected field.npz, found none yet: it is still being distilled, or was killed; "
-                "then gsjax distill goes on with --resume"
+                "if killed, continue it with gsjax distill --resume"
             )
     if kind_of(path) == "deform":
         raise ValueError(
             f"{path}: expected {DEFORMATION}, found none yet: it is still being reconstructed, or "
-            "was killed; then gsjax deform goes on with --resume"
+            "was killed; if killed, continue it with gsjax deform --resume"
         )
     if is_run(path) and kind_of(path) != "track":
         raise ValueError(f"{path}: expected a field, found none; gsjax distill {path} makes one")
@@ -172,11 +174,11 @@ def _query_field(options: Options, path: Path, console: Console) -> None:
     if ways != 1:
         raise ValueError(
             f"expected one of TEXT, --image and --point, found {ways or 'none'}; "
-            f"gsjax query {options.run} can"
+            f'for example gsjax query {options.run} "can"'
         )
     _expect_none_of("a field knows the encoder of its features; leave it out (--threshold)", options.track)
     if question.point is not None and question.camera is None:
-        raise ValueError("--point: expected --camera too, the photograph that it is in, found none")
+        raise ValueError("--point: expected --camera too, found none; name the photograph that it is in")
     with Notes(console) as notes:
         with stage(console, "reading the field"):
             now = Whereabouts(options.field.scene, options.field.images, options.weights)
@@ -200,7 +202,7 @@ def _query_deformation(options: Options, console: Console) -> None:
         raise ValueError("expected at most one of TEXT, --point and --box, found more")
     for option, value in (("negatives", question.negatives), ("weights", options.weights)):
         if question.text is None and value is not None:
-            raise ValueError(f"--{option}: expected a TEXT too, which it is for; found none")
+            raise ValueError(f"--{option}: expected a TEXT too, found none; leave out --{option} or give one")
     with Notes(console) as notes:
         with stage(console, "reading the scene"):
             result = read_deformation(options.run / DEFORMATION)
@@ -284,7 +286,7 @@ def _object_query(options: Options) -> ObjectQuery:
     )
     if options.text is None:
         raise ValueError(
-            f'expected a TEXT that says which object, found none; gsjax query {options.run} "can"'
+            f'expected a TEXT that names the object, found none; for example gsjax query {options.run} "can"'
         )
     camera = options.camera
     if camera is not None and not camera.lstrip("-").isdigit():

@@ -39,15 +39,15 @@ class Options(Common):
     port: int | None = None
     """Port to listen on; default: 8080, or the next free one."""
     max_gaussians: int = 500_000
-    """Most Gaussians that the browser receives, the most opaque ones; our render draws all."""
+    """Largest number of Gaussians that the browser receives (the most opaque); gsjax's own render has all."""
     up: Literal["auto", "x", "y", "z", "-x", "-y", "-z"] = "auto"
     """The up direction; auto: that of the photographs, else z."""
     scene: Path | None = None
-    """Present path of a field's scene, a PLY file."""
+    """Current path of a field's scene, a PLY file."""
     images: str | None = None
-    """Present path of the photographs of a field or a fit."""
+    """Current path of the photographs of a field or a fit."""
     weights: Path | None = None
-    """Present folder of CLIP's weights, for features of CLIP."""
+    """Current folder of CLIP's weights, for features of CLIP."""
 
 
 def run(options: Options) -> int:
@@ -87,7 +87,7 @@ def _announce(options: Options, scene: Viewable, viewer: Viewer, notes: Notes) -
     if num > options.max_gaussians:
         notes.warn(
             f"the browser gets the {options.max_gaussians} most opaque of {num} Gaussians "
-            "(--max-gaussians); our render has all"
+            "(--max-gaussians); gsjax's own render has all"
         )
     if options.port is None and viewer.port != PORT:
         notes.warn(f"port {PORT} is in use; this is {viewer.port} (--port names one)")

@@ -130,7 +130,7 @@ def is_endonerf(root: Path, images: str = "images") -> bool:
 
 
 def is_unambiguous_endonerf(root: Path, images: str = "images") -> bool:
-    """Whether both masks and depth lie beside the frames, which is never so in LLFF's own folders."""
+    """Whether both masks and depth lie beside the frames, which never happens in LLFF's own folders."""
     return is_endonerf(root, images) and find_masks(root) is not None and (root / "depth").is_dir()
 
 

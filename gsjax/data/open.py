@@ -51,7 +51,7 @@ class ReadOptions:
     """Options for what some layouts leave open."""
 
     K: tuple[float, float, float, float] | None = None
-    """fx fy cx cy for data without intrinsics (Open3D, videos), in pixels, centres at +0.5."""
+    """fx fy cx cy for data without intrinsics (Open3D, videos), in pixels, with pixel centres at +0.5."""
     axes: poses_bounds.Axes | None = None
     """Meaning of the rotation columns in poses_bounds.npy: llff (down, right, back; DyNeRF too) or endonerf
     (right, up, back). Default: endonerf if masks and depth lie beside the images; otherwise required."""
@@ -127,7 +127,7 @@ def open_photographs(path: str | Path, options: ReadOptions | None = None) -> Ph
 
     Raises:
         DataError: there is no such folder, or its layout is unknown.
-        ValueError: as `open_sequence`, or `axes` is required and missing.
+        ValueError: as for `open_sequence`, or `axes` is required and missing.
     """
     options = options or ReadOptions()
     return replace(_photographs(path, options), near=options.near)

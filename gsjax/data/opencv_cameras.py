@@ -75,7 +75,7 @@ def calibrated_camera(index: int, capture: Capture, viewmat: Float[np.ndarray, "
         viewmat: world to camera, OpenCV axes.
 
     Raises:
-        DataError: as `open_camera`.
+        DataError: as for `open_camera`.
     """
     what, expected = f"camera {index}", "an RGB-D camera of OpenCV's OpenNI 2 backend"
     if not capture.isOpened():

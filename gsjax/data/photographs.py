@@ -113,7 +113,7 @@ class Photographs:
         """Photograph `i` as a frame of one camera, on the host: RGB in bytes, poses in float64.
 
         Raises:
-            DataError: as `image`.
+            DataError: as for `image`.
         """
         width, height = (int(size) for size in self.sizes[i])
         camera = Camera(self.viewmats[i][None], self.Ks[i][None], width, height, self.near)
@@ -139,7 +139,7 @@ class Photographs:
         """Which pixels count; None if all do.
 
         Raises:
-            DataError: as `image`.
+            DataError: as for `image`.
         """
         return self._optional(self.load_mask, "mask", i, np.bool_)
 
@@ -147,7 +147,7 @@ class Photographs:
         """Depth along the optical axis, float32, 0 = invalid; None without depth.
 
         Raises:
-            DataError: as `image`.
+            DataError: as for `image`.
         """
         depth = self._optional(self.load_depth, "depth", i, np.floating)
         if depth is None:
@@ -158,7 +158,7 @@ class Photographs:
         """Label of each pixel, 0 for the background; None without labels.
 
         Raises:
-            DataError: as `image`.
+            DataError: as for `image`.
         """
         return self._optional(self.load_labels, "labels", i, np.integer)
 

@@ -69,7 +69,7 @@ def read_dynerf(path: str | Path, axes: Axes = "llff") -> Sequence:
     The sequence is as long as the shortest video.
 
     Raises:
-        DataError: as `read_llff`, or the videos differ in size.
+        DataError: as for `read_llff`, or the videos differ in size.
     """
     root = Path(path)
     file, viewmats, sizes, focals = _read_rows(root, axes)

@@ -183,7 +183,7 @@ class Sequence:
         """All cameras of frame `t` as device arrays; cameras without depth have depth 0 everywhere.
 
         Raises:
-            DataError: as `image` and `depth`.
+            DataError: as for `image` and `depth`.
         """
         cameras = range(self.num_cameras)
         dtype = jnp.result_type(float)

@@ -44,7 +44,7 @@ def exit_code(stopped: BaseException | None) -> int:
     """0, or 130 where Ctrl-C ended the run.
 
     Raises:
-        BaseException: what else ended it early.
+        BaseException: anything else that ended it early.
     """
     if stopped is None:
         return 0

@@ -86,7 +86,7 @@ def read_drawable(file: Path, notes: Notes) -> tuple[Gaussians, PlyReport]:
     """The drawable Gaussians of a PLY file, and what else it held; warns of those that cannot be drawn.
 
     Raises:
-        FileNotFoundError, PlyError: as `read_ply`.
+        FileNotFoundError, PlyError: as for `read_ply`.
         ValueError: it holds none.
     """
     gaussians, report = read_ply(file)

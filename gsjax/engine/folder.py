@@ -42,21 +42,21 @@ def is_run(folder: Path) -> bool:
 
 
 def expect_run(path: Path, made_by: str = "") -> None:
-    """Raises FileNotFoundError if this is no folder of a run, `made_by` a command."""
+    """Raises FileNotFoundError if this is not the folder of a run (of the command `made_by`)."""
     expect_folder(path, made_by)
     if not is_run(path):
         found = "other files" if any(path.iterdir()) else "an empty folder"
         raise FileNotFoundError(
-            f"{_wanted(path, made_by)}, whose config.yml begins with {SIGNATURE!r}, found {found}; name its "
-            "--out"
+            f"{_wanted(path, made_by)}, whose config.yml begins with {SIGNATURE!r}, found {found}; give a "
+            "run's --out"
         )
 
 
 def expect_folder(path: Path, made_by: str = "") -> None:
-    """Raises FileNotFoundError if this is no folder."""
+    """Raises FileNotFoundError if this is not a folder."""
     if not path.is_dir():
         found = "a file" if path.exists() else "nothing there"
-        raise FileNotFoundError(f"{_wanted(path, made_by)}, found {found}; name its --out")
+        raise FileNotFoundError(f"{_wanted(path, made_by)}, found {found}; give a run's --out")
 
 
 def _wanted(path: Path, made_by: str) -> str:
@@ -112,8 +112,8 @@ class RunFolder:
     """
 
     def __init__(self, path: str | Path, *, overwrite: bool = False, resume: bool | None = False):
-        """Claim the folder. It is made, and what an earlier run left there is removed, when this run writes
-        its settings.
+        """Claim the folder. Only when this run writes its settings is the folder made, and what an earlier
+        run left in it removed.
 
         Args:
             path: a folder that does not exist, is empty, or holds an earlier run.
@@ -123,8 +123,8 @@ class RunFolder:
 
         Raises:
             FileNotFoundError: `resume` is on and no run is there.
-            FileExistsError: a finished run is there and `overwrite` is off, or an unfinished one with results
-                and both are off; or something that is not a run is there. Nothing of it is touched.
+            FileExistsError: the folder holds a finished run and `overwrite` is off; an unfinished run with
+                results and both are off; or something that is not a run. It is left untouched.
             NotADirectoryError: `path` is a file.
             ValueError: both `resume` and `overwrite` are on.
         """
@@ -292,8 +292,7 @@ def expect_ours(path: Path, written: Sequence[str]) -> Path:
         return path
     found = "a file" if not path.is_dir() else (others or [f"no {written[0]}"])[0]
     raise FileExistsError(
-        f"{path}: expected nothing, or only what gsjax writes there and replaces; found {found}; move it "
-        "elsewhere"
+        f"{path}: expected nothing, or only what gsjax writes there itself; found {found}; move it elsewhere"
     )
 
 

@@ -25,8 +25,8 @@ class Common:
     """Options of every command."""
 
     cores: int | None = None
-    """Number of processor cores to use, the last ones; default: all. The tracker's updates are steadiest on
-    1. To run two programs at once, give each its own cores by taskset."""
+    """Number of processor cores to use (the highest-numbered ones); default: all. The tracker's updates take
+    the steadiest time on 1. To run two programs at once, give each its own cores with taskset."""
     debug: bool = False
     """Show Python's traceback when something fails."""
 
@@ -177,9 +177,9 @@ def checked(options: AnyOptions) -> AnyOptions:
     if not 0 < scale <= 1:
         raise ValueError(f"--scale: expected above 0 and at most 1, found {scale}")
     if test_every < 0 or test_every == 1:
-        raise ValueError(f"--test-every: expected 0 (none) or 2 and more, found {test_every}")
+        raise ValueError(f"--test-every: expected 0 (none), or 2 or more, found {test_every}")
     if getattr(options, "sam", None) is not None and getattr(options, "masks", None) == "files":
-        raise ValueError("--sam: expected --masks segment, for SAM is a segmenter; found --masks files")
+        raise ValueError("--sam: expected --masks segment, as SAM is a segmenter; found --masks files")
     if (seed := getattr(options, "seed", None)) is None:
         return options
     nested = {f.name: getattr(options, f.name) for f in dataclasses.fields(options)}

@@ -59,7 +59,7 @@ def choose_photographs(
         chosen = range(photographs.num)[parse_frames(frames)]
         if not chosen:
             raise ValueError(
-                f"--frames: {frames} holds no photograph of {photographs.name}, which has 0 to "
+                f"--frames: {frames} selects no photograph of {photographs.name}, which has 0 to "
                 f"{photographs.num - 1}."
             )
         return smaller(photographs.select(chosen), scale)
@@ -105,7 +105,7 @@ def split(photographs: Photographs, every: int) -> tuple[Int[np.ndarray, "a"], I
     """Indices of the photographs to fit and of those held out: by the data's split, else every n-th.
 
     Raises:
-        ValueError: none is left to fit.
+        ValueError: no photograph is left to fit.
     """
     indices = np.arange(photographs.num)
     splits = None if photographs.splits is None else np.array(photographs.splits)
@@ -116,7 +116,9 @@ def split(photographs: Photographs, every: int) -> tuple[Int[np.ndarray, "a"], I
         held_out = (indices % every == 0) & (photographs.num > 1) if every else np.zeros(len(indices), bool)
         chosen = indices[~held_out]
     if not len(chosen):
-        raise ValueError(f"{photographs.name}: of {photographs.num} photographs none is left to fit")
+        raise ValueError(
+            f"{photographs.name}: expected photographs to fit, found all {photographs.num} held out"
+        )
     return chosen, indices[held_out]
 
 

@@ -43,7 +43,7 @@ class Options(Common, Overwriting):
     out: Path
     """Folder for the dataset: images/ and COLMAP's sparse/0/."""
     stills: int = 100
-    """Number of pictures to take from a video: the sharpest of as many equal intervals."""
+    """Number of pictures to take from a video: the sharpest in each of as many equal intervals."""
     compare: str | None = None
     """A dataset with poses of the same photographs, by name, to compare the result with."""
     place: Annotated[MotionConfig, tyro.conf.arg(name="")] = field(default_factory=MotionConfig)

@@ -243,8 +243,8 @@ def load_run(folder: Path, run: Run, progress: Progress) -> tuple[Run, Progress]
         others = [what for what, digest in progress.about.items() if about.get(what) != digest]
         if others:
             raise ValueError(
-                f"--resume: {' and '.join(others)}: expected what the run in {folder.parent} was begun with, "
-                "found something else; put that back, or replace the run with --overwrite instead"
+                f"--resume: {' and '.join(others)}: expected the same as when the run in {folder.parent} was "
+                "started, found a change; undo it, or replace the run with --overwrite instead"
             )
         for later in damaged:  # otherwise they would count among the newest
             later.unlink()

@@ -43,10 +43,10 @@ class Question:
     Attributes:
         text: "red can".
         image: a picture of the thing; where it has an alpha channel, only what is opaque.
-        point: x, y in pixels of a photograph or frame, as they were learned from.
+        point: x, y in pixels of a photograph or frame, at the size used in training.
         box: x0, y0, x1, y1, likewise.
         camera: short name of the photograph of the point, and of the only mask to draw.
-        frame: the recording's number of the frame of point and box, whose Gaussians are written (default: the
+        frame: frame number, in the recording, of point and box; its Gaussians are written (default: the
             first).
         frames: frames to draw, as a Python slice (default: the held-out ones).
         threshold: score above which a Gaussian is selected (default: by a rule).
@@ -73,11 +73,11 @@ class Question:
     def __post_init__(self):
         if self.threshold is not None and not -math.inf < self.threshold < _HIGHEST:
             raise ValueError(
-                f"--threshold: expected a finite number below {_HIGHEST:g}, which no score is above, found "
-                f"{self.threshold:g}"
+                f"--threshold: expected a finite number below {_HIGHEST:g}, the highest possible score, "
+                f"found {self.threshold:g}"
             )
         if any(not 0 <= value <= 1 for value in self.color):
-            raise ValueError(f"--color: expected three numbers of 0 to 1, found {_spaced(self.color)}")
+            raise ValueError(f"--color: expected three numbers from 0 to 1, found {_spaced(self.color)}")
         if self.move is not None and not all(map(math.isfinite, self.move)):
             raise ValueError(f"--move: expected three finite numbers, found {_spaced(self.move)}")
 
@@ -153,7 +153,7 @@ class Queryable(ABC):
         """The index of the frame in question, once all that the question names is there.
 
         Raises:
-            ValueError: something is not there.
+            ValueError: something does not exist.
         """
 
     @abstractmethod
@@ -166,7 +166,7 @@ class Queryable(ABC):
 
         Raises:
             ValueError: the question cannot be answered.
-            FileNotFoundError: weights of the encoder are not there.
+            FileNotFoundError: weights of the encoder do not exist.
         """
 
     @abstractmethod
@@ -203,7 +203,7 @@ def select(run: Queryable, question: Question, frame: int, prompt: Prompt | None
         prompt: of the query (default: that of the question).
 
     Raises:
-        ValueError, FileNotFoundError: as `Queryable.prompt`.
+        ValueError, FileNotFoundError: as for `Queryable.prompt`.
     """
     prompt = run.prompt(question, frame) if prompt is None else prompt
     score = run.scorer(prompt, frame)
@@ -318,12 +318,12 @@ def write_mask(folder: Path, name: str, mask: Bool[np.ndarray, "h w"]) -> int:
 
 
 def _check_count(run: Queryable, found: Selection, notes: Notes) -> None:
-    """Raises a ValueError where nothing is selected, and warns where everything is."""
+    """Raises ValueError if nothing is selected, and warns if everything is."""
     selected, threshold, words = found.selected, found.threshold, found.question.words
     if not selected.any():
         where = "" if run.frame_ids is None else f" in frame {run.frame_ids[found.frame]}"
         raise ValueError(
-            f"{words} means nothing of this scene{where}: the best score is "
+            f"{words} matches nothing in this scene{where}: the best score is "
             f"{found.scores.max():.3f}, and more than {threshold.value:.5g} is required ({threshold.rule}); "
             "try a lower --threshold"
         )

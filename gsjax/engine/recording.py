@@ -99,11 +99,15 @@ def open_recording(
     if both:
         raise ValueError(f"--eval-cameras: camera {both[0]} is in --cameras too; it cannot be held out.")
     if not chosen:
-        raise ValueError(f"--cameras: none is left; {sequence.name} has {known}.")
+        raise ValueError(
+            f"--cameras: expected at least one that is not held out, found none; {sequence.name} has {known}."
+        )
     total = sequence.num_frames
     chosen_frames = parse_frames(frames)
     if not range(total)[chosen_frames]:
-        raise ValueError(f"--frames: {frames} holds no frame of {sequence.name}, which has 0 to {total - 1}.")
+        raise ValueError(
+            f"--frames: {frames} selects no frame of {sequence.name}, which has 0 to {total - 1}."
+        )
     if (chosen_frames.stop or 0) > total:
         message = f"--frames: {frames} goes beyond the last frame of {sequence.name}, {total - 1}"
         warnings.warn(message, DataWarning, stacklevel=2)
@@ -278,11 +282,11 @@ def label_names(recording: Recording, source: str) -> dict[int, str]:
 
 
 def warn_of_missing(recording: Recording, mask: FirstMask, scene_ids: tuple[int, ...], notes: Notes) -> None:
-    """Warn of objects that will not be tracked: those of the truth without a label in the mask, and labels
-    without Gaussians.
+    """Warn of objects that will not be tracked: true objects without a label in the mask, and labels without
+    Gaussians.
 
     Args:
-        recording: the recording, perhaps with a truth.
+        recording: the recording, with or without ground truth.
         mask: the first mask.
         scene_ids: labels that the scene has.
         notes: collects the warnings.

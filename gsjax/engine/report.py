@@ -30,7 +30,7 @@ def write_report(path: str | Path, summary: Summary) -> None:
         summary: what it shows.
 
     Raises:
-        ValueError: a medium's suffix is none that browsers show.
+        ValueError: a medium has a suffix that browsers do not show.
     """
     notes = list(summary.notes)
     sections = [

@@ -23,7 +23,7 @@ class Saver:
         self._work, self._every, self._at = work, every, perf_counter()
 
     def __call__(self, write: Callable[[], None], *, last: bool) -> None:
-        """Write if the last time is long enough ago, or this is the last; warn if it fails."""
+        """Write if the previous save is long enough ago or this is the last one; warn if writing fails."""
         every = EVERY_S if self._every is None else self._every
         if not last and perf_counter() - self._at < every:
             return

@@ -1,4 +1,4 @@
-"""Scores of views, added up one by one so that memory stays flat, and the metrics that come of them."""
+"""Scores of views, added up one by one so that memory stays flat, and the metrics computed from them."""
 
 from collections import defaultdict
 from collections.abc import Iterable
@@ -33,7 +33,7 @@ CAMERA_COLUMNS = (
 
 
 def mean_scores(rows: list[dict[str, Any]], names: Iterable[str]) -> dict[str, float | None]:
-    """Of each score, over the views that have a finite one; None where none has."""
+    """The mean of each score over the views for which it is finite; None if there are none."""
     known = {
         name: [row[name] for row in rows if row.get(name) is not None and np.isfinite(row[name])]
         for name in names
@@ -115,7 +115,8 @@ def _mean_of(cameras: dict[str, dict], tracked: bool) -> dict[str, float | None]
 
 
 def camera_rows(found: dict[str, Any], seen: str = "tracked") -> list[dict[str, Any]]:
-    """One row a camera, by the keys of `CAMERA_COLUMNS`; one that is not held out is called `seen`."""
+    """One row per camera, with the keys of `CAMERA_COLUMNS`. The kind of a camera that was not held out is
+    `seen`."""
     return [
         {
             **scored,

@@ -1,4 +1,4 @@
-"""What a run came to, as one value: the terminal, report.html and `gsjax compare` draw the same."""
+"""The outcome of a run as one value, which the terminal, report.html and `gsjax compare` all draw."""
 
 import math
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence

@@ -19,7 +19,7 @@ def print_summary(
     """Print a summary on stdout.
 
     Args:
-        summary: what a run came to.
+        summary: the outcome of a run.
         report: the page that shows all of it; None if none was written.
         notes: print its notes too.
         titles: print the titles of its tables too.

@@ -48,10 +48,10 @@ def fit(
         extra_losses: custom losses `loss(scene, rendered, frame)`; see `gsjax.losses.extra`.
 
     Returns:
-        ticks, whose `result` are the scene's `Gaussians`.
+        ticks, whose `result` is the scene's `Gaussians`.
 
     Raises:
-        ValueError: as `gsjax.methods.fit.Fit.start`.
+        ValueError: as for `gsjax.methods.fit.Fit.start`.
         DataError: a photograph cannot be read.
     """
     from gsjax.engine.fit.start import start_from  # matching is seldom needed, and slow to import
@@ -78,17 +78,18 @@ def deform(
     """Reconstruct a scene that deforms, seen by one camera (SurstSplat, GaussianClin).
 
     Args:
-        sequence: from `gsjax.open_sequence`; all frames of its first camera are learned from (see `select`).
-            Depth is the camera's own, else matched with the second camera's pictures, else the scene begins
-            on a plane.
+        sequence: from `gsjax.open_sequence`; trains on all frames of its first camera (see `select`).
+            Depth is the camera's own, else from stereo matching with the second camera; without either, the
+            scene starts as a plane.
         config: settings (default: those of `DeformConfig`).
         teacher: source of the features learned beside colours: "classes" of masks, "closed", a folder of
             feature files, "none", or a `TeacherChoice` with weights and masks (default: classes, if there are
             two or more among the pixels that count).
-        tools: whether tools, by the names of mask values, are left out ("leave-out") or drawn ("draw").
+        tools: whether tools, recognised by the names of mask values, are left out ("leave-out") or drawn
+            ("draw").
         tool_values: mask values that are tools, whatever their names.
-        first: index of the frame of the canonical scene (default: with classes the earliest that shows most
-            of them, else the first in which a pixel counts).
+        first: index of the frame of the canonical scene (default: with classes, the earliest frame that
+            shows the most of them; else the first in which a pixel counts).
         gaussians: initial canonical scene (default: from depth).
         after: a tick of an earlier reconstruction of the same sequence, to continue from.
         extra_losses: custom losses `loss(scene, rendered, frame)`; see `gsjax.losses.extra`.
@@ -98,10 +99,10 @@ def deform(
         `query(text)` scores them.
 
     Raises:
-        ValueError: as `gsjax.methods.deform.Deform.start`; the teacher does not fit the recording; or `first`
-            is not learned from.
+        ValueError: as for `gsjax.methods.deform.Deform.start`; the teacher does not fit the recording; or
+            `first` is not a training frame.
         DataError: a picture, depth or mask cannot be read.
-        FileNotFoundError: weights or feature files are not there.
+        FileNotFoundError: weights or feature files do not exist.
     """
     from gsjax.engine.deform.start import start_from  # teachers are slow to import
 
@@ -137,9 +138,9 @@ def distill(
         field.npz for `gsjax query` and `gsjax view`.
 
     Raises:
-        ValueError: the teacher does not fit the photographs, or as `gsjax.methods.distill.Distill.start`.
+        ValueError: the teacher does not fit the photographs, or as for `gsjax.methods.distill.Distill.start`.
         DataError: a photograph or its masks cannot be read.
-        FileNotFoundError: weights or feature files are not there.
+        FileNotFoundError: weights or feature files do not exist.
     """
     from gsjax.engine.teaching.teaching import teacher_for
 

@@ -157,7 +157,7 @@ def _of_deformation(path: Path, notes: Notes, weights: Path | None) -> Viewable:
     result = read_deformation(path / DEFORMATION)
     kind = None if result.meaning is None else result.meaning.source.kind
     if weights is not None and kind in (None, "classes", "closed"):
-        raise ValueError(f"--weights: {path} has learned nothing of CLIP; leave it out")
+        raise ValueError(f"--weights: {path} has no CLIP features; leave it out")
     first, labels, asking, times = result.at(0.0), None, None, result.timeline.times
     if result.meaning is not None and first.features is not None:
         asking = asking_of(QueryableScene(path, result, weights))
@@ -248,7 +248,7 @@ def _shots_of_deformation(path: Path, result: DeformResult, notes: Notes) -> Sho
         sequence = reopen(path / "config.yml", _AGAIN, opened=open_as_sequence)[0].judged
         found = (sequence.num_frames, sequence.width, sequence.height)
         if found != (wanted := (len(result.timeline.times), *result.timeline.size)):
-            raise ValueError(f"expected frames, width and height {wanted} as then, found {found}")
+            raise ValueError(f"expected frames, width and height {wanted} as in the run, found {found}")
         load = lambda t, _: sequence.image(t, 0)  # noqa: E731
     except (ValueError, OSError) as error:
         notes.warn(f"its photographs are not shown: {describe(error)}")

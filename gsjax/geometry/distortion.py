@@ -293,7 +293,7 @@ def _atan_over_r(r2):
 
 
 def _tan_over_t(t2):
-    """tan(t) / t as a function of t^2, likewise."""
+    """tan(t) / t as a function of t^2; a series near 0, as in `_atan_over_r`."""
     small = t2 < 1e-4
     t = jnp.sqrt(jnp.where(small, 1.0, t2))
     series = 1 + t2 * (1 / 3 + t2 * (2 / 15 + t2 * (17 / 315 + t2 * 62 / 2835)))

@@ -146,7 +146,7 @@ def _type_named(name: str) -> type:
     except (ImportError, AttributeError):
         raise ValueError(f"type {name}: not found") from None
     if not isinstance(kind, type) or not (dataclasses.is_dataclass(kind) or hasattr(kind, "_fields")):
-        raise ValueError(f"type {name}: not a NamedTuple, dataclass or module")
+        raise ValueError(f"type {name}: expected a NamedTuple, dataclass or module, found another object")
     return kind
 
 

@@ -74,7 +74,8 @@ def write_ply(
         labels = np.asarray(labels)
         if labels.shape != (gaussians.num,) or not np.issubdtype(labels.dtype, np.integer):
             raise ValueError(
-                f"labels: expected integers [{gaussians.num}], found {labels.dtype} of shape {labels.shape}"
+                f"labels: expected integers of shape [{gaussians.num}], found {labels.dtype} of shape "
+                f"{labels.shape}"
             )
         columns["label"] = labels
         fields.append(("label", "<i4"))

@@ -149,7 +149,7 @@ def _to_bytes(frame: np.ndarray) -> np.ndarray:
 
 
 def _own_process_group() -> dict[str, int]:
-    """Options that shield ffmpeg from the terminal's Ctrl-C: it must survive it to finish the file."""
+    """Options that shield ffmpeg from the terminal's Ctrl-C, as ffmpeg must still finish the file."""
     if os.name == "posix":
         return {"process_group": 0}
     return {"creationflags": subprocess.CREATE_NEW_PROCESS_GROUP}

@@ -56,7 +56,9 @@ def named_losses(losses: Any) -> dict[str, ExtraLoss]:
             raise ValueError(f"extra_losses: expected functions loss(scene, rendered, frame), found {loss!r}")
         name = getattr(loss, "__name__", type(loss).__name__)
         if name in named:
-            raise ValueError(f"extra_losses: expected functions of different names, found two named {name!r}")
+            raise ValueError(
+                f"extra_losses: expected functions with different names, found two named {name!r}; rename one"
+            )
         named[name] = loss
     return named
 
@@ -69,7 +71,7 @@ def extra_terms(losses: Any, scene: Any, rendered: Any, frame: Any) -> dict[str,
         scene, rendered, frame: their arguments.
 
     Raises:
-        ValueError: as `named_losses`, or a loss returns something other than a scalar.
+        ValueError: as for `named_losses`, or a loss returns something other than a scalar.
     """
     terms = {name: loss(scene, rendered, frame) for name, loss in named_losses(losses).items()}
     for name, value in terms.items():

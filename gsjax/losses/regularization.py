@@ -31,7 +31,7 @@ def plane_variation(planes: Float[Array, "p h w c"]) -> Float[Array, ""]:
 
 
 def second_differences(planes: Float[Array, "p t w c"]) -> Float[Array, ""]:
-    """Mean squared second difference of planes along their first axis, the time: uniform motion costs nothing
+    """Mean squared second difference of planes along their first axis, time: uniform motion costs nothing
     (K-Planes, eq. 5). 0 for fewer than three times."""
     if planes.shape[1] < 3:
         return jnp.zeros((), planes.dtype)

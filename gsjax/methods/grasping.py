@@ -141,8 +141,8 @@ def sample_poses(
 ) -> Float[Array, "samples 4 4"]:
     """Tool poses that close on a randomly drawn contact; NaN if there is nothing to draw.
 
-    The draws are relative to the object (the direction across a normal is that to another of its points), so
-    the poses rotate with it; only `approach` is fixed in the world.
+    The draws are relative to the object: the direction across a normal points to another point of the object.
+    So the poses rotate with it; only `approach` is fixed in the world.
 
     Args:
         key: random key of the draws.

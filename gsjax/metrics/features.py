@@ -32,7 +32,7 @@ def feature_psnr(
         ValueError: the shapes do not agree.
     """
     if features.shape != teacher.shape:
-        raise ValueError(f"teacher: expected shape {features.shape} like features, found {teacher.shape}")
+        raise ValueError(f"teacher: expected shape {features.shape} to match features, found {teacher.shape}")
     if mask is not None and mask.shape != features.shape[:-1]:
         raise ValueError(f"mask: expected shape {features.shape[:-1]} to match features, found {mask.shape}")
     squared = (_normalized(features) - _normalized(teacher)) ** 2

@@ -71,7 +71,7 @@ def match_parts(predicted: Integer[np.ndarray, "..."], true: Integer[np.ndarray,
     Parts that do not overlap are not matched.
 
     Args:
-        predicted, true: labels of the same Gaussians or pixels. Where the true label is -1, it is not scored.
+        predicted, true: labels of the same Gaussians or pixels; those whose true label is -1 are not scored.
 
     Raises:
         ValueError: the two differ in shape.

@@ -68,7 +68,7 @@ def t_ssim(video: Num[np.ndarray, "..."], masks: Bool[np.ndarray, "..."] | None 
         masks: [T, H, W], True where to compare; default: everywhere.
 
     Raises:
-        ValueError: as `between_neighbors`, or a side is below 11 pixels.
+        ValueError: as for `between_neighbors`, or a side is below 11 pixels.
     """
     return between_neighbors(ssim, video, masks)
 
@@ -84,7 +84,7 @@ def t_lpips(
         masks: [T, H, W], True where to compare; default: everywhere.
 
     Raises:
-        ValueError: as `between_neighbors`, or the frames are too small for the network.
+        ValueError: as for `between_neighbors`, or the frames are too small for the network.
     """
     return between_neighbors(partial(lpips, weights), video, masks)
 
@@ -210,7 +210,7 @@ def temporal_scores(
     if truth is None:
         return found
     if truth.shape != video.shape:
-        raise ValueError(f"truth: expected shape {video.shape} like video, found {truth.shape}")
+        raise ValueError(f"truth: expected shape {video.shape} to match video, found {truth.shape}")
     true = _scores(truth, masks, optical_flow, lpips_weights)
     gaps = {f"{name}_gap": _gap(found[name], true[name]) for name in found if name != "flow_warp_share"}
     return found | gaps

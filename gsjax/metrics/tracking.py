@@ -74,7 +74,7 @@ def true_labels(
     for mask, depth, viewmat, K in zip(masks, depths, viewmats, Ks, strict=True):
         if np.shape(mask) != np.shape(depth):
             raise ValueError(
-                f"masks: expected shape {np.shape(depth)} like its depth, found {np.shape(mask)}"
+                f"masks: expected shape {np.shape(depth)} to match its depth, found {np.shape(mask)}"
             )
         value, gap = _seen_by(np.asarray(points), np.asarray(mask), np.asarray(depth), viewmat, K)
         better = (gap <= max_depth_gap) & (gap < best)

@@ -189,7 +189,7 @@ def least_squares_step(
     a rejected move, so that the host re-plans.
 
     Raises:
-        ValueError: as `solve`; `params` are checked by `init`.
+        ValueError: as for `solve`; `params` are checked by `init`.
     """
     _check(jac, damping)
 

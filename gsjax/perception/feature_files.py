@@ -246,7 +246,9 @@ def _refusing(path: Path, expected: str) -> Iterator[None]:
 
 def _expect(path: Path, array: np.ndarray, axes: int, shape: str) -> None:
     if array.ndim != axes or array.dtype.kind not in "iuf" or 0 in array.shape:
-        raise ValueError(f"{path}: expected numbers {shape}, found {array.dtype} {list(array.shape)}")
+        raise ValueError(
+            f"{path}: expected numbers of shape {shape}, found {array.dtype} of shape {list(array.shape)}"
+        )
 
 
 def _rows(path: Path, ids: np.ndarray, count: int) -> Int[np.ndarray, "H W"]:

@@ -44,7 +44,7 @@ class DisFlow:
         if image.ndim != 3 or image.shape[2] != 3:
             raise ValueError(f"image: expected shape [H, W, 3], RGB, found {image.shape}")
         if other.shape != image.shape:
-            raise ValueError(f"other: expected shape {image.shape} like image, found {other.shape}")
+            raise ValueError(f"other: expected shape {image.shape} to match image, found {other.shape}")
         if any(side < least for side, least in zip(sorted(image.shape[:2]), _LEAST_SIDES, strict=True)):
             shorter, longer = _LEAST_SIDES
             raise ValueError(

@@ -47,7 +47,8 @@ class PlaneSegmenter:
     depth_jump: float = 0.02
     """Largest relative difference of depth between neighbouring pixels of one object."""
     color_jump: float | None = None
-    """Largest difference of smoothed CIELAB colour between them; None does not split by colour."""
+    """Largest difference of smoothed CIELAB colour between neighbouring pixels of one object; None does not
+    split by colour."""
     min_pixels: int = 60
     """Smaller components are dropped."""
     seed: int = 0

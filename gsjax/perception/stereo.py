@@ -56,7 +56,7 @@ def stereo_depth(
         ValueError: the images differ in size, or the cameras coincide or diverge too much.
     """
     if left.shape != right.shape:
-        raise ValueError(f"right: expected shape {left.shape} like left, found {right.shape}")
+        raise ValueError(f"right: expected shape {left.shape} to match left, found {right.shape}")
     config = config or StereoConfig()
     pair = _rectified(left.shape[:2], viewmats, Ks)
     cameras = list(zip(pair.turns, Ks, strict=True))
@@ -117,8 +117,8 @@ def _rectified(
     size = (high - low).astype(int)
     if size.prod() > _LARGEST * width * height:
         raise ValueError(
-            f"viewmats: expected two cameras that look in similar directions, found that rectified images of "
-            f"{width}x{height} pixels would need {size[0]}x{size[1]}"
+            f"viewmats: expected two cameras that look in similar directions, found a pair whose images of "
+            f"{width}x{height} pixels would be {size[0]}x{size[1]} when rectified"
         )
     K[:2, 2] -= low
     return _Pair(turns, K, (int(size[0]), int(size[1])), baseline)

@@ -41,7 +41,7 @@ def read_torch_array(path: Path) -> np.ndarray:
             names = archive.namelist()
             described = [name for name in names if name.endswith("/data.pkl") or name == "data.pkl"]
             if len(described) != 1:
-                raise ValueError(f"{path}: expected a file of torch.save, found no data.pkl in it. {_ADVICE}")
+                raise ValueError(f"{path}: expected a torch.save file, found no data.pkl in it. {_ADVICE}")
             kind, key, offset, shape, strides = _tensor(path, _part(path, archive, described[0]))
             root = described[0].removesuffix("data.pkl")
             if f"{root}data/{key}" not in names:

@@ -38,8 +38,8 @@ class DeformationConfig:
     resolution: int = 64
     """Vertices per axis of the coarsest planes, or of the voxels."""
     time_resolution: int = 30
-    """Vertices along the time of all planes: about half the number of frames, so that nearby frames share
-    vertices."""
+    """Vertices along the time axis of all planes: about half the number of frames, so that nearby frames
+    share vertices."""
     levels: int = 2
     """Levels of planes, each twice as fine in space as the one before."""
     channels: int = 16

@@ -82,7 +82,10 @@ def part_of(frame: Frame, cameras: tuple[int, ...] = (), shrink: int = 1) -> Fra
         return frame
     height, width = (size // shrink for size in (frame.cameras.height, frame.cameras.width))
     if not (height and width):
-        raise ValueError(f"shrink: {shrink} leaves nothing of {frame.cameras.width}x{frame.cameras.height}")
+        raise ValueError(
+            f"shrink: expected at most the sides of the pictures, {frame.cameras.width}x"
+            f"{frame.cameras.height}, found {shrink}"
+        )
     images = frame.images[:, : height * shrink, : width * shrink]
     images = images.reshape(-1, height, shrink, width, shrink, 3).mean((2, 4))
     middle = slice(shrink // 2, None, shrink)

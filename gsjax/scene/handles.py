@@ -100,7 +100,7 @@ def skin_means(
 @partial(jax.jit, inline=True)
 def blend_quats(weights: Float[Array, "N P"], quats: Float[Array, "P 4"]) -> Float[Array, "N 4"]:
     """Unit quaternions of the blended rotations. The sign of a quaternion is arbitrary, so each is aligned
-    with that of the largest weight; if the sum still vanishes, the latter is used alone."""
+    with that of the largest weight, which is used alone if the sum still vanishes."""
     signed, leading = _aligned(weights, normalize_quats(quats))
     total = jnp.einsum("np,npi->ni", weights, signed)
     vanishes = jnp.sum(total * total, axis=-1, keepdims=True) < MIN_SQUARED_NORM
@@ -110,7 +110,7 @@ def blend_quats(weights: Float[Array, "N P"], quats: Float[Array, "P 4"]) -> Flo
 def _aligned(
     weights: Float[Array, "N P"], quats: Float[Array, "P 4"]
 ) -> tuple[Float[Array, "N P 4"], Float[Array, "N 4"]]:
-    """The quaternions on the same hemisphere as that of the largest weight, and the latter."""
+    """The quaternions flipped to the hemisphere of the one with the largest weight, and that one."""
     leading = quats[jnp.argmax(weights, axis=-1)]
     signs = jnp.where(leading @ quats.T < 0, -1.0, 1.0).astype(quats.dtype)
     return signs[..., None] * quats, leading
@@ -118,8 +118,8 @@ def _aligned(
 
 def _polar(weights: Float[Array, "N P"], quats: Float[Array, "P 4"]) -> Float[Array, "N 4"]:
     """Quaternions of the rotations nearest to the blended matrices, by Newton's iteration X <- (X + X^-T) / 2
-    (Higham 1986). If handles are so far apart that the blended matrix is not near any rotation, that of the
-    largest weight is used alone."""
+    (Higham 1986). If handles are so far apart that the blended matrix is not near any rotation, the
+    rotation with the largest weight is used alone."""
     rotations = quats_to_matrices(quats)
     blended = jnp.einsum("np,pij->nij", weights, rotations)
     lost = (jnp.linalg.det(blended) < 1e-3)[:, None, None]

@@ -130,7 +130,9 @@ def gaussians_from_points(
     if colors.shape != points.shape:
         raise ValueError(f"colors: expected shape {points.shape} to match points, found {colors.shape}")
     if isinstance(normals, str) and normals != "pca":
-        raise ValueError(f"normals: expected None, 'pca' or an array {points.shape}, found {normals!r}")
+        raise ValueError(
+            f"normals: expected None, 'pca' or an array of shape {points.shape}, found {normals!r}"
+        )
     if normals is not None and not isinstance(normals, str) and np.shape(normals) != points.shape:
         raise ValueError(f"normals: expected shape {points.shape} to match points, found {np.shape(normals)}")
     finite = np.flatnonzero(np.isfinite(points).all(axis=1) & np.isfinite(colors).all(axis=1))
@@ -157,7 +159,7 @@ def check_depth(depth: np.ndarray) -> None:
         raise ValueError(f"depth: expected shape [H, W], found {depth.shape}")
     if not np.issubdtype(depth.dtype, np.floating):
         raise ValueError(
-            f"depth: expected metres as floats (times the file's unit), found dtype {depth.dtype}"
+            f"depth: expected floats in metres (multiply by the file's unit), found dtype {depth.dtype}"
         )
 
 

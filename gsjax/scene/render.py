@@ -65,7 +65,7 @@ def render(
         visibility: factor on each opacity in each camera, 0 to 1 (default: 1).
 
     Raises:
-        ValueError: as `gsjax.rasterization`.
+        ValueError: as for `gsjax.rasterization`.
     """
     features = gaussians.features if features is None else features
     scene = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.sh, features)

@@ -217,7 +217,7 @@ def in_rows(
 def overlay_labels(
     image: Num[np.ndarray, "h w 3"], labels: Integer[np.ndarray, "h w"]
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """Labels as colours over a grey copy of the image, so that the shapes below still show; 0 and below stay
+    """Labels as colours over a grey copy of the image, so that the shapes below still show; labels <= 0 stay
     grey."""
     grey = to_uint8(image).mean(axis=-1, keepdims=True) * 0.75
     inside: Bool[np.ndarray, "h w 1"] = (labels > 0)[..., None]

@@ -93,7 +93,7 @@ def test_a_seed_is_that_of_every_configuration():
         ({"minutes": 0.0}, "--minutes: expected more than 0, found 0.0"),
         ({"minutes": float("nan")}, "--minutes: expected more than 0, found nan"),
         ({"scale": 1.5}, "--scale: expected above 0 and at most 1, found 1.5"),
-        ({"test_every": 1}, "--test-every: expected 0 .none. or 2 and more, found 1"),
+        ({"test_every": 1}, "--test-every: expected 0 .none., or 2 or more, found 1"),
     ],
 )
 def test_what_cannot_be_is_said(given, said):

@@ -32,7 +32,7 @@ def test_some_of_photographs(photographs):
     )
     with pytest.raises(ValueError, match=r"--cameras: .* holds photographs, not a recording"):
         choose_photographs(str(photographs), cameras=(0,))
-    with pytest.raises(ValueError, match=r"--frames: 9: holds no photograph of .* 0 to 8"):
+    with pytest.raises(ValueError, match=r"--frames: 9: selects no photograph of .* 0 to 8"):
         choose_photographs(str(photographs), frames="9:")
 
 
@@ -58,5 +58,5 @@ def test_what_is_held_out_is_as_the_data_says_or_every_so_manieth():
     assert [part.tolist() for part in split(alone, 8)] == [[0], []]
     said = replace(nine, splits=("train",) * 6 + ("val",) + ("test",) * 2)
     assert [part.tolist() for part in split(said, 4)] == [[0, 1, 2, 3, 4, 5], [7, 8]]
-    with pytest.raises(ValueError, match="none is left to fit"):
+    with pytest.raises(ValueError, match="expected photographs to fit, found all"):
         split(replace(nine, splits=("test",) * 9), 4)

@@ -84,10 +84,10 @@ def with_header(path, change):
     [
         ("os:system", "not of gsjax, optax"),
         ("gsjax.cli.__main__:entry", "not of gsjax, optax"),
-        ("gsjax.scene.gaussians:take", "not a NamedTuple, dataclass or module"),
+        ("gsjax.scene.gaussians:take", "expected a NamedTuple, dataclass or module"),
         ("gsjax.scene.gaussians:Gone", "not found"),
         ("gsjax.nowhere:Gone", "not found"),
-        ("optax:adam", "not a NamedTuple, dataclass or module"),
+        ("optax:adam", "expected a NamedTuple, dataclass or module"),
     ],
 )
 def test_only_types_that_hold_fields_are_made(tmp_path, name, says):

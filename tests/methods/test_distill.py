@@ -177,7 +177,7 @@ def test_the_result_scores_its_gaussians_and_others(two_balls, result, problem):
     with pytest.raises(ValueError, match="encoder: expected one that reads texts"):
         result.query("can")
     with pytest.raises(
-        ValueError, match="expected a query of 24 numbers like this field's features, found 7"
+        ValueError, match="expected a query of 24 numbers, as in this field's features, found 7"
     ):
         result.scores(BOOK[:, :7])
     with pytest.raises(ValueError, match="means: expected the centres"):

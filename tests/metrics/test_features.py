@@ -39,7 +39,7 @@ def test_feature_psnr_by_hand():
     assert feature_psnr(x, mixed, mask) == math.inf
     assert feature_psnr(x, mixed, ~mask) == pytest.approx(10 * math.log10(4 / 2))
     with pytest.raises(
-        ValueError, match=r"teacher: expected shape \(2, 3, 4\) like features, found \(2, 3, 3\)"
+        ValueError, match=r"teacher: expected shape \(2, 3, 4\) to match features, found \(2, 3, 3\)"
     ):
         feature_psnr(x, y[..., :3])
     with pytest.raises(ValueError, match=r"mask: expected shape \(2, 3\)"):

@@ -190,5 +190,5 @@ def test_shapes_that_do_not_fit_are_named():
         t_ssim(video, np.ones((3, HEIGHT, WIDTH), bool))
     with pytest.raises(ValueError, match=r"flows.backward: expected shape \(3, 24, 32, 2\)"):
         flow_warp_error(video, flows._replace(backward=flows.backward[1:]))
-    with pytest.raises(ValueError, match=r"truth: expected shape \(4, 24, 32, 3\) like video"):
+    with pytest.raises(ValueError, match=r"truth: expected shape \(4, 24, 32, 3\) to match video"):
         temporal_scores(video, video[1:])

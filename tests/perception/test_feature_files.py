@@ -156,7 +156,7 @@ def test_what_could_unpack_or_print_without_end_is_refused(tmp_path):
 
 def test_files_of_other_kinds_are_refused(tmp_path):
     (tmp_path / "old.pt").write_bytes(b"\x80\x02")
-    with pytest.raises(ValueError, match=r"old\.pt: expected a file of torch\.save"):
+    with pytest.raises(ValueError, match=r"old\.pt: expected a torch\.save file"):
         read_torch_array(tmp_path / "old.pt")
     with zipfile.ZipFile(tmp_path / "empty.pt", "w") as archive:
         archive.writestr("readme", "nothing")

@@ -53,7 +53,7 @@ def test_nothing_moves_in_equal_pictures_and_bytes_are_as_good_as_floats(texture
 
 def test_pictures_that_do_not_fit_are_named(textured):
     with pytest.raises(
-        ValueError, match=r"other: expected shape \(72, 96, 3\) like image, found \(71, 96, 3\)"
+        ValueError, match=r"other: expected shape \(72, 96, 3\) to match image, found \(71, 96, 3\)"
     ):
         DisFlow()(textured, textured[1:])
     with pytest.raises(ValueError, match=r"image: expected shape \[H, W, 3\], RGB, found \(72, 96\)"):

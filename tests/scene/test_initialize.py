@@ -56,7 +56,7 @@ def test_depth_in_another_unit_is_noticed():
     image, depth = picture()
     with pytest.warns(UserWarning, match="millimetres"):
         points_from_rgbd(image, 1000 * depth, VIEWMAT, K)
-    with pytest.raises(ValueError, match=r"expected metres as floats .*, found dtype uint16"):
+    with pytest.raises(ValueError, match=r"expected floats in metres .*, found dtype uint16"):
         points_from_rgbd(image, (1000 * depth).astype(np.uint16), VIEWMAT, K)
 
 

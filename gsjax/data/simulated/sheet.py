@@ -95,7 +95,7 @@ class Sheet:
 
 
 def _in_the_plane(along_x: np.ndarray, along_y: np.ndarray, error: np.ndarray) -> np.ndarray:
-    """The steps in x and y at rest that cancel the first two coordinates of an error, [2,n]."""
+    """Steps in the rest coordinates x and y that cancel the first two coordinates of an error, [2,n]."""
     determinant = along_x[0] * along_y[1] - along_y[0] * along_x[1]
     steps = np.stack(
         [along_y[1] * error[0] - along_y[0] * error[1], along_x[0] * error[1] - along_x[1] * error[0]]

@@ -44,14 +44,14 @@ class Group:
 
 @dataclass
 class Comparison:
-    """What came of it.
+    """The result of a comparison.
 
     Attributes:
         kind: the command whose runs these are.
         records: the runs, by their labels, group by group.
         scores: of each run, by the keys of `SCORES`; None where it is not known.
         groups: runs that can be compared with each other.
-        options: settings that all runs have, and not the same, of each run.
+        options: each run's values of the settings that all runs have but that differ between runs.
         notes: what was not compared, and why.
     """
 
@@ -76,12 +76,12 @@ def compare(records: Sequence[Record], same_views: Callable[[list[Record], str],
         same_views: whether a held-out view of this name shows the same in all of these runs.
 
     Raises:
-        ValueError: they are of different commands.
+        ValueError: they are runs of different commands.
     """
     kinds = {record.kind: [str(r.path) for r in records if r.kind == record.kind] for record in records}
     if len(kinds) > 1:
         listed = " and ".join(f"`gsjax {kind}` ({', '.join(names)})" for kind, names in kinds.items())
-        raise ValueError(f"expected runs of one command, found those of {listed}; compare them apart")
+        raise ValueError(f"expected runs of one command, found those of {listed}; compare each alone")
     labelled = dict(zip(labels([record.path for record in records]), records, strict=True))
     kind, notes = records[0].kind, [note for record in records for note in record.notes]
     groups: dict[Any, Group] = {}

@@ -1,4 +1,4 @@
-"""What two runs must share to be compared, and the scores by which runs of each command are."""
+"""What two runs must share to be compared, and the scores that are compared for each command."""
 
 from typing import Any
 
@@ -22,7 +22,7 @@ SCORES: dict[Kind, tuple[Score, ...]] = {
 
 def data_of(kind: Kind, found: Metrics) -> tuple[Any, ...]:
     """What runs of the same dataset must share to be compared: the size of pictures, then the frames and
-    cameras of a recording, or the number of views or frames that were learned from and held out."""
+    cameras of a recording, or the numbers of training and held-out views or frames."""
     if kind == "fit":
         return tuple(found["size"])
     if kind == "distill":
@@ -36,7 +36,7 @@ def data_of(kind: Kind, found: Metrics) -> tuple[Any, ...]:
 
 
 def data_in_words(dataset: str, data: tuple[Any, ...] | None) -> str:
-    """The same in words, for a note; `data` is None for a run that has no metrics yet."""
+    """A dataset and its `data_of` in words, for a note; `data` is None for a run that has no metrics yet."""
     if data is None:
         return dataset
     size = f"{dataset} at {data[0]}x{data[1]}"

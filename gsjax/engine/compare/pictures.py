@@ -39,7 +39,7 @@ def read_panels(record: Record, view: str) -> Panels | None:
 
 
 def shows_the_same(records: list[Record], view: str) -> bool:
-    """Whether all runs have the same photograph of that name, as far as their pictures are still there."""
+    """Whether all runs have the same photograph for a view; runs whose picture is gone are ignored."""
     photographs = [panels.photograph for panels in (read_panels(r, view) for r in records) if panels]
     return all(
         other.shape == photographs[0].shape and np.abs(other.astype(int) - photographs[0]).mean() < _TOLERANCE
@@ -48,7 +48,7 @@ def shows_the_same(records: list[Record], view: str) -> bool:
 
 
 def write_strip(path: Path, records: Mapping[str, Record], view: str) -> bool:
-    """Writes the photograph and what each run made of it; whether there was anything to write.
+    """Writes the photograph beside each run's render of it; returns whether there was anything to write.
 
     Args:
         path: the .png file.

@@ -33,11 +33,11 @@ class DeformData:
 
     Attributes:
         sequence: camera 0 is the one that is learned from; others are only judged.
-        train: indices of frames to learn from.
+        train: indices of training frames.
         test: indices of frames that are held out.
-        frames: the frames to learn from, in memory.
+        frames: the training frames, in memory.
         taught: the teacher's labels of the frames; None without a teacher.
-        tool_values: mask values that are tools; those with names of tools where there is none.
+        tool_values: mask values that are tools; if empty, those that are named like tools.
     """
 
     sequence: Sequence
@@ -54,7 +54,7 @@ class DeformData:
 
     @property
     def lesson(self) -> Lesson | None:
-        """The teacher's labels of the frames to learn from; None without a teacher."""
+        """The teacher's labels of the training frames; None without a teacher."""
         return None if self.taught is None else self.taught.lesson
 
     @property
@@ -83,7 +83,7 @@ class DeformData:
         return int(shown.argmax()) if shown.any() else None
 
     def digest(self) -> str:
-        """Digest of all that is learned from, in hexadecimal."""
+        """Digest of all training data, in hexadecimal."""
         found = hashlib.sha256(b"" if self.taught is None else self.taught.digest.encode())
         ids = () if self.lesson is None else self.lesson.ids
         for value in jax.tree.leaves((self.frames, list(ids))):
@@ -125,7 +125,7 @@ class DeformData:
         )
 
     def timeline(self, metric: bool = True) -> Timeline:
-        """All frames of the recording, those that are held out too.
+        """All frames of the recording, held-out ones included.
 
         Args:
             metric: whether depth, and so the scene, is in metres.
@@ -154,23 +154,23 @@ def deform_data(
     notes: Notes,
     console: Console,
 ) -> DeformData:
-    """Read the frames to learn from.
+    """Read the training frames.
 
     Args:
-        sequence: camera 0 is learned from.
+        sequence: the recording; camera 0 is the training camera.
         every: hold out frame i where (i - 1) mod `every` is 0, as is done with EndoNeRF; 0: none.
-        tools: whether tools are left out, by the names of mask values.
+        tools: whether tools, recognised by the names of mask values, are left out.
         choice: the teacher; checked. "auto": the masks' classes, if there are two or more among pixels that
             count. "none": no teacher.
         channels: of a Gaussian's feature.
-        tool_values: mask values that are tools; those with names of tools where there is none.
+        tool_values: mask values that are tools; if empty, those that are named like tools.
         notes: receives oddities of the data.
         console: shows the progress.
 
     Raises:
-        ValueError: there are too many classes, or too few that classes are asked for; features do not fit; or
-            no frame has a mask.
-        DataError, FileNotFoundError: a file is bad, or not there.
+        ValueError: there are too many classes, or too few for "classes"; features do not fit; or no frame has
+            a mask.
+        DataError, FileNotFoundError: a file is invalid or missing.
     """
     count = sequence.num_frames
     test = [i for i in range(count) if every and (i - 1) % every == 0] if count > 1 else []
@@ -185,10 +185,10 @@ def deform_data(
         train, test = ([t for t in some if t not in unknown] for some in (train, test))
         if unknown:
             numbers = ", ".join(str(sequence.frame_ids[t]) for t in unknown)
-            notes.warn(f"frames {numbers} have no mask of tools and are left out")
+            notes.warn(f"frames {numbers} have no tool mask and are left out")
         if not train:
             raise ValueError(
-                f"{sequence.name}: expected masks of frames to learn from, found none (--tools draw)"
+                f"{sequence.name}: expected masks of training frames, found none; try --tools draw"
             )
     counted = _counted_names(sequence, [masks.get(t) for t in train], tools, tool_values, notes)
     teaching = None

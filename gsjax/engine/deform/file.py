@@ -59,7 +59,7 @@ def warn_of_partial(path: Path, notes: Notes) -> None:
     except (OSError, ValueError, KeyError, TypeError):
         return
     if steps is not None:
-        notes.warn(f"{path} is a partial run of {steps} steps; gsjax deform goes on with --resume")
+        notes.warn(f"{path} is a partial run of {steps} steps; continue it with gsjax deform --resume")
 
 
 def _misfit(result: DeformResult) -> str | None:

@@ -37,8 +37,8 @@ def as_refined(
     arrays = {"viewmats": found, "frame_ids": sequence.frame_ids, "camera_ids": sequence.camera_ids}
     write_npz(folder.path / NAME, arrays)
     notes.add(
-        f"Poses were refined ({NAME}), and frames are judged with these: that of a held-out frame by the "
-        "corrections of its neighbours in time, without its picture."
+        f"Poses were refined ({NAME}), and frames are judged with the refined poses. The pose of a held-out "
+        "frame is corrected like those of its neighbours in time; its picture is not used."
     )
     turned, moved = _apart(given[:, 0], found[:, 0])
     return replace(data, sequence=sequence), {

@@ -1,5 +1,5 @@
-"""Queries of a run of `gsjax deform`: the Gaussians that a text, a point or a box means, or what all of them
-are, at every time."""
+"""Queries of a run of `gsjax deform`, at every time: the Gaussians that match a text, a point or a box, or
+the labels of all Gaussians."""
 
 from collections.abc import Callable, Iterator, Sequence
 from functools import cached_property, partial
@@ -82,7 +82,7 @@ class QueryableScene(Queryable):
         meaning, gaussians = result.meaning, result.scene.gaussians
         if meaning is None or gaussians.features is None:
             raise ValueError(
-                f"{path}: expected a scene that knows what is what in it, found none with features: there "
+                f"{path}: expected a scene with features, found none: there "
                 "was one class among the pixels that counted; reconstruct it with --tools draw, or with "
                 "--features"
             )
@@ -116,7 +116,7 @@ class QueryableScene(Queryable):
         count = len(self.result.timeline.times)
         chosen = range(count)[parse_frames(question.frames)]
         if not chosen:
-            raise ValueError(f"--frames: {question.frames} holds no frame of the run, which has {count}")
+            raise ValueError(f"--frames: {question.frames} selects no frame of the run, which has {count}")
         return sorted({frame, *chosen})
 
     def at(self, frame: int) -> Gaussians:
@@ -201,7 +201,7 @@ def label_everything(
         console: shows the progress.
 
     Raises:
-        ValueError: a frame is not there.
+        ValueError: a frame does not exist.
         FileExistsError: the folder holds something else than a result of a query.
     """
     frame, result = scene.frame_of(question), scene.result

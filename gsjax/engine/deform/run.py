@@ -46,13 +46,13 @@ class Options(TeacherOptions, OfDataset):
     preset: Literal["surst", "clin"] = "surst"
     """Recipe whose settings are the defaults of --deform: SurstSplat's or GaussianClin's."""
     tools: Tools = "leave-out"
-    """Leave tools out, or draw them too. Tools are known by the names of mask values; without names all
-    values but 0 are tools."""
+    """Leave tools out, or draw them too. Tools are recognised by the names of mask values; without
+    names, all values but 0 are tools."""
     tool_values: Annotated[tuple[int, ...], tyro.conf.arg(metavar="VALUE")] = ()
     """Mask values that are tools, whatever their names."""
     depth: Depth = "auto"
-    """Source of the depth: data (files), stereo (the camera to learn from and the next one are matched) or
-    plane (none: the scene begins on one, and its depth has no unit). auto: the first of these that exists."""
+    """Source of the depth: data (files), stereo (matching the training camera with the next one) or plane (no
+    depth: the scene starts as a plane, and lengths have no unit). auto: the first of these that exists."""
     deform: DeformConfig = field(default_factory=lambda: PRESETS["surst"])
     """Settings of the scene and its training."""
 
@@ -127,10 +127,10 @@ def run(options: Options) -> int:
 def _warn_of_oddities(progress: Progress, judged: Mapping[str, Any], notes: Notes) -> None:
     """Warns of skipped steps, and of a scene that hardly learned motion or classes."""
     if progress.skipped:
-        notes.warn(f"{progress.skipped} steps met numbers that are not finite and changed nothing")
+        notes.warn(f"{progress.skipped} steps produced non-finite numbers and were skipped")
     tracks = judged["tracks"]
     if tracks is not None and tracks["median_mm"] > _HARDLY * tracks["still_median_mm"]:
-        notes.warn("tracks are hardly better than those of a static scene; more steps (--deform.iterations)?")
+        notes.warn("tracks are hardly better than those of a static scene; try more --deform.iterations")
     unlike = [f"{one['class']} {one['iou']:.2f}" for one in judged["classes"] if one["iou"] < _UNLIKE]
     if unlike:
         notes.warn(
@@ -139,7 +139,7 @@ def _warn_of_oddities(progress: Progress, judged: Mapping[str, Any], notes: Note
 
 
 def _recording(options: Options, notes: Notes) -> tuple[Sequence, DepthSource]:
-    """The recording with its depth, the camera to learn from first, and the source of the depth."""
+    """The recording with its depth, the training camera first, and the source of the depth."""
     chosen = (options.frames, options.read, options.scale)
     whole = open_recording(options.dataset, (), (), *chosen, opened=open_as_sequence).judged
     if is_photographs(options.dataset) and not is_recording(options.dataset):
@@ -163,7 +163,7 @@ def _recording(options: Options, notes: Notes) -> tuple[Sequence, DepthSource]:
 def _of_photographs(photographs: Photographs, facing: Float[np.ndarray, "4 4"]) -> str:
     """The note on their order, and on the unit of lengths by their points; `facing` is the first view
     matrix."""
-    words = f"{photographs.num} photographs are taken as frames, in their order."
+    words = f"{photographs.num} photographs are used as frames, in their order."
     if photographs.cloud is None or not len(photographs.cloud.points):
         return words
     away = float(np.median(photographs.cloud.points @ facing[2, :3] + facing[2, 3]))
@@ -175,9 +175,9 @@ def _of_photographs(photographs: Photographs, facing: Float[np.ndarray, "4 4"]) 
 def _teacher(options: Options) -> TeacherChoice:
     """The choice of a teacher, once all options fit."""
     if len(options.cameras) > 1:
-        raise ValueError(f"--cameras: expected one to learn from, found {list(options.cameras)}")
+        raise ValueError(f"--cameras: expected one training camera, found {list(options.cameras)}")
     if len(options.eval_cameras) > 1:
-        raise ValueError(f"--eval-cameras: expected one to judge by, found {list(options.eval_cameras)}")
+        raise ValueError(f"--eval-cameras: expected one held-out camera, found {list(options.eval_cameras)}")
     option = "masks" if options.masks != "auto" else "sam" if options.sam is not None else None
     if option is not None and options.features not in ("closed", "clip"):
         raise ValueError(

@@ -1,5 +1,5 @@
 """Scores of a deforming scene: held-out frames and their neighbours in time, the other eye, classes, and
-tracks where truth has them."""
+tracks if the ground truth has any."""
 
 from collections.abc import Iterable
 from dataclasses import replace
@@ -104,7 +104,8 @@ def judge(
 
 
 def _other_counts(data: DeformData, t: int, tools: Tools) -> bool:
-    """Whether another camera can judge: one without masks shows tools that were left out."""
+    """Whether another camera can judge frame t. If tools were left out, it needs a mask, as its pictures show
+    the tools."""
     seen = data.sequence
     if seen.num_cameras < 2:
         return False
@@ -117,7 +118,7 @@ class Drawn(NamedTuple):
     Attributes:
         colors: 0 to 1, on the host.
         depths: metres, on the host.
-        features: on the device; None of a scene without.
+        features: on the device; None if the scene has none.
     """
 
     colors: Float[np.ndarray, "h w 3"]
@@ -184,7 +185,7 @@ def _of_classes(
     drawn: Drawn, frame: Frame, data: DeformData, t: int, overlap: LabelOverlap
 ) -> dict[str, Any]:
     """f-PSNR of a frame, on the teacher's grid; the classes of its pixels that count, by the nearest code,
-    are added to `overlap`, against those of the teacher's."""
+    are added to `overlap`, against the teacher's."""
     labels = data.labels(t)
     if labels is None or data.meaning is None or drawn.features is None:
         return {"f_psnr": None}
@@ -213,7 +214,8 @@ def _classes(overlap: LabelOverlap, names: Iterable[str]) -> list[dict[str, Any]
 
 
 def _means_of_classes(overlap: LabelOverlap, count: int) -> dict[str, float | None]:
-    """Means over classes that occurred, and the share of pixels that are named right; None without any."""
+    """Means over the classes that occurred, and the share of pixels with the right class; None if no class
+    occurred."""
     names = ("iou", "dice", "f1")
     found = {name: overlap.mean(getattr(overlap, name), range(count)) for name in names}
     found["accuracy"] = overlap.accuracy

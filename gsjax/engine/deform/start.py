@@ -31,7 +31,7 @@ def start_from(
         sequence, teacher, tools, tool_values, first, gaussians: as for `gsjax.deform`.
 
     Raises:
-        ValueError, DataError, FileNotFoundError: as `gsjax.deform`.
+        ValueError, DataError, FileNotFoundError: as for `gsjax.deform`.
     """
     choice = teacher if isinstance(teacher, TeacherChoice) else TeacherChoice(teacher or "auto")
     choice.check(optional=True)
@@ -40,7 +40,7 @@ def start_from(
     seen, source = with_depth(sequence, "auto", config.plane_depth, notes)
     data = deform_data(seen, 0, tools, choice, config.channels, tool_values, notes, quiet)
     if first is not None and first not in data.train:
-        raise ValueError(f"first: expected one of the frames to learn from, {data.train}, found {first}")
+        raise ValueError(f"first: expected one of the training frames, {data.train}, found {first}")
     for text in notes.warnings:
         warnings.warn(text, DataWarning, stacklevel=3)
     return method.start(

@@ -34,8 +34,8 @@ class Labels(NamedTuple):
     """A teacher's labels of a frame.
 
     Attributes:
-        ids: row of the codes of each of the teacher's pixels, -1 for none; a grid of any size.
-        codes: in the scene's channels.
+        ids: row in `codes` for each of the teacher's pixels, -1 for none; a grid of any size.
+        codes: feature vectors, in the scene's channels.
     """
 
     ids: Int[np.ndarray, "h w"]
@@ -46,7 +46,7 @@ class Taught(NamedTuple):
     """A teacher's labels of a recording.
 
     Attributes:
-        lesson: labels of the frames to learn from.
+        lesson: labels of the training frames.
         held_out: labels of held-out frames, by their index; those that have none are left out.
         digest: of all that is taught beside the ids of frames, in hexadecimal.
     """
@@ -68,7 +68,7 @@ def taught_by_classes(
 
     Args:
         masks: of frames; pixels of a frame without one have no label.
-        train, test: indices of the frames to learn from, and of those that are held out.
+        train, test: indices of the training frames and of the held-out ones.
         names: of mask values.
         size: width and height of the masks, pixels.
         channels: of a Gaussian's feature.
@@ -109,7 +109,7 @@ def taught_by_features(
 
     Args:
         teaching: the teacher of the recording, frame by frame.
-        frames: those to learn from, of one camera each.
+        frames: training frames, of one camera each.
         test: indices of the held-out frames, with the recording's own numbers of these.
         channels: of a Gaussian's feature.
         notes: receives what is learned, and which held-out frames cannot be read; these are left out.
@@ -157,8 +157,8 @@ def taught_by_features(
 def basis_of(
     vectors: Many[Float[np.ndarray, "_ D"]], channels: int
 ) -> tuple[Float[np.ndarray, "D channels"], float]:
-    """The orthonormal columns that keep most of some vectors, their lengths and angles, and which share of
-    their squares that is; zeros fill it up where there are fewer than `channels`."""
+    """Orthonormal columns onto which the projection of some vectors keeps most of their squared lengths, and
+    the share that it keeps. Columns beyond the rank of the vectors are zeros."""
     products = sum(np.asarray(some, np.float64).T @ np.asarray(some, np.float64) for some in vectors)
     squares, axes = np.linalg.eigh(products)
     squares, axes = np.maximum(squares[::-1], 0), axes[:, ::-1]
@@ -225,7 +225,7 @@ def as_photographs(sequence: Sequence) -> Photographs:
 
 
 def _counts(ids: Many[Int[np.ndarray, "h w"]], rows: int, frames: Many[Frame]) -> Float[np.ndarray, "n"]:
-    """The number of pixels that count which have each of this number of vectors.
+    """How many of the pixels that count have each vector, for `rows` vectors.
 
     Raises:
         ValueError: grids differ, or no pixel has any.
@@ -233,7 +233,7 @@ def _counts(ids: Many[Int[np.ndarray, "h w"]], rows: int, frames: Many[Frame]) -
     grids = Counter(one.shape for one in ids)
     if len(grids) > 1:
         found = ", ".join(f"{width}x{height} ({n})" for (height, width), n in grids.most_common())
-        raise ValueError(f"--features: expected one grid in all frames, found (frames) {found}")
+        raise ValueError(f"--features: expected one grid size in all frames, found (frames of each) {found}")
     counts = np.zeros(1 + rows)
     for frame, one in zip(frames, ids, strict=True):
         counted = counted_ids(one, None if frame.masks is None else frame.masks[0])
@@ -241,7 +241,7 @@ def _counts(ids: Many[Int[np.ndarray, "h w"]], rows: int, frames: Many[Frame]) -
     if not counts[1:].any():
         silent = all((one < 0).all() for one in ids)
         found = "zeros alone" if silent else "none; do masks hide all?"
-        raise ValueError(f"--features: expected some of pixels that count, found {found}")
+        raise ValueError(f"--features: expected some for the pixels that count, found {found}")
     return counts[1:]
 
 

@@ -58,7 +58,7 @@ def read_field(path: Path) -> DistillResult:
     rows, entries = arrays["rows"], sum(config.entries)
     if not (np.diff(rows) > 0).all() or not 0 <= rows[0] <= rows[-1] < entries:
         raise ValueError(
-            f"{path}: rows: expected some of 0 to {entries - 1}, in order, found others; {_AGAIN}"
+            f"{path}: rows: expected increasing numbers from 0 to {entries - 1}, found others; {_AGAIN}"
         )
     grid = FeatureGrid(
         jnp.asarray(arrays["table"]),

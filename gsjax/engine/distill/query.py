@@ -100,13 +100,13 @@ class QueryableField(Queryable):
         return {"image": image, "camera": question.camera, "scene": str(self.run.file)}
 
     def draw(self, folder: Path, found: Selection, notes: Notes, console: Console) -> dict[str, int]:
-        """Writes masks/CAMERA.png, 255 where more than half of a pixel's light is of the selected Gaussians,
-        and overview.png of the photograph that shows most: it, a heat map of the scores, and the scenes
-        without what was found, it alone, recoloured, moved.
+        """Writes masks/CAMERA.png, 255 where more than half of a pixel's light comes from the selected
+        Gaussians, and overview.png, for the photograph that shows most of them: the photograph, a heat map of
+        the scores, and the scenes with the selected Gaussians removed, alone, recoloured and moved.
 
-        All are drawn by one program for each size of picture, with one colour a Gaussian, because compiling
-        takes longer than drawing. What is not to be seen is hidden, not left out, so the number of Gaussians
-        stays the same."""
+        All are drawn by one program for each size of picture, with one colour per Gaussian, because compiling
+        takes longer than drawing. Gaussians that should not be seen are made invisible rather than removed,
+        so their number stays the same."""
         run, question, photographs = self.run, found.question, self.run.photographs
         if photographs is None:
             return {}
@@ -184,7 +184,9 @@ class QueryableField(Queryable):
         width, height = (int(side) for side in photographs.sizes[v])
         x, y = question.point
         if not (0 <= x < width and 0 <= y < height):
-            raise ValueError(f"--point: expected one in {width}x{height} pixels, found {x:g},{y:g}")
+            raise ValueError(
+                f"--point: expected a pixel of the {width}x{height} photograph, found {x:g},{y:g}"
+            )
         field, located = run.stored.placed
         view, plan = frozen_views(run.gaussians, [photographs.camera(v)], run.rasterize_mode)[0]
         row, below = divmod(int(y), plan.tile_size)
@@ -192,7 +194,10 @@ class QueryableField(Queryable):
         pixel = jnp.array([[int(x), below]])
         features, alphas = jax.jit(pixel_features)(field, located, strip, strip_plan, pixel)
         if float(alphas[0]) < _LEAST_ALPHA:
-            raise ValueError(f"--point {x:g},{y:g}: expected something of the scene, found nothing there")
+            raise ValueError(
+                f"--point {x:g},{y:g}: expected a pixel that shows the scene, found an empty one; choose "
+                "another"
+            )
         return np.asarray(features[0])
 
 

@@ -142,14 +142,14 @@ def _out(options: Options, scene: Path) -> Path:
     out = options.scene / FOLDER if options.out is None else options.out
     if any(place.is_relative_to(out.resolve()) for place in (scene.resolve(), scene.parent.resolve())):
         raise ValueError(
-            f"--out {out}: expected a folder for the field alone, found one with its scene, {scene}, in it; "
-            "name another"
+            f"--out {out}: expected a folder for the field alone, found the one that contains its scene, "
+            f"{scene}; name another"
         )
     return out
 
 
 def _note_oddities(scene: FieldScene, progress: Progress, notes: Notes) -> None:
     if progress.skipped:
-        notes.warn(f"{progress.skipped} steps met numbers that are not finite and changed nothing")
+        notes.warn(f"{progress.skipped} steps produced non-finite numbers and were skipped")
     if not len(scene.held_out):
         notes.add("No view is held out: all scores are of training views.")

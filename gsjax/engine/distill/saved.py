@@ -84,7 +84,7 @@ class FieldRun:
         """The encoder that reads texts in the space of the field's features.
 
         Raises:
-            ValueError, FileNotFoundError: as `Source.encoder`.
+            ValueError, FileNotFoundError: as for `Source.encoder`.
         """
         return self.stored.source.encoder(self.weights)
 
@@ -102,21 +102,21 @@ def open_field_run(
     Args:
         folder: the folder that holds field.npz.
         notes: receives warnings.
-        now: where things are now.
+        now: where the scene, photographs and weights are now, if they were moved.
         photographs: whether to open the photographs too.
 
     Raises:
-        FileNotFoundError: a file of it, or the scene, is missing.
-        ValueError: a file holds something else, or the field does not fit the scene; photographs that were
-            named cannot be read.
+        FileNotFoundError: a file of the field, or the scene, is missing.
+        ValueError: a file has other contents, the field does not fit the scene, or photographs named in
+            `now` cannot be read.
     """
     stored = read_field(folder / NAME)
     file = _scene_file(folder, stored, now.scene, notes)
     gaussians, report = read_drawable(file, notes)
     if stored.rows is None and len(stored.field.encoding) != gaussians.num:
         raise ValueError(
-            f"{folder}: expected the scene of its {len(stored.field.encoding)} Gaussians, found "
-            f"{gaussians.num} in {file}; --scene names another, or distil it again"
+            f"{folder}: expected a scene with the field's {len(stored.field.encoding)} Gaussians, found "
+            f"{gaussians.num} in {file}; give another with --scene, or distil the field again"
         )
     gaussians = jax.tree.map(jnp.asarray, gaussians)
     stored = replace(stored, means=gaussians.means)
@@ -132,15 +132,15 @@ def _scene_file(folder: Path, stored: DistillResult, given: Path | None, notes: 
     there = [file for file in (was, *beside) if file.is_file()] if given is None else [given]
     if not there or not there[0].is_file():
         raise FileNotFoundError(
-            f"{given or was}: expected the scene of {folder}, found no file; --scene names it"
+            f"{given or was}: expected the scene of {folder}, found no file; give it with --scene"
         )
     sha256 = stored.scene.get("sha256")  # None for a field that was distilled in Python
     fitting = (file for file in there if sha256 in (None, digest(file)))
     if (file := next(fitting, None)) is not None:
         return file
     notes.warn(
-        f"{there[0]} is not as it was when the field in {folder} was distilled; answers may be wrong "
-        "(--scene names another)"
+        f"{there[0]} has changed since the field in {folder} was distilled; answers may be wrong "
+        "(give another with --scene)"
     )
     return there[0]
 
@@ -158,7 +158,7 @@ def _photographs(
             options = _options(stored.scene.get("photographs"), folder, file, images)
         except (KeyError, TypeError, AttributeError) as error:
             raise ValueError(
-                f"{folder / NAME}: expected which photographs it learned from, found others ({error}); "
+                f"{folder / NAME}: expected the training photographs' names, found others ({error}); "
                 "distil it again with this version of gsjax"
             ) from error
         return open_scene(options, gaussians).photographs
@@ -188,7 +188,7 @@ def _tuple(value: Any) -> Any:
 
 
 def short_names(names: Sequence[str]) -> tuple[str, ...]:
-    """Short names of photographs, fit for files: for one frame of a recording, those of its cameras."""
+    """Short names of photographs, usable as file names; for one frame of a recording, its camera names."""
     parts = [name.rsplit("/", 1) for name in names]
     if all(len(part) == 2 for part in parts) and len({part[1] for part in parts}) == 1:
         short = [part[0] for part in parts]

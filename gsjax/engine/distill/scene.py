@@ -31,7 +31,7 @@ class SceneAndImages:
 
     scene: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN|SCENE.ply")]
     """Folder of a run of `gsjax fit`, `gsjax track` (its first frame) or `gsjax parts` (its canonical frame);
-    or a PLY file of any program, with --images and --out."""
+    or a PLY file from any program, with --images and --out."""
     images: str | None = None
     """Photographs of a PLY file's scene, posed in its world, of which --frames, --cameras, --eval-cameras
     and --test-every select some. For a run: the present location of its photographs."""
@@ -50,7 +50,7 @@ class FieldScene:
         file: the PLY file.
         gaussians: the scene.
         photographs: of the scene, posed as it was fitted.
-        taught: indices of the photographs to learn from.
+        taught: indices of the training photographs.
         held_out: indices of those that are only used for scores.
         rasterize_mode: as the scene was fitted: "classic" or "antialiased".
     """
@@ -71,12 +71,12 @@ def open_scene(options: SceneOptions, gaussians: Gaussians | None = None) -> Fie
         gaussians: the scene's, if they were read already.
 
     Raises:
-        ValueError, OSError: they are not there, or options are given that the run has chosen itself.
+        ValueError, OSError: they do not exist, or options are given that the run has chosen itself.
     """
     path = options.scene
     if path.is_file():
         if options.images is None:
-            raise ValueError(f"{path}: a PLY file has no photographs; --images names a folder of them")
+            raise ValueError(f"{path}: a PLY file has no photographs; give a folder of them with --images")
         chosen = {name: getattr(options, name) for name in ("frames", "cameras", "eval_cameras")}
         scene = scene_of_file(path, options.images, options.read, options.test_every, gaussians, **chosen)
     else:
@@ -125,7 +125,9 @@ def scene_of_run(path: Path, images: str | None = None, gaussians: Gaussians | N
     try:
         photographs = photographs_of_run(record.config, images)
     except DataError as error:
-        raise ValueError(f"{error} It was read for the fit; --images says where it is now") from error
+        raise ValueError(
+            f"{error} The fit read it from there; if it was moved, give its new place with --images"
+        ) from error
     photographs = _as_learned(photographs, path / "cameras.npz")
     mode = "antialiased" if record.config["fit"].get("antialiased") else "classic"
     return FieldScene(file, gaussians, photographs, *_split(photographs, record.config["test_every"]), mode)

@@ -95,7 +95,8 @@ def class_maps(
     of_gaussians: Int[np.ndarray, "n"],
     strip_megabytes: float = 256.0,
 ) -> tuple[Int[np.ndarray, "h w"], Int[np.ndarray, "h w"]]:
-    """The class of each pixel of a view, by either query; -1 where little of the scene shows.
+    """The class of each pixel of a view, from the pixel's own feature and from the classes of the Gaussians;
+    -1 where little of the scene shows.
 
     Args:
         field, located: as `gaussian_cosines` takes them.

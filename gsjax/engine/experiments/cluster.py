@@ -90,7 +90,7 @@ def run_on_cluster(
                     if debug:  # a script's own
                         raise
                     raise ValueError(
-                        f"a worker cannot load what runs a cell: {error}; start workers where gsjax "
+                        f"a worker cannot load the code of a cell: {error}; start workers where gsjax "
                         f"{experiment.made_with} is installed, as here"
                     ) from error
                 future.release()  # before its worker can die, for then Dask would compute it again
@@ -108,7 +108,7 @@ def _reporting_loss(scheduler: str) -> Iterator[None]:
         yield
     except CancelledError as error:
         raise OSError(
-            f"--scheduler {scheduler}: expected it to stay, found it gone; finished cells are kept, and the "
+            f"--scheduler {scheduler}: the connection was lost; finished cells are kept, and the "
             "same command continues from there"
         ) from error
 
@@ -194,13 +194,13 @@ def _loaded(root: str, name: str, script: str, made_with: str) -> tuple[Experime
     experiment = read_experiment(Path(root), name, Path())
     if experiment.made_with != made_with:
         raise ValueError(
-            f"expected gsjax {made_with}, as where the run was started, found {experiment.made_with}; bring "
-            "its checkout to the same state and start the worker again"
+            f"expected gsjax {made_with}, as where the run was started, found {experiment.made_with}; check "
+            "out the same version here and start the worker again"
         )
     if experiment.fingerprint != script:
         raise ValueError(
-            f"{experiment.script}: expected the script as it is where the run was started, found another; "
-            "bring this checkout to the same state"
+            f"{experiment.script}: expected the same script as where the run was started, found a different "
+            "one; check out the same version here"
         )
     return experiment, experiment.load()[0]
 
@@ -280,13 +280,14 @@ def _client(scheduler: str, workers: int | None) -> Iterator[Any]:
             client = distributed.Client(place, timeout=CONNECT_S)
         except OSError as error:
             raise OSError(
-                f"--scheduler {scheduler}: expected one of Dask, found none that answers in {CONNECT_S} s"
+                f"--scheduler {scheduler}: expected a Dask scheduler, found none that answers within "
+                f"{CONNECT_S} s; check the address"
             ) from error
         yield stack.enter_context(client)
 
 
 def slurm_cluster() -> Any:
-    """Dask's cluster of SLURM jobs, of which none is submitted yet. A job is one worker, with all its cores.
+    """Dask's cluster of SLURM jobs, with none submitted yet. A job is one worker, with all its cores.
 
     Jobs are configured in Dask's own settings: `jobqueue.slurm` of ~/.config/dask/*.yaml.
 

@@ -42,7 +42,7 @@ def run_here(
 def run_cell(
     experiment: Experiment, cell: Cell, script_run: Callable, cells_folder: Path, debug: bool = False
 ) -> dict[str, Any]:
-    """Run one cell and write its record, also if it fails; only Ctrl-C leaves none. Returns the record.
+    """Run one cell and write its record, even if it fails; only Ctrl-C leaves none. Returns the record.
 
     Args:
         experiment: the experiment.
@@ -78,10 +78,10 @@ def run_cell(
 def _check_result(result: Any, cell: Cell) -> None:
     """Raises a TypeError unless the result is a dict that JSON can hold, by names that are not reserved."""
     if not isinstance(result, Mapping):
-        raise TypeError(f"run() returned {type(result).__name__}, expected a dict of figures by name")
+        raise TypeError(f"run() returned {type(result).__name__}, expected a dict of named figures")
     for key, value in result.items():
         if not isinstance(key, str) or key in (*RESERVED, *cell.options):
-            raise TypeError(f"run() returned {key!r}, expected a name that is no option, seed or seconds")
+            raise TypeError(f"run() returned {key!r}, expected a name other than seed, seconds or an option")
         try:
             json.dumps(value, default=lambda array: array.tolist())
         except (TypeError, ValueError, AttributeError) as error:

@@ -41,8 +41,8 @@ class Table(List):
 
 @dataclass(frozen=True, kw_only=True)
 class Run(Table):
-    """Run the unfinished cells of an experiment, and collect. With --debug it stops at the first cell that
-    fails."""
+    """Run the unfinished cells of an experiment, and collect the results. With --debug it stops at the first
+    cell that fails."""
 
     seeds: Annotated[tuple[int, ...], tyro.conf.arg(metavar="SEED [SEED ...]")] = ()
     """Run only these of the config's seeds."""
@@ -53,8 +53,8 @@ class Run(Table):
     executor: Literal["local", "dask"] = "local"
     """Where cells run: in this process, one after the other, or on the workers of a Dask cluster."""
     scheduler: Annotated[str, tyro.conf.arg(metavar="processes|slurm|tcp://HOST:PORT")] = "processes"
-    """For dask: processes on this machine; SLURM jobs, by Dask's configuration jobqueue.slurm; or the address
-    of a scheduler whose workers run in checkouts like this one."""
+    """For dask: processes on this machine; SLURM jobs, as configured under jobqueue.slurm in Dask's settings;
+    or the address of a scheduler whose workers run in checkouts like this one."""
     workers: int | None = None
     """For dask: number of processes or jobs to start; default: one process per core."""
 

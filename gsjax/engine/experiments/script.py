@@ -94,8 +94,8 @@ def forget_scripts(root: Path) -> None:
 def fingerprint_of(root: Path, path: Path, text: str, version: int) -> str:
     """A fingerprint of a script, the modules beside it and the config's version.
 
-    It ignores what changes no row: the script's function `figure`, and lines that only import from gsjax or
-    from the experiments, without `as`, which change when a module moves. Rows record the versions of gsjax
+    It ignores what cannot change a row: the script's function `figure`, and lines that only import from gsjax
+    or from the experiments, without `as`, which change when a module moves. Rows record the versions of gsjax
     and of shared modules themselves.
 
     Args:

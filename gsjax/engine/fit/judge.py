@@ -38,12 +38,12 @@ class Scores:
 
 @dataclass(eq=False)
 class Judge:
-    """Renders the views of photographs and compares; all views of one size share one program.
+    """Renders the views of photographs and compares them; all views of one size share one program.
 
     Attributes:
         config: the settings of the fit.
         background: RGB behind the scene; None is black.
-        plans: a plan that is large enough, by the size of the photograph.
+        plans: a large enough plan for each size of photograph.
     """
 
     config: FitConfig
@@ -85,7 +85,8 @@ class Judge:
         )
 
     def compare(self, gaussians: Gaussians, frame: Frame) -> "Compared":
-        """The Gaussians as seen in a frame of one camera, which is on the host, beside its photograph."""
+        """The Gaussians rendered from the camera of `frame`, beside its photograph. The frame is on the host
+        and has one camera."""
         size = frame.images.shape
         drawn, self.plans[size] = self.draw(gaussians, frame.cameras, self.plans.get(size))
         image, truth = np.clip(np.asarray(drawn.colors[0]), 0, 1), frame.images[0] / 255

@@ -45,7 +45,7 @@ class Options(OfDataset):
 
     preset: Literal["default", "quick", "classic", "depth", "published"] = "default"
     """Default settings of the fit: quick (for a first impression), classic (cloning and splitting, as in
-    3DGS), depth (for RGB-D), published (those of 3DGS-MCMC, for a GPU or a night)."""
+    3DGS), depth (for RGB-D), published (those of 3DGS-MCMC, for a GPU or an overnight run)."""
     until_psnr: float | None = None
     """Stop when held-out photographs reach this PSNR, dB."""
     judge_every: int = 500
@@ -115,7 +115,7 @@ def run(options: Options) -> int:
                 if gaussians.num < before:
                     notes.add(
                         f"{before - gaussians.num:,} of {before:,} Gaussians were removed at the end: "
-                        f"together they sent at most {config.prune:.2%} of the light into any photograph."
+                        f"together they gave at most {config.prune:.2%} of the light of any photograph."
                     )
         write_ply(folder.scene, gaussians)
         with optional("scores", "scoring held-out photographs"):
@@ -218,7 +218,7 @@ def _note_oddities(
     options: Options, progress: Progress, gaussians: Gaussians, finished: bool, notes: Notes
 ) -> None:
     if progress.skipped:
-        notes.add(f"{progress.skipped} steps were not finite and changed nothing.")
+        notes.add(f"{progress.skipped} steps produced non-finite numbers and were skipped.")
     compiling, given = progress.compile_seconds, 60 * (options.minutes or np.inf)
     if compiling > given / 3:
         kept = jax.config.jax_enable_compilation_cache and jax.config.jax_compilation_cache_dir

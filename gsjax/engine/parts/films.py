@@ -255,8 +255,8 @@ def _beyond(recorded: Layer, now: Trajectory) -> Beyond:
 
 
 def _idle(script: Script, film: Film, saved: PartsRun, known: LoadScene) -> list[str]:
-    """Labels of the edits that change neither the film nor what the edits before them make: of two equal
-    ones, the second."""
+    """Labels of the edits that change neither the film nor the result of earlier edits, such as the second of
+    two equal ones."""
     length = _lasting(script, film, saved)
 
     @cache

@@ -25,7 +25,7 @@ class Loop:
         method, problem: the method and its problem.
         run: the newest run.
         progress: its progress.
-        seconds: time by stage; extended.
+        seconds: time by stage; the loops add theirs.
         folder: of the run.
         notes: collects warnings.
         console: shows the progress.
@@ -73,7 +73,7 @@ class Loop:
             self.run = self.method.brought_up_to_date(self.problem, self.run)
         self.seconds["finish"] = perf_counter() - begun
         if not np.asarray(self.run.kept.weights)[:, 1:].any():
-            self.notes.warn("no picture needs any part; the result is the canonical scene")
+            self.notes.warn("no part is needed to explain the pictures; the result is the canonical scene")
 
     def refine(self) -> None:
         """Fit the scene and all poses to all frames, until it is stopped. An OSError ends it early, and the
@@ -97,7 +97,7 @@ class Loop:
             if isinstance(stopped, OSError):
                 self.progress.stopped = None
         if lost := self.progress.skipped - skipped:
-            self.notes.warn(f"{lost} of {done} steps of the refinement were not finite and changed nothing")
+            self.notes.warn(f"{lost} of {done} refinement steps produced non-finite numbers and were skipped")
 
     def _watch(self, schedule: Schedule) -> None:
         """Run to the last step of a schedule."""

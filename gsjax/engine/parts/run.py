@@ -48,13 +48,14 @@ class Options(Seeded, SamWeights, OfRecording):
     """Options of `gsjax parts`."""
 
     anchor: int | None = None
-    """Index of the canonical frame among those frames, from 0. Default: the one that differs most."""
+    """Index of the canonical frame among the selected frames, from 0. Default: the frame that differs most
+    from the others."""
     masks: Literal["segment", "files"] = "segment"
     """Where the pieces in the anchor's pictures come from: a segmenter, or the recording's own masks, whose
     labels must mean the same in all cameras."""
     scene: Path | None = None
-    """The scene at the anchor, which must then be given: a PLY file, or a run of `gsjax fit`. Default: it is
-    fitted, into RUN/canonical."""
+    """The scene at the anchor: a PLY file, or a run of `gsjax fit`; requires --anchor. Default: it is fitted,
+    into RUN/canonical."""
     fit: FitConfig = FIT
     """How the canonical scene is fitted."""
     parts: PartsConfig = field(default_factory=PartsConfig)
@@ -141,8 +142,8 @@ def _check(options: Options, recording: Recording) -> None:
     inside = options.scene is not None and options.out.resolve() in options.scene.resolve().parents
     if inside and options.overwrite:
         raise ValueError(
-            f"--scene {options.scene}: expected one outside of --out, which --overwrite replaces, found it "
-            "in there; name another --out"
+            f"--scene {options.scene}: expected one outside --out, which --overwrite replaces, found one "
+            "inside it; name another --out"
         )
     if options.scene is not None and options.anchor is None:
         raise ValueError("--scene: expected --anchor too, the frame that it shows, found none")
@@ -165,8 +166,8 @@ def _masks(
     masks = masks_from_labels(np.stack(known), moved, options.parts.discover.most_parts)
     if not masks.any():
         raise ValueError(
-            "--masks files: expected a label of which a third of the pixels changes in other frames, found "
-            "none; use --masks segment"
+            "--masks files: expected a label with at least a third of its pixels changed in other frames, "
+            "found none; use --masks segment"
         )
     return masks
 

@@ -88,7 +88,7 @@ def read_parts(path: str | Path) -> tuple[Layer, Names]:
     """The scene of a run with its parts, and their names, without opening its recording.
 
     Raises:
-        FileNotFoundError, ValueError: as `open_parts_run`.
+        FileNotFoundError, ValueError: as for `open_parts_run`.
     """
     layer, names, _ = _read(Path(path))
     return layer, names
@@ -104,7 +104,7 @@ def _read(path: Path) -> tuple[Layer, dict[str, int], bool]:
                 f"{path}: expected a run of `gsjax parts`, found one of `gsjax {kind}`; name another folder"
             )
         raise FileNotFoundError(
-            f"{path}: expected a whole run of `gsjax parts`, found no {missing[0]}; {_AGAIN}"
+            f"{path}: expected a complete run of `gsjax parts`, found no {missing[0]}; {_AGAIN}"
         )
     arrays = _arrays(path / "parts.npz")
     num, parts = arrays["weights"].shape

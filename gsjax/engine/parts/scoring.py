@@ -23,7 +23,7 @@ _STILL_MM = 2.0  # a true part that moves less cannot be found by its motion, an
 def part_rows(
     scene: PartScene, trajectory: Trajectory, joints: dict[int, FittedJoint]
 ) -> list[dict[str, Any]]:
-    """A row for each part, with what is known without the truth.
+    """A row for each part, with what is known without ground truth.
 
     Args:
         scene: the parts.

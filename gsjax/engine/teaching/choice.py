@@ -23,9 +23,9 @@ class TeacherOptions(SamWeights, ClipWeights):
     features: str = "auto"
     """Features to learn: classes (a code for each class of the mask files), closed (colour and outline of
     each mask; no foundation model), clip or maskclip (with --weights), or a folder of feature files
-    (LangSplat's, Feature-3DGS's, LERF's, .npy, .npz; named as the pictures, or by frame number). auto:
-    classes if there are mask files, else closed. For gsjax deform also none, which is its auto where masks
-    have fewer than two classes among the pixels that count."""
+    (LangSplat's, Feature-3DGS's, LERF's, .npy, .npz; named like the pictures, or by frame number). auto:
+    classes if there are mask files, else closed. gsjax deform also accepts none, and its auto means none if
+    the pixels that count have fewer than two mask classes."""
     masks: Masks = "auto"
     """Source of the masks: the recording's own files, or a segmenter without weights. auto: files, if any."""
     level: Level = "default"
@@ -37,11 +37,11 @@ class TeacherChoice(TeacherOptions):
     """Which masks and features teach, with what `gsjax distill` alone offers."""
 
     second: Second = "none"
-    """Second teacher beside --features clip, which knows of masks alone: maskclip, CLIP's vectors of patches,
-    by the same --weights. Its weight is --distill.weights.map."""
+    """Second teacher beside --features clip, which gives one vector per mask: maskclip gives CLIP's vector of
+    each patch, from the same --weights. The weight of its loss is --distill.weights.map."""
     snap: int = 0
-    """Move outlines of masks to the picture's edges, where there are any within this many pixels: for masks
-    whose outlines are off, as many segmenters' are."""
+    """Snap the outlines of masks to edges in the picture up to this many pixels away, for masks with inexact
+    outlines, such as those of many segmenters."""
 
     @property
     def of_files(self) -> bool:
@@ -62,7 +62,7 @@ class TeacherChoice(TeacherOptions):
 
         Raises:
             ValueError: options contradict each other.
-            FileNotFoundError: a folder is not there.
+            FileNotFoundError: a folder does not exist.
         """
         known = ("auto", *KINDS, *((NO_TEACHER,) if optional else ()))
         if self.features not in known and not (self.of_files and Path(self.features).is_dir()):
@@ -95,7 +95,7 @@ class TeacherChoice(TeacherOptions):
             )
         if self.second != "none" and self.features != "clip":
             raise ValueError(
-                f"--second {self.second}: expected --features clip, whose second teacher it is, found "
+                f"--second {self.second}: expected --features clip, which it complements, found "
                 f"{self.features}"
             )
 

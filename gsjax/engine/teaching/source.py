@@ -61,10 +61,10 @@ class Source:
 
         Raises:
             ValueError: there is none, a package is missing, or weights are given for one that has none.
-            FileNotFoundError: the weights are not there.
+            FileNotFoundError: the weights do not exist.
         """
         if self.kind in ("classes", "closed") and weights is not None:
-            raise ValueError(f"--weights: features of {self.kind} have none; leave it out")
+            raise ValueError(f"--weights: expected none, as features of {self.kind} need none; leave it out")
         if self.kind == "classes":
             return ClassCodebook(self.names)
         if self.kind == "closed":
@@ -72,14 +72,14 @@ class Source:
         if self.kind == "files" and weights is None:
             raise ValueError(
                 "these features are from files, and no encoder of their texts is known; if they are CLIP's, "
-                "--weights names its folder; else ask by --point, or in gsjax view for what is picked"
+                "give its folder with --weights; else query by --point, or by a click in gsjax view"
             )
         from gsjax.perception.clip import load_clip
 
         try:
             return load_clip(weights or str(self.weights))
         except FileNotFoundError as error:
-            raise FileNotFoundError(f"{error}; --weights says where they are now") from error
+            raise FileNotFoundError(f"{error}; give their folder with --weights") from error
 
     def hint(self, weights: Path | None = None) -> str:
         """The queries that the encoder reads, in words.

@@ -50,7 +50,7 @@ class Teaching:
     from, so that held-out photographs have features in the same terms.
 
     Attributes:
-        teacher: features of the photographs to learn from, in their order.
+        teacher: features of the training photographs, in their order.
         source: the source of these features.
         masks: source of the masks: "files", "segment", "sam", "in the feature files", or "none".
         about: the features in words.
@@ -68,14 +68,14 @@ class Teaching:
 
         Args:
             photographs: of the scene.
-            indices: indices of those to learn from.
+            indices: indices of the training photographs.
             choice: the masks and features; checked.
             cache: earlier outputs.
             console: shows the progress.
 
         Raises:
             ValueError: there are no masks, feature files do not fit, or a package is missing.
-            FileNotFoundError: files of features or weights are not there.
+            FileNotFoundError: files of features or weights do not exist.
         """
         self._photographs, self._indices = photographs, list(indices)
         self._choice, self._cache = choice, cache
@@ -130,7 +130,7 @@ class Teaching:
         return content_digest("lesson", arrays)
 
     def _taught(self, views: list[_View] | None, console: Console) -> Teacher:
-        """The teacher of the photographs to learn from."""
+        """The teacher of the training photographs."""
         found = self._features(self._indices, views, console)
         if isinstance(found, Teacher):
             return found
@@ -212,7 +212,7 @@ class Teaching:
         return self._cache(self._encoder_key, {"image": image, **view._asdict()}, embed)["rows"]
 
     def _of_patches(self, indices: Sequence[int], views: list[_View] | None, console: Console) -> Teacher:
-        """MaskCLIP's maps; masks, where there are any, say which pixels are one thing."""
+        """MaskCLIP's maps; masks, if any, define which pixels form one object."""
         from gsjax.perception.maskclip import MaskClipEncoder
 
         encoder, maps = MaskClipEncoder(self._encoder), []
@@ -250,7 +250,7 @@ def teacher_for(photographs: Photographs, wanted: Teacher | TeacherChoice | str)
         wanted: the teacher itself, a choice of one, or its features as `TeacherChoice.features` has them.
 
     Raises:
-        ValueError, FileNotFoundError: as `TeacherChoice.check` and `Teaching`.
+        ValueError, FileNotFoundError: as for `TeacherChoice.check` and `Teaching`.
     """
     if isinstance(wanted, Teacher):
         return wanted, Source("files")
@@ -271,8 +271,8 @@ def _settled(choice: TeacherChoice, files: bool, name: str) -> tuple[Any, str]:
         kind = "classes" if masks == "files" else "closed"
     if kind == "classes" and masks != "files":
         raise ValueError(
-            "--features classes: they are the classes of mask files, and masks here are a segmenter's; use "
-            "closed, or clip with its --weights"
+            "--features classes: expected mask files, whose classes are learned, found a segmenter's masks; "
+            "use closed, or clip with its --weights"
         )
     if kind not in _OF_OBJECTS and choice.masks == "auto" and choice.sam is None:
         masks = "none"
@@ -317,7 +317,7 @@ def _ids(views: list[_View] | None) -> list[np.ndarray] | None:
 
 
 def _expect_shape(one: PictureFeatures, photographs: Photographs, i: int) -> None:
-    """Raises a ValueError where a file belongs to a picture of another shape."""
+    """Raises ValueError if a file belongs to a picture of another shape."""
     width, height = (int(side) for side in photographs.sizes[i])
     rows, columns = np.shape(one.ids if one.map is None else one.map)[:2]
     # A grid of square patches leaves up to one of them at the far side of each axis.
@@ -325,7 +325,7 @@ def _expect_shape(one: PictureFeatures, photographs: Photographs, i: int) -> Non
     if abs(np.log((columns / rows) / (width / height))) > stretch:
         what, axes = ("masks", "[H,W]") if one.map is None else ("features", "[h,w,C]")
         raise ValueError(
-            f"{one.path}: expected {what} {axes}, as wide for their height as {photographs.names[i]}, "
+            f"{one.path}: expected {what} {axes} with the aspect ratio of {photographs.names[i]}, "
             f"{width}x{height}, found {columns}x{rows}; are axes swapped?"
         )
 

@@ -43,7 +43,7 @@ class Options(Seeded, ObjectQuery):
     """Options of `gsjax grasp`."""
 
     ignore: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME [NAME ...]")] = ("robot",)
-    """Objects that are no obstacles, such as the grasping arm; names that the run does not have are ignored
+    """Objects that are not obstacles, such as the grasping arm; names that the run does not have are ignored
     by default. Without a name, all objects are obstacles."""
     approach: tuple[float, float, float] | None = None
     """Direction of approach in the world: 0 0 -1 is from above if z is up; default: any."""
@@ -64,7 +64,7 @@ def run(options: Options) -> int:
     """Find the grasps, and write grasp/ into the run folder; returns the exit code.
 
     Raises:
-        ValueError, OSError: there is no such run or encoder, or the text means none of the objects.
+        ValueError, OSError: there is no such run or encoder, or no object matches the text.
     """
     options = checked(options)
     console = Console(stderr=True, highlight=False)

@@ -69,7 +69,7 @@ def ask_for_object(options: ObjectQuery, console: Console) -> None:
     """Answer, and write query/ into the run folder.
 
     Raises:
-        ValueError, OSError: there is no such run or encoder, or the text means none of the objects.
+        ValueError, OSError: there is no such run or encoder, or no object matches the text.
     """
     with Notes(console) as notes:
         saved, answer = ask(options, console, notes)
@@ -114,7 +114,7 @@ def ask(options: ObjectQuery, console: Console, notes: Notes) -> tuple[SavedRun,
         notes: for warnings.
 
     Raises:
-        ValueError, OSError: as `ask_for_object`.
+        ValueError, OSError: as for `ask_for_object`.
     """
     _check_encoder(options)
     saved = open_run(options.run)
@@ -131,8 +131,8 @@ def ask(options: ObjectQuery, console: Console, notes: Notes) -> tuple[SavedRun,
     if not match.found:
         listed = ", ".join(f"{name} {score:.2f}" for name, score in _ranked(scores))
         raise ValueError(
-            f"{options.text!r} means none of the objects of {saved.path}: its best cosine is "
-            f"{max(scores.values()):.2f}, and {min_score:.2f} is required. There are: {listed}"
+            f"{options.text!r} matches none of the objects of {saved.path}: its best cosine is "
+            f"{max(scores.values()):.2f}, and {min_score:.2f} is required. The objects are: {listed}"
         )
     if margin < _CLOSE:
         second = _ranked(scores)[1][0]
@@ -178,7 +178,9 @@ def _check_encoder(options: ObjectQuery) -> None:
             "--encoder clip: expected --weights PATH as well, a folder of CLIP's weights, found none"
         )
     if options.encoder == "closed" and options.weights is not None:
-        raise ValueError("--weights: the closed vocabulary has none; they are for --encoder clip")
+        raise ValueError(
+            "--weights: expected none with the closed vocabulary; leave it out, or use --encoder clip"
+        )
 
 
 def _encoder(options: ObjectQuery, saved: SavedRun) -> LanguageEncoder:

@@ -56,10 +56,11 @@ class Options(FirstMasks, OfRecording):
     """Options of `gsjax track`."""
 
     budget_ms: float | None = None
-    """Time that an update may take, milliseconds. Settings are then chosen by measured cost; of the tracker's
-    own, only the start of the scene, the limit of what may join it, and the seed are used."""
+    """Time that an update may take, milliseconds. Settings are then chosen by measured cost; of those under
+    --track, only the initial scene, the limit on its growth, and the seed are used."""
     preset: Literal["accurate", "balanced", "fast", "paper"] = "accurate"
-    """Default settings of the tracker: for small errors, between, for 30 Hz, or as in the paper."""
+    """Default settings of the tracker: for small errors (accurate), for 30 Hz (fast), between the two
+    (balanced), or as in the paper."""
     track: TrackConfig = field(default_factory=TrackConfig)
     """The tracker's own settings."""
 
@@ -156,10 +157,10 @@ def _judge(
     console: Console,
     budget_ms: float | None,
 ) -> tuple[dict[str, Any], dict[str, list[Media]], Exception | None]:
-    """Render and score what was tracked. Ctrl-C or an error ends it; what was scored until then counts.
+    """Render and score what was tracked. Ctrl-C or an error ends it; what was scored by then counts.
 
     Returns:
-        metrics.json but for seconds and notes; the plots and images of the report; and what ended the scoring
+        metrics.json without seconds and notes; the plots and images of the report; and what ended the scoring
         early, or None.
     """
     begun = perf_counter()
@@ -274,7 +275,7 @@ def _note_what_is_missing(
             f"no settings keep the budget on this machine; {tracking.chosen.name} take {base} an update"
         )
     if tracking.skipped:
-        notes.add(f"{tracking.skipped} updates gave numbers that are not finite and were left out.")
+        notes.add(f"{tracking.skipped} updates produced non-finite numbers and were skipped.")
 
 
 def _note_what_was_lost(

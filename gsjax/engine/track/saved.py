@@ -49,13 +49,13 @@ def open_run(path: Path) -> SavedRun:
     """Read the folder of a run.
 
     Raises:
-        FileNotFoundError: there is no such folder, it is no run's, or a file of it is missing.
+        FileNotFoundError: there is no such folder, it is not a run's, or one of its files is missing.
         ValueError: a file is not as the run wrote it, or its recording cannot be opened.
     """
     expect_run(path, made_by="`gsjax track`")
     missing = [n for n in ("trajectory.npz", "scene.ply", "metrics.json") if not (path / n).is_file()]
     if missing:
-        raise FileNotFoundError(f"{path}: expected a whole run, found no {missing[0]}; {_AGAIN}")
+        raise FileNotFoundError(f"{path}: expected a complete run, found no {missing[0]}; {_AGAIN}")
     tracking = read_tracking(path)
     recording, _ = reopen(path / "config.yml", _AGAIN)
     if recording.tracked.num_frames < tracking.num_frames:

@@ -118,7 +118,7 @@ def budget_metrics(chosen: Chosen) -> dict[str, Any]:
 
 
 def object_names(tracking: Tracking, recording: Recording, values: np.ndarray | None) -> dict[int, str]:
-    """The name of each object that is tracked or in the truth, by label, background left out.
+    """The name of each object that is tracked or in the ground truth, by label, without the background.
 
     Args:
         tracking: the scene.

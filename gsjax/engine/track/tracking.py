@@ -116,7 +116,8 @@ def _ticks(
 def _begun(
     method: Track, scene: TrackedScene, first: Frame, after: Tick | None, anew: bool = False
 ) -> tuple[FrameShape, Run]:
-    """A run before its next frame; `anew` keeps only the scene of `after`, whose state has other settings."""
+    """A run before its next frame; `anew` keeps only the scene of `after`, because its state belongs to other
+    settings."""
     if after is None:
         return method.start(scene, first)
     if anew:

@@ -1,4 +1,4 @@
-"""Answers to questions on a deforming scene (SurstSplat, section 3.2; GaussianClin, section 4.3).
+"""Answers to questions about a deforming scene (SurstSplat, section 3.2; GaussianClin, section 4.3).
 
 The papers give the scene's features to Med-LLaVA and have GPT-4 judge its sentences. Here the answers rest on
 facts, numbers measured in the scene: by default from templates for ten types of question, whose values can be
@@ -39,14 +39,14 @@ class TemplatedAnswerer:
         """The answer.
 
         Raises:
-            ValueError: as `parse_question`, or a frame is not among the facts.
+            ValueError: as for `parse_question`, or a frame is not among the facts.
         """
         asked = parse_question(question, facts.names)
         return _ANSWERS[asked.kind](asked, facts, rows_of(asked, facts.frames))
 
 
 def _absent(asked: Question, facts: SceneFacts, row: int) -> str | None:
-    """A sentence on the things in question that are not in view in a frame; None if all are."""
+    """A sentence that names the things asked about that are not visible in a frame; None if all are."""
     missing = [facts.names[k] for k in asked.things if not facts.present(row, k)]
     return f"There is no {' and no '.join(missing)} in frame {facts.frames[row]}." if missing else None
 
@@ -76,7 +76,8 @@ def _place(asked: Question, facts: SceneFacts, rows: list[int]) -> Answer:
 
 
 def part_of_picture(x: float, y: float) -> str:
-    """The name of the ninth of the image that a place is in; x from the left, y from the top, 0 to 1."""
+    """The name of the cell of a 3x3 grid over the image that contains a place; x from the left, y from the
+    top, 0 to 1."""
     column, row = (min(2, int(3 * v)) for v in (x, y))
     name = f"{('upper', 'middle', 'lower')[row]} {('left', 'middle', 'right')[column]}"
     return "centre" if name == "middle middle" else name

@@ -56,7 +56,7 @@ class SceneFacts:
 
     Attributes:
         names: names of the classes.
-        frames: the recording's numbers of the frames, in order.
+        frames: frame numbers in the recording, in order.
         times: their times, 0 to 1 over the recording.
         unit: unit of lengths: "mm", or "% of the depth" for a scene of unknown scale.
         gaussians: number of Gaussians of each class, in the whole scene.

@@ -109,14 +109,14 @@ def text_prompt(
     prompt = encoded_prompt(meaning.source, text, negatives, lambda: loaded)
     if prompt.vectors.shape[1] != len(meaning.basis):
         raise ValueError(
-            f"expected texts of {len(meaning.basis)} numbers like these features, found "
+            f"expected texts of {len(meaning.basis)} numbers as in these features, found "
             f"{prompt.vectors.shape[1]}: --weights are those of another encoder"
         )
     return prompt._replace(vectors=_normalized(prompt.vectors) @ meaning.basis)
 
 
 def feature_prompt(meaning: Meaning, feature: Float[np.ndarray, "c"]) -> Prompt:
-    """The prompt of a feature, in place of the code that is most similar to it; the other codes are its
+    """The prompt for a feature, which replaces the code most similar to it; the other codes are its
     negatives."""
     codebook = np.array(meaning.codebook)
     row = int(np.asarray(prompt_probabilities(jnp.asarray(feature), jnp.asarray(codebook))).argmax())
@@ -134,7 +134,7 @@ def _row_of(names: tuple[str, ...], text: str) -> int:
 
 
 def _name_prompt(meaning: Meaning, vectors: Float[np.ndarray, "k c"], row: int) -> Prompt:
-    """The prompt of the vector in a row; the other rows are its negatives."""
+    """The prompt for the name in one row of `vectors`; the other rows are its negatives."""
     others = [other for other in range(len(vectors)) if other != row]
     negatives = tuple(meaning.names[other] for other in others)
     ordered = _normalized(vectors)[[row, *others]]

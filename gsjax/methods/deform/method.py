@@ -107,8 +107,8 @@ class Deform:
             frames: frames of one camera over time, all of one size, on the host. If none has depth, the scene
                 is initialized on a plane.
             lesson: a teacher's labels of these frames, with codes of `config.channels` numbers.
-            first: index of the frame that the canonical scene is initialized from (default: the first that it
-                can be, `can_start_from`).
+            first: index of the frame from which the canonical scene is initialized (default: the first for
+                which `can_start_from` holds).
             gaussians: initial canonical Gaussians; invalid ones are removed (default: from depth, or on the
                 plane).
             timeline: frames of the whole recording, for the result (default: `frames`).
@@ -152,7 +152,7 @@ class Deform:
         return deform_step(self.config, self.extra_losses)
 
     def total(self, problem: Problem) -> int:
-        """Number of steps, those of the warm-up and the joint ones."""
+        """Total number of steps: warm-up steps and joint steps."""
         return self.config.warmup + self.config.iterations
 
     def between(self, problem: Problem, run: Run, progress: float) -> Run:
@@ -286,13 +286,14 @@ def _check(frames: Sequence[Frame], config: DeformConfig, lesson: Lesson | None)
     for i, frame in enumerate(frames):
         if frame.images.shape != shape or len(frame.images) != 1:
             raise ValueError(
-                f"frames: expected one image {shape[1:]} like the first, found {frame.images.shape} in {i}"
+                f"frames: expected one image {shape[1:]} like the first, found {frame.images.shape} in frame "
+                f"{i}"
             )
         for name in ("masks", "depths"):
             value = getattr(frame, name)
             if value is not None and value.shape != shape[:3]:
                 raise ValueError(
-                    f"frames: expected {name} {shape[:3]} like images, found {value.shape} in frame {i}"
+                    f"frames: expected {name} {shape[:3]} to match images, found {value.shape} in frame {i}"
                 )
     if not any(frame.masks is None or frame.masks.any() for frame in frames):
         raise ValueError("masks: expected pixels that count, found none in any frame; are masks inverted?")
@@ -303,8 +304,8 @@ def _check(frames: Sequence[Frame], config: DeformConfig, lesson: Lesson | None)
     for i, ids in enumerate(lesson.ids):
         if ids.max(initial=-1) >= len(lesson.codebook):
             raise ValueError(
-                f"lesson: expected ids of {len(lesson.codebook)} rows of the codebook, or -1, found "
-                f"{ids.max()} in frame {i}"
+                f"lesson: expected ids below {len(lesson.codebook)}, the number of rows of the codebook, "
+                f"found {ids.max()} in frame {i}"
             )
     if lesson.codebook.shape[1] != config.channels:
         raise ValueError(

@@ -61,5 +61,5 @@ def region_feature(
         )
     region = np.s_[int(y0) : int(y1) + 1, int(x0) : int(x1) + 1]
     if alphas[region].mean() < _LEAST_ALPHA:
-        raise ValueError("expected something of the scene, found nothing there")
+        raise ValueError("expected pixels that show the scene, found empty ones; choose others")
     return drawn[region].mean(axis=(0, 1))

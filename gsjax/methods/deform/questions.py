@@ -1,4 +1,4 @@
-"""Questions on a deforming scene in plain English: ten types, parsed by templates."""
+"""Questions about a deforming scene in plain English: ten types, parsed by templates."""
 
 import re
 from collections.abc import Sequence
@@ -19,7 +19,8 @@ class QuestionType(NamedTuple):
         example: an example, with X and Y for things, F and G for frames.
         gives: the kind of value, and its unit.
         frames: number of frames that the question names.
-        forms: regular expressions of the question without frames and articles; groups x and y are things.
+        forms: regular expressions that match the question once frames and articles are removed; groups x and
+            y are things.
     """
 
     name: str

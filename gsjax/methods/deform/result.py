@@ -24,7 +24,7 @@ class Timeline(NamedTuple):
 
     Attributes:
         times: times of the frames, 0 to 1.
-        frame_ids: the recording's numbers of the frames.
+        frame_ids: frame numbers in the recording.
         seconds: duration of the recording.
         viewmats: view matrices of the training camera in each frame: world to camera, OpenCV axes; refined
             if poses were.
@@ -47,7 +47,7 @@ class Timeline(NamedTuple):
 
 
 def timeline_of(frames: Sequence[Frame]) -> Timeline:
-    """The timeline of frames alone: numbered from 0, one second long, and metric where any has depth."""
+    """A timeline from frames alone: numbered from 0, one second long, and metric if any frame has depth."""
     cameras = jax.tree.map(
         lambda *arrays: np.concatenate(arrays).astype(np.float64), *(frame.cameras for frame in frames)
     )

@@ -83,7 +83,7 @@ class Batch(NamedTuple):
     Attributes:
         frame: frame of one camera, with a mask and a time.
         view: row of the camera's twist; -1 for a camera that is not refined. None if no poses are.
-        ids: row of the codebook of each of the teacher's pixels, -1 for none; None without a teacher.
+        ids: row of the codebook for each of the teacher's pixels, -1 for none; None without a teacher.
         codebook: the teacher's features, in the scene's channels.
         moving: where the field is evaluated.
         graph: graph of the frame and those around it; None without.

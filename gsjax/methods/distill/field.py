@@ -60,7 +60,7 @@ class RenderedFeatures(NamedTuple):
     head: Float[Array, "channels hidden+1"] | None
 
     def channels_of(self, rendered: Float[Array, "*pixels r"]) -> Float[Array, "*pixels channels"]:
-        """F' from the output of `joined`."""
+        """F', the feature image in the field's channels, from the rendered output of `joined`."""
         if self.head is None:
             return rendered
         return jnp.matmul(rendered, self.head.T, precision="highest")

@@ -57,18 +57,20 @@ class DistillResult:
         return self.at(self.means)
 
     def at(self, means: Float[Array, "n 3"]) -> tuple[FeatureField, Located | None]:
-        """The field and the locations of other Gaussians in it.
+        """The field, and the locations in it of Gaussians other than its own.
 
         Args:
             means: centres of the Gaussians, metres.
 
         Raises:
-            ValueError: the field has a vector for each Gaussian, and their number differs.
+            ValueError: the field stores one vector per Gaussian, and there are not as many means as vectors.
         """
         encoding, rows = self.field.encoding, self.rows
         if not isinstance(encoding, FeatureGrid):
             if len(encoding) != len(means):
-                raise ValueError(f"means: expected {len(encoding)}, one per vector, found {len(means)}")
+                raise ValueError(
+                    f"means: expected {len(encoding)} centres, one per vector, found {len(means)}"
+                )
             return self.field, None
         assert rows is not None
         located = locate(encoding, means)
@@ -154,8 +156,8 @@ class DistillResult:
         queries = jnp.asarray(vectors, self.field.lift.dtype)
         if queries.shape[1] != self.field.dimension:
             raise ValueError(
-                f"expected a query of {self.field.dimension} numbers like this field's features, found "
-                f"{queries.shape[1]}: it comes from another encoder (--weights)"
+                f"expected a query of {self.field.dimension} numbers, as in this field's features, found "
+                f"{queries.shape[1]}; use the encoder that the field was distilled from (--weights)"
             )
         return queries
 

@@ -69,7 +69,9 @@ def teacher_of_objects(masks: Sequence[np.ndarray], embeddings: Sequence[np.ndar
             )
         if not np.isfinite(rows).all():
             bad = sorted(set(np.nonzero(~np.isfinite(rows))[0].tolist()))
-            raise ValueError(f"embeddings of view {v}: expected numbers, found NaN or infinity in rows {bad}")
+            raise ValueError(
+                f"embeddings of view {v}: expected finite numbers, found NaN or infinity in rows {bad}"
+            )
         if np.max(mask, initial=-1) >= len(rows):
             raise ValueError(
                 f"embeddings of view {v}: expected a row for each of the labels 0 to {np.max(mask)}, found "
@@ -110,7 +112,7 @@ def teacher_of_maps(
         if np.ndim(one) != 3 or np.shape(one)[-1] != dimension:
             raise ValueError(f"maps of view {v}: expected [h, w, {dimension}], found {_kind(one)}")
         if not np.isfinite(one).all():
-            raise ValueError(f"maps of view {v}: expected numbers, found NaN or infinity")
+            raise ValueError(f"maps of view {v}: expected finite numbers, found NaN or infinity")
         stretch = (one.shape[1] / one.shape[0]) / (width / height)
         # A grid of square patches may omit up to one of them at the end of each axis.
         if abs(np.log(stretch)) > np.log(1 + 1.5 / min(one.shape[:2])):

@@ -37,7 +37,7 @@ def label_votes(
 def majority_labels(
     views: Sequence[tuple[FrozenView, Plan]], ids: Sequence[np.ndarray], count: int, num: int
 ) -> Int[np.ndarray, "n"]:
-    """The label with most votes over all views, for each of `num` Gaussians; -1 for one without votes.
+    """The label with the most votes over all views, for each of `num` Gaussians; -1 for one without votes.
 
     Args:
         views: frozen views with their plans.

@@ -89,8 +89,8 @@ def begin(
         masks = _find_masks(sequence, gaussians, frame, plan, anchor, moved, config, segmenter)
     if not (masks > 0).any():
         raise ValueError(
-            "masks: expected a segment of which a third changes in other frames, found none; choose another "
-            "anchor, a lower discover.threshold, or discover.difference off"
+            "masks: expected a segment with at least a third of its pixels changed in other frames, found "
+            "none; choose another anchor, lower discover.threshold, or turn discover.difference off"
         )
     slots = config.discover.most_parts + 1
     logits, lifting = lift_masks(
@@ -212,8 +212,8 @@ def pixel_width(points: Float[np.ndarray, "n 3"], cameras: Camera) -> float:
 def _movable_first(
     means: Float[np.ndarray, "N 3"], weights: Float[np.ndarray, "N P"]
 ) -> tuple[Int[np.ndarray, "N"], int]:
-    """Row indices, movable Gaussians first, and the number of these: all that are not surely background, or
-    so near to a moving one that the part's border may run there."""
+    """Row indices, movable Gaussians first, and the number of movable ones. A Gaussian is movable unless it
+    is surely background, and also if it is so near to a moving one that the part's border may run there."""
     moves = weights[:, BACKGROUND] < 0.5
     tree = cKDTree(means[moves])
     spacing = np.median(tree.query(means[moves], k=2)[0][:, 1]) if moves.sum() > 1 else 0.0

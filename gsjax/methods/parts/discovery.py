@@ -231,7 +231,7 @@ def _split(run: Run, config: PartsConfig) -> Run:
 def _with_parts(
     discovery: Discovery, weights: Float[np.ndarray, "M P"], alive: Bool[np.ndarray, "P"]
 ) -> Discovery:
-    """The discovery with other living slots, and the radii of parts with these weights."""
+    """The discovery with other slots alive, and part radii to match these weights."""
     canonical = discovery.canonical
     means, centers = np.asarray(canonical.movable.means), np.asarray(canonical.centers)
     radii = jnp.asarray(radii_of(means, weights.argmax(-1), centers))

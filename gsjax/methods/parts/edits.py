@@ -2,8 +2,7 @@
 
 Each edits the given parts and leaves all others unchanged, to the bit. There are two kinds.
 
-- Edits of time (`speed`, `loop`, `freeze`, `isolate`) show parts as they were at other times. The motion
-after
+- Edits of time (`speed`, `loop`, `freeze`, `isolate`) show parts as they were at other times. Motion after
   the interval from `begin` to `end` follows the edited interval, earlier or later than it did.
 - Edits of pose and appearance (`move`, `rotate`, `redirect`, `amplify`, `scale`, `fade`, `ghost`) are applied
   by a `share`, 0 to 1: one number, or one for each moment, such as `during` returns.
@@ -141,7 +140,7 @@ def freeze(
     begin: float | None = None,
     end: float | None = None,
 ) -> Trajectory:
-    """Holds parts from `begin` to `end` as they were at `at`, from where they then continue.
+    """Holds parts from `begin` to `end` as they were at `at`; then they continue from there.
 
     Args:
         at: seconds; default: `begin`.

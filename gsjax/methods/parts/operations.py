@@ -292,8 +292,8 @@ def example_line(operation: str, parts: str) -> str:
 
 
 def describe_operation(operation: str) -> list[str]:
-    """A sentence that describes an operation, and a line for its keys, one for all that have the same
-    values."""
+    """A sentence that describes an operation, and lines for its keys; keys that take the same values share a
+    line."""
     kind, keys = OPERATIONS[operation], {}
     for f in sorted(fields(kind), key=lambda f: f.name in _COMMON):  # else as they are declared
         keys.setdefault(f.metadata["wanted"], []).append(key_of(f))

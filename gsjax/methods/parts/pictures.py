@@ -164,7 +164,7 @@ def with_part_masks(
         canonical: the canonical scene.
         weights: weights of its movable Gaussians.
         pose: poses of the handles.
-        tile: edge of the square blocks of which masks consist, pixels.
+        tile: edge of the square blocks that make up the masks, pixels.
         blend: how rotations are blended.
     """
     moves = weights[:, BACKGROUND] < 0.5

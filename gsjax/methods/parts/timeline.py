@@ -223,7 +223,7 @@ def _numbers(parts: Sequence[str | int], names: Names, num: int) -> list[int]:
 def _frame_time(times: Float[np.ndarray, "T"]) -> float:
     """Seconds from one moment to the next."""
     if len(times) < 2:
-        raise ValueError("fps: expected frames a second, as the recording is of one moment; found nothing")
+        raise ValueError("fps: expected a frame rate, as the recording has only one moment; found none")
     return float(np.median(np.diff(times)))
 
 
@@ -232,7 +232,7 @@ def _extended(times: Float[np.ndarray, "T"], step: float, until: float) -> Float
     if until / step > MOST_MOMENTS:
         found = f"{until:g} s at {1 / step:g} frames a second"
         raise ValueError(
-            f"length: expected at most {MOST_MOMENTS} moments, also between edits, found {found}; "
+            f"length: expected at most {MOST_MOMENTS} moments after each edit, found {found}; "
             "loop or echo less often, or slow down less"
         )
     more = max(0, int(np.ceil((until - times[-1]) / step - _INSTANT)) - 1)

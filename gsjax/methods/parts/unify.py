@@ -42,7 +42,7 @@ def motions_of(
 
     Args:
         rotations: rotations of P handles in T frames.
-        translations: translations of the same, metres.
+        translations: their translations, metres.
         centers: centres of rotation, metres.
     """
     return Motions(rotations, centers + translations - np.einsum("tpij,pj->tpi", rotations, centers))
@@ -132,8 +132,8 @@ class Cut(NamedTuple):
 
     Attributes:
         beyond: the points of the part that lie beyond the cut.
-        score: difference of the two sides' pulls, relative to what chance would make; above about 6 it is
-            significant.
+        score: difference between the two sides' pulls, relative to the difference expected by chance;
+            significant above about 6.
     """
 
     beyond: Bool[np.ndarray, "n"]

@@ -69,13 +69,15 @@ class AlignConfig:
     centers: int = 256
     """Gaussians of a group whose centres are aligned."""
     center_weight: float = 1.0
-    """Weight of a centre relative to a pixel. Centres prevent drift; pixels look more like the new frame."""
+    """Weight of a centre relative to a pixel. Centres prevent drift; pixels are closer in appearance to the
+    new frame."""
     pixels: int = 192
-    """Pixels of the last frame that are aligned per group and camera, and as many of its keyframe."""
+    """Pixels aligned per group and camera: this many from the last frame and as many from the group's
+    keyframe."""
     keyframe_turn: float = 0.4
-    """Turn of a group up to which the weight of its keyframe fades to 0; then it is replaced, radians."""
+    """Rotation of a group at which its keyframe, whose weight has then faded to 0, is replaced, radians."""
     max_thickness: float = 0.06
-    """Measured depth that differs from the model by more than this is of another object, metres."""
+    """Measured depth that differs from the model's by more than this belongs to another object, metres."""
     shading: float = 0.3
     """Weight of brightness relative to chroma, 0 to 1: objects that turn are lit differently."""
     widen: float = 2.0
@@ -85,13 +87,14 @@ class AlignConfig:
     spacing: float = 0.015
     """Distance between those shifts, metres."""
     everywhere: int | None = None
-    """Groups that are searched for everywhere around per frame, the worst first; default: all."""
+    """Groups per frame to search for throughout that radius, those that agree worst first; default: all."""
     turns: tuple[float, ...] = (0.2, 0.6)
-    """Turns by which the best start is varied, to either side about each principal axis, radians."""
+    """Angles by which the best start is rotated, both ways about each principal axis, radians."""
     max_step: float = 0.1
     """Longest step of one iteration, metres."""
     max_turn: float = 0.1
-    """Longest turn of one iteration, radians; 0, with refine.rotation_rate 0, allows translations only."""
+    """Largest rotation of one iteration, radians; 0, with refine.rotation_rate 0, allows translations
+    only."""
 
     def __post_init__(self):
         scales = ("color_scale", "depth_scale", "max_thickness", "widen", "spacing", "max_step")
@@ -149,11 +152,12 @@ class GrowConfig:
     reach: int = 6
     """Largest distance of those pixels from an object's outline, pixels."""
     min_gap: float = 0.008
-    """The model does not explain depth that is nearer by more than this, metres."""
+    """Measured depth nearer than the model's by more than this is not explained by the model, metres."""
     distance: float = 0.012
     """Largest distance from a pixel to a Gaussian whose object it continues, metres."""
     color: float = 0.15
-    """Largest difference of their colours, 0 to 1. The two squares add up; the background competes."""
+    """Largest difference of their colours, 0 to 1. The squares of distance and difference, each relative to
+    its limit, add up; the background competes."""
 
     def __post_init__(self):
         expect(self, "track.grow.", **dict.fromkeys(("min_gap", "distance", "color"), ABOVE_ZERO))
@@ -170,21 +174,22 @@ class TrackConfig:
     refine: RefineConfig = field(default_factory=lambda: RefineConfig(iterations=0))
     grow: GrowConfig = field(default_factory=GrowConfig)
     matching: bool = False
-    """Add the result of template matching to the starts of the alignment."""
+    """Also start the alignment from the result of template matching."""
     warm_start: bool = True
     """Start from the last frame's motion too: delta_i as it was, and D_k as one of the starts."""
     cameras: tuple[int, ...] = ()
     """Indices of the cameras to track with; default: all."""
     shrink: int = 1
-    """Factor by which images are averaged down each way before anything else."""
+    """Factor by which images are first downscaled along each axis, by averaging."""
     redraw: Literal["all", "moving"] = "moving"
     """What an update draws: the whole scene, or the moving Gaussians over a background that is drawn once."""
     coarseness: int = 1
-    """With "moving": images shrink by this factor each way, and every coarseness^2-th Gaussian is drawn."""
+    """With "moving": images shrink by this factor along each axis, and every coarseness^2-th Gaussian is
+    drawn."""
     headroom: float = 1.5
     """Capacity of the rasterizer's plans relative to what is needed at first, 1 or more."""
     seed: int = 0
-    """Seed of the random guesses where a lost object may be."""
+    """Seed of the random guesses of where a lost object may be."""
 
     def __post_init__(self):
         expect(self, "track.", headroom=(1, np.inf), coarseness=(1, np.inf), shrink=(1, np.inf))

@@ -119,7 +119,7 @@ def distill_features(
             hardly show would take whatever values compensate for others.
 
     Raises:
-        ValueError: as `project_features`; or damping is negative.
+        ValueError: as for `project_features`; or damping is negative.
     """
     if not damping >= 0:
         raise ValueError(f"damping: expected 0 or more, found {damping}")
@@ -251,7 +251,7 @@ def _checked(maps: Array | np.ndarray, frame: Frame) -> tuple[Array, Array]:
     """Finite maps, and 1 for each pixel where they were."""
     wanted = frame.images.shape[:3]
     if np.ndim(maps) != 4 or maps.shape[:3] != wanted:
-        raise ValueError(f"maps: expected shape {[*wanted, 'D']} as the images, found {np.shape(maps)}")
+        raise ValueError(f"maps: expected shape {[*wanted, 'D']} to match images, found {np.shape(maps)}")
     maps = jnp.asarray(maps, frame.images.dtype)
     valid = jnp.isfinite(maps).all(-1)
     return jnp.where(valid[..., None], maps, 0.0), valid.astype(maps.dtype)

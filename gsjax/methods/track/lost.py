@@ -3,7 +3,7 @@
 Residuals of the alignment rise while a group is getting lost, but not once it is: pixels of the last frame
 are taken from where the group was believed to be, and agree again with whatever is there. The Gaussians of
 the first frame do not: if the group is elsewhere, cameras see past them, or see other colours. So these
-decide whether a group is lost, and whether it is found again (see `recover`).
+Gaussians decide whether a group is lost, and whether it is found again (see `recover`).
 """
 
 from typing import NamedTuple

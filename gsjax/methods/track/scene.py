@@ -42,7 +42,7 @@ class TrackedScene(eqx.Module):
 
     @property
     def num_objects(self) -> int:
-        """K, the number of objects; the background is none."""
+        """K, the number of objects, without the background."""
         return len(self.label_ids) - 1
 
     @property
@@ -92,7 +92,7 @@ def labelled_cloud(
             "make one with a segmenter of gsjax.perception"
         )
     if mask.shape != depths.shape[1:]:
-        raise ValueError(f"mask: expected shape {depths.shape[1:]} as the images, found {mask.shape}")
+        raise ValueError(f"mask: expected shape {depths.shape[1:]} to match images, found {mask.shape}")
     clouds = [points_from_rgbd(*view) for view in zip(images, depths, viewmats, Ks, strict=True)]
     footprints = [depth[valid_depth(depth)] / K[0, 0] for depth, K in zip(depths, Ks, strict=True)]
     points = np.concatenate([points for points, _ in clouds])

@@ -156,7 +156,7 @@ def free_port(host: str, port: int | None) -> int:
     try:
         family, _, _, _, _ = socket.getaddrinfo(host, asked[0], type=socket.SOCK_STREAM)[0]
     except socket.gaierror as error:
-        raise OSError(f"host: {host!r} is not an address of this machine") from error
+        raise OSError(f"host: expected an address of this machine, found {host!r}") from error
     refused = OSError()
     for number in asked:
         with socket.socket(family, socket.SOCK_STREAM) as probe:

@@ -1,4 +1,4 @@
-"""The Gaussians in a browser's scene: those that stand still, and those that are sent again every frame."""
+"""The Gaussians in a browser's scene: static ones, and ones that are sent again every frame."""
 
 from typing import Any, NamedTuple
 

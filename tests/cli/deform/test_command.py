@@ -110,14 +110,14 @@ def test_a_recipe_by_its_name(gsjax, tmp_path):
     ("told", "words"),
     [
         (("--cameras", 7), "--cameras: tissue_seed0 has no camera 7; it has [0, 1]"),
-        (("--cameras", 0, 1), "--cameras: expected one to learn from, found [0, 1]"),
+        (("--cameras", 0, 1), "--cameras: expected one training camera, found [0, 1]"),
         (("--eval-cameras", 7), "--eval-cameras: tissue_seed0 has no camera 7; it has [0, 1]"),
-        (("--eval-cameras", 0, 1), "--eval-cameras: expected one to judge by, found [0, 1]"),
+        (("--eval-cameras", 0, 1), "--eval-cameras: expected one held-out camera, found [0, 1]"),
         (
             ("--cameras", 1, "--eval-cameras", 1),
             "--eval-cameras: expected a camera other than the training camera",
         ),
-        (("--test-every", 1), "--test-every: expected 0 (none) or 2 and more, found 1"),
+        (("--test-every", 1), "--test-every: expected 0 (none), or 2 or more, found 1"),
         (("--features", "classes"), "expected two classes or more among pixels that count, found 1"),
         (("--tools", "draw", "--deform.channels", 1), "--deform.channels 1: expected at least 2"),
         (("--scale", 2), "--scale: expected above 0 and at most 1"),

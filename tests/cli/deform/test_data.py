@@ -55,11 +55,11 @@ def test_tools_may_be_named_by_value():
 def test_frames_without_a_mask_are_left_out_with_the_tools_and_said():
     data, said = read(recording(masked=[0, 1, 3, 4]))
     assert (data.train, data.test) == ([0, 3, 4], [1])
-    assert "frames 2, 5, 6, 7, 8, 9 have no mask" in said
+    assert "frames 2, 5, 6, 7, 8, 9 have no tool mask" in said
     data, _ = read(recording(masked=[0, 3, 4]), tools="draw")
     assert data.train == [0, 2, 3, 4, 5, 6, 7, 8]
     assert (data.lesson.ids[1] == -1).all()  # nobody says what frame 2 shows
-    with pytest.raises(ValueError, match="expected masks of frames to learn from"):
+    with pytest.raises(ValueError, match="expected masks of training frames"):
         read(recording(masked=[1]))
 
 

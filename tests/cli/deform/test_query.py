@@ -148,7 +148,7 @@ def test_without_a_prompt_all_are_named(gsjax, run):
         (("--box", "9,9,3,3"), "--box: expected"),
         (("--box", "9,9,3"), "--box: expected X0,Y0,X1,Y1 in pixels, found '9,9,3'"),
         (("tool", "--frame", 10), "--frame: expected one of 0 to 9, found 10"),
-        (("tool", "--frames", "20:"), "--frames: 20: holds no frame of the run, which has 10"),
+        (("tool", "--frames", "20:"), "--frames: 20: selects no frame of the run, which has 10"),
         (("tool", "--threshold", 1), "--threshold: expected a finite number below 1"),
         (("tool", "--threshold", 0.99999), "best score"),
         (("tool", "--camera", 1), "--camera: a run of `gsjax deform` has no use for it"),
@@ -178,7 +178,7 @@ def test_a_run_without_names_and_one_without_a_scene(gsjax, run):
     (run / "deformation.npz").unlink()
     code, said = gsjax("query", run, "tool")
     assert code == 2
-    assert "gsjax deform goes on with --resume" in said
+    assert "continue it with gsjax deform --resume" in said
 
 
 def test_a_run_is_seen_over_time_and_asked(run):
@@ -262,5 +262,5 @@ def test_a_region_is_the_mean_of_its_pixels():
     for box, words in (((0, 0, 7, 1), "0 <= X < 7"), ((0, 3, 1, 1), "found 0,3 to 1,1")):
         with pytest.raises(ValueError, match=words):
             region_feature(drawn, alphas, box)
-    with pytest.raises(ValueError, match="nothing there"):
+    with pytest.raises(ValueError, match="found empty ones"):
         region_feature(drawn, 0.1 * alphas, (0, 0, 2, 2))

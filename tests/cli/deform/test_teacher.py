@@ -145,10 +145,12 @@ def test_files_that_do_not_fit(files, tmp_path):
         data_of(tmp_path, tmp_path)
     for t in range(10):
         np.save(tmp_path / f"{t:06d}.npy", feature_map(t, (13, 16) if t else (26, 32)))
-    with pytest.raises(ValueError, match=r"one grid in all frames, found \(frames\) 16x13 \(7\), 32x26"):
+    with pytest.raises(
+        ValueError, match=r"one grid size in all frames, found \(frames of each\) 16x13 \(7\), 32x26"
+    ):
         data_of(tmp_path, tmp_path)
     np.save(tmp_path / "000000.npy", feature_map(0, (16, 13)))
-    with pytest.raises(ValueError, match="for their height as 000000, 64x52, found 13x16; are axes swap"):
+    with pytest.raises(ValueError, match="aspect ratio of 000000, 64x52, found 13x16; are axes swap"):
         data_of(tmp_path, tmp_path)
 
 

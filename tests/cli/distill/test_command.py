@@ -117,7 +117,7 @@ def test_a_run_goes_on_with_what_it_was_begun_with_or_not_at_all(
     write_ply(file, replace(gaussians, means=gaussians.means + 0.01))
     code, said = gsjax(*told, "--resume")
     assert code == 2
-    assert f"--resume: {file}: expected what the run in {out} was begun with" in said
+    assert f"--resume: {file}: expected the same as when the run in {out} was" in said
     shutil.copy(scene, file)
     kept = mask.read_bytes()
     cv2.imwrite(str(mask), cv2.imread(str(mask), cv2.IMREAD_UNCHANGED)[:, ::-1])

@@ -37,21 +37,21 @@ def test_a_scene_is_found_by_what_is_in_it(gsjax, field, scene, tmp_path):
     shutil.copy(scene[0], run / "canonical" / "scene.ply")
     code, said = gsjax("query", moved, "can", "--camera", 0)
     assert code == 0, said
-    assert "is not as it was" not in said
+    assert "has changed since" not in said
     assert told_of(moved)["scene"] == str(run / "canonical" / "scene.ply")
     np.testing.assert_array_equal(read_ply(moved / "query" / "object.ply")[1].labels, CAN)
     # Without it the other one is better than nothing, and that is said.
     (run / "canonical" / "scene.ply").unlink()
     code, said = gsjax("query", moved, "can", "--camera", 0)
     assert code == 0, said
-    assert f"{run / 'scene.ply'} is not as it was when the field in {moved} was distilled" in said
+    assert f"{run / 'scene.ply'} has changed since the field in {moved} was distilled" in said
     (run / "scene.ply").unlink()
     code, said = gsjax("query", moved, "can")
     assert code == 2
-    assert "--scene names it" in said
+    assert "give it with --scene" in said
     code, said = gsjax("query", moved, "can", "--camera", 0, "--scene", scene[0])
     assert code == 0, said
-    assert "is not as it was" not in said
+    assert "has changed since" not in said
 
 
 def test_photographs_are_where_they_are_said_to_be(gsjax, field, pristine, scene, tmp_path):
@@ -71,7 +71,7 @@ def test_photographs_are_where_they_are_said_to_be(gsjax, field, pristine, scene
     change(field, lambda about: about["scene"].pop("photographs"))
     code, said = gsjax("query", field, "can")
     assert code == 0, said
-    assert "field.npz: expected which photographs it learned from, found others" in said
+    assert "field.npz: expected the training photographs' names, found others" in said
 
 
 # what it refuses

@@ -268,7 +268,7 @@ def test_nothing_is_forgotten_where_no_scheduler_answers(toy, gsjax, monkeypatch
     elsewhere = ("--executor", "dask", "--scheduler", "tcp://127.0.0.1:1")
     code, _, err = gsjax("run", "toy", "--fresh", *elsewhere)
     assert code == 2
-    assert "found none that answers in 1 s" in err
+    assert "found none that answers within 1 s" in err
     assert cell_files() == before
 
 

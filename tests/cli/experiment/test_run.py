@@ -185,10 +185,10 @@ def test_cells_that_there_are_not(toy, gsjax, options, says):
 @pytest.mark.parametrize(
     ("returned", "says"),
     [
-        ("3", "run() returned int, expected a dict of figures by name"),
+        ("3", "run() returned int, expected a dict of named figures"),
         ("{'x': object()}", "run() returned 'x' of type object, expected numbers, text, or lists of them"),
         ("{'x': {'y': [1j]}}", "run() returned 'x' of type dict, expected"),
-        ("{'size': 3}", "run() returned 'size', expected a name that is no option, seed or seconds"),
+        ("{'size': 3}", "run() returned 'size', expected a name other than seed, seconds or an option"),
         ("{1: 3}", "run() returned 1, expected a name"),
     ],
 )

@@ -212,7 +212,7 @@ def test_a_scene_is_not_read_from_what_is_replaced(gsjax_parts, tmp_path):
     inside = ("--scene", str(tmp_path / "run" / "canonical"), "--anchor", "0")
     code, said = gsjax_parts(*QUICK, *inside, "--overwrite")
     assert code == 2
-    assert "expected one outside of --out, which --overwrite replaces" in said
+    assert "expected one outside --out, which --overwrite replaces" in said
 
 
 def test_a_scene_in_which_nothing_moves(gsjax_parts, tmp_path):

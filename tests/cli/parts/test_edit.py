@@ -342,7 +342,7 @@ def test_a_script_that_is_none(gsjax, run, tmp_path, text, says):
         (lambda run: (run / "config.yml").write_text("# gsjax run\na: 1"), "expected a run's settings"),
         (
             lambda run: (run / "parts.npz").unlink(),
-            "expected a whole run of `gsjax parts`, found no parts.npz",
+            "expected a complete run of `gsjax parts`, found no parts.npz",
         ),
         (lambda run: _of_track(run), "expected a run of `gsjax parts`, found one of `gsjax track`; name"),
         (lambda run: (run / "parts.npz").write_bytes(b"x"), "parts.npz: expected plain arrays"),

@@ -52,14 +52,14 @@ def test_a_scene_is_read_once(fitted, asked, notes, monkeypatch):
 def test_a_field_alone_is_asked_of_the_scene_that_is_named(fitted, asked, tmp_path, notes, view):
     write_ply(fitted / "scene.ply", some(), labels=np.arange(30) % 3)  # not as it was
     scene, _ = open_viewable(fitted, notes)
-    assert any("is not as it was when the field in" in note for note in notes.all)
+    assert any("has changed since the field in" in note for note in notes.all)
     mine = tmp_path / "mine"
     mine.mkdir()
     shutil.copy(asked / "field.npz", mine)
     shutil.move(fitted / "scene.ply", tmp_path / "moved.ply")
     code, said = view(mine, "--port", 0)
     assert code == 2
-    assert "--scene names it" in said
+    assert "give it with --scene" in said
     code, said = view(mine, "--port", 0, "--scene", tmp_path / "moved.ply")
     assert code == 130, said
     assert "can be queried" in said
@@ -112,7 +112,7 @@ def test_what_can_be_asked_for_is_said(fitted, notes, source, hint):
     asking = open_viewable(fitted, notes)[0].asking
     assert asking.hint.startswith(hint)
     if source.kind == "files":
-        with pytest.raises(ValueError, match="--weights names its folder"):
+        with pytest.raises(ValueError, match="give its folder with --weights"):
             asking.ask("can", 0)
         assert open_viewable(fitted, notes, Whereabouts(weights=Path("x")))[0].asking.hint == "Any words"
 

@@ -87,8 +87,8 @@ def align_and_search(
     key: Key[Array, ""],
     config: TrackConfig,
 ) -> Alignment:
-    """Third stage: each group is aligned with the images. Those that agree worst are searched for everywhere
-    around, and those that may be lost are searched for elsewhere.
+    """Third stage: each group is aligned with the images. Those that agree worst are searched for
+    throughout their surroundings, and those that may be lost are searched for elsewhere.
 
     Args:
         now, past, starts: from the earlier stages.
