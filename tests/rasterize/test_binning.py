@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gsjax.rasterize.binning import _sorted_pairs, _Spans, _total, bin_gaussians, needed_capacity
+from gsjax.rasterize.binning import _sorted_pairs, _Spans, total, bin_gaussians, needed_capacity
 from gsjax.rasterize.plan import Plan
 from gsjax.rasterize.projection import project_gaussians
 
@@ -106,5 +106,5 @@ def test_keys_that_just_fit_32_bits_are_sorted_as_one():
 
 def test_a_count_beyond_int32_saturates_instead_of_wrapping():
     counts = jnp.full(100_000, 32_400, jnp.int32)  # 3.2e9 pairs
-    assert int(_total(counts)) == np.iinfo(np.int32).max
-    assert int(_total(counts[:10])) == 324_000
+    assert int(total(counts)) == np.iinfo(np.int32).max
+    assert int(total(counts[:10])) == 324_000
