@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gsjax.rasterize.binning import _sorted_pairs, _Spans, total, bin_gaussians, needed_capacity
+from gsjax.rasterize.binning import _sorted_pairs, _Spans, bin_gaussians, needed_capacity, total
 from gsjax.rasterize.plan import Plan
 from gsjax.rasterize.projection import project_gaussians
 
