@@ -53,7 +53,6 @@ class Row:
     awaited_ms: float
     awaited_p95_ms: float
     streamed_ms: float
-    compile_s: float
     pairs: int | None = None
 
 
@@ -77,7 +76,7 @@ def gsjax_programs(
             if kernels and name == JVP:
                 continue  # forward mode is XLA's in both
             run = jax.jit(program)
-            _, (_, pairs, overflow) = run(pool[0], None)
+            _, (_, pairs, overflow) = run(pool[0], None)  # compiles
             if bool(overflow.any()):
                 raise RuntimeError("the plan was too small for a perturbed scene")
             yield (
@@ -175,12 +174,9 @@ def measure(workload: Workload, names: list[str], report: Callable[[Row], None])
     for name in names:
         try:
             for program, run, wait, pairs in IMPLEMENTATIONS[name](workload, scene):
-                began = time.perf_counter()
-                wait(run(0))
-                compile_s = time.perf_counter() - began
                 seconds = sample(lambda i: wait(run(i)), AWAITED, MAX_SECONDS)  # noqa: B023
                 median, p95 = median_and_p95(seconds)
-                report(Row(workload.name, name, program, median, p95, streamed(run, wait), compile_s, pairs))
+                report(Row(workload.name, name, program, median, p95, streamed(run, wait), pairs))
         except Exception as error:
             notes.append(f"{workload.name}, {name}: {type(error).__name__}: {str(error)[:300]}")
     return notes
@@ -215,7 +211,7 @@ def main() -> None:
         rows.append(row)
         times = f"{row.awaited_ms:9.3f} ms awaited {row.streamed_ms:9.3f} streamed"
         label = f"{row.workload:>22} {row.program:>17} {row.implementation:>8}"
-        print(f"{label} {times}, first call {row.compile_s:.1f} s", flush=True)
+        print(f"{label} {times}", flush=True)
 
     for name in choose(list(known), options.only):
         notes += measure(known[name], options.names, report)

@@ -46,7 +46,7 @@ def bin_gaussians(projected: Projected, tile_mask: Bool[Array, "tiles"] | None, 
     """
     projected = jax.lax.stop_gradient(projected)
     by_depth = depth_order(projected, plan)
-    first_row, num_rows = _rows(projected, tile_mask, plan)
+    first_row, num_rows = tile_rows(projected, tile_mask, plan)
     first_row, num_rows = first_row[by_depth], num_rows[by_depth]
     rows = total(num_rows)
     enough_rows = rows <= plan.capacity // 2
@@ -81,12 +81,12 @@ def needed_capacity(
         tile_mask: tiles that are drawn (default: all).
         plan: its capacity determines how many rows fit.
     """
-    first_row, num_rows = _rows(projected, tile_mask, plan)
+    first_row, num_rows = tile_rows(projected, tile_mask, plan)
     rows = total(num_rows)
     num_rows = jnp.where(rows <= plan.capacity // 2, num_rows, 0)
     unordered = jnp.arange(num_rows.shape[0], dtype=jnp.int32)
     spans = _spans(projected, tile_mask, unordered, first_row, num_rows, plan)
-    return jnp.maximum(total(spans.count), _doubled(rows))
+    return jnp.maximum(total(spans.count), doubled(rows))
 
 
 def total(counts: Int[Array, "*n"]) -> Int[Array, ""]:
@@ -95,7 +95,12 @@ def total(counts: Int[Array, "*n"]) -> Int[Array, ""]:
     return jnp.where(estimate > _TOO_MANY, jnp.iinfo(jnp.int32).max, counts.sum(dtype=jnp.int32))
 
 
-def _doubled(rows: Int[Array, ""]) -> Int[Array, ""]:
+def doubled(rows: Int[Array, "*n"]) -> Int[Array, "*n"]:
+    """Twice the rows, or the largest int32.
+
+    Args:
+        rows: numbers of rows, 0 or more.
+    """
     return jnp.where(rows > _TOO_MANY // 2, jnp.iinfo(jnp.int32).max, 2 * rows)
 
 
@@ -123,7 +128,7 @@ def _box(projected: Projected, axis: int, plan: Plan) -> tuple[Int[Array, "n"], 
     return low, jnp.where(projected.visible, jnp.maximum(high, low), low)
 
 
-def _rows(projected: Projected, tile_mask, plan: Plan) -> tuple[Int[Array, "n"], Int[Array, "n"]]:
+def tile_rows(projected: Projected, tile_mask, plan: Plan) -> tuple[Int[Array, "n"], Int[Array, "n"]]:
     """First row of tiles and number of rows of each Gaussian; no rows if it touches no tile of the mask."""
     top, bottom = _box(projected, 1, plan)
     if tile_mask is None:
@@ -139,7 +144,7 @@ def _bounding_pairs(projected: Projected, plan: Plan) -> Int[Array, ""]:
     """An upper bound on the needed capacity, from bounding boxes alone."""
     (left, right), (top, bottom) = _box(projected, 0, plan), _box(projected, 1, plan)
     columns, rows = right - left, bottom - top
-    return jnp.maximum(total(columns * rows), _doubled(total(rows)))
+    return jnp.maximum(total(columns * rows), doubled(total(rows)))
 
 
 def _spans(projected: Projected, tile_mask, by_depth, first_row, num_rows, plan: Plan) -> _Spans:

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, UInt
 
-from gsjax.rasterize.binning import depth_order, total
+from gsjax.rasterize.binning import depth_order, doubled, tile_rows, total
 from gsjax.rasterize.compositing import Lists, Splats, chunk_length
 from gsjax.rasterize.plan import Plan
 from gsjax.rasterize.projection import Projected
@@ -139,7 +139,7 @@ def _form(passes: Array, channels: int, plan: Plan, lanes: int):
 
 def _values_per_pass(channels: int) -> int:
     """As few passes as possible, of equal size."""
-    return -(-channels // max(1, -(-channels // MOST_VALUES)))
+    return -(-channels // -(-channels // MOST_VALUES))
 
 
 def _passes(values: Float[Array, "n channels"]) -> Float[Array, "passes n values"]:
@@ -202,12 +202,14 @@ def tile_lists(projected: Projected, mask, plan: Plan, capacity: int):
     views, tiles = projected.depths.shape[0], plan.num_tiles
     by_depth = jax.vmap(lambda one: depth_order(one, plan))(projected)
     counts = kernels.count_pairs(projected, by_depth, mask, plan)
-    needed = jax.vmap(total)(counts)
-    overflow = needed > plan.capacity  # a view that overflowed draws nothing and reports it
+    wanted = jax.vmap(total)(counts)
+    overflow = wanted > plan.capacity  # a view that overflowed draws nothing and reports it
+    _, rows = jax.vmap(partial(tile_rows, plan=plan), (0, None if mask is None else 0))(projected, mask)
+    needed = jnp.maximum(wanted, doubled(jax.vmap(total)(rows)))  # what XLA needs is enough everywhere
     drawn = jnp.where(overflow[:, None], 0, counts).ravel()
     starts = jnp.cumsum(drawn) - drawn
     starts = jnp.where(drawn > 0, starts, -1).astype(jnp.int32)
-    keys, ids = kernels.list_pairs(projected, by_depth, mask, starts, capacity, plan)
+    keys, ids = kernels.list_pairs(projected, by_depth, mask, starts, drawn, capacity, plan)
     keys, ids = jax.lax.sort_key_val(keys, ids)  # stable: the order of depth remains
     first = edges(keys, views * tiles)
     lengths = jnp.diff(first)

@@ -82,12 +82,12 @@ def _composite_bwd(plan: Plan, residuals, cotangents):
         jnp.zeros(d.shape, d.dtype) if isinstance(d, SymbolicZero) else d for d in cotangents[:2]
     )
     if image is None:
-        either = (partial(f, plan=plan) for f in (_values_gradients, fused.values_gradients))
-        d_values = fused.by_platform(*either, splats, lists, reads, d_values)
+        in_xla, in_kernels = (partial(f, plan=plan) for f in (_values_gradients, fused.values_gradients))
+        d_values = fused.by_platform(in_xla, in_kernels, splats, lists, reads, d_values)
         return Splats(None, None, None, d_values), None, None  # type: ignore[arg-type]
-    either = (partial(f, plan=plan) for f in (_gradients, fused.gradients))
+    in_xla, in_kernels = (partial(f, plan=plan) for f in (_gradients, fused.gradients))
     cotangents = (d_values, d_transmittance)
-    return fused.by_platform(*either, splats, lists, reads, image, cotangents), None, None
+    return fused.by_platform(in_xla, in_kernels, splats, lists, reads, image, cotangents), None, None
 
 
 def _gradients(splats: Splats, lists: Lists, reads, image, cotangents, plan: Plan) -> Splats:

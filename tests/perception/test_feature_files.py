@@ -156,7 +156,7 @@ def test_what_could_unpack_or_print_without_end_is_refused(tmp_path):
 
 def test_files_of_other_kinds_are_refused(tmp_path):
     (tmp_path / "old.pt").write_bytes(b"\x80\x02")
-    with pytest.raises(ValueError, match=r"old\.pt: expected a torch\.save file"):
+    with pytest.raises(ValueError, match=r"old\.pt: expected a file of torch\.save"):
         read_torch_array(tmp_path / "old.pt")
     with zipfile.ZipFile(tmp_path / "empty.pt", "w") as archive:
         archive.writestr("readme", "nothing")
@@ -290,8 +290,8 @@ def bad_files(folder, kind):
     ("kind", "says"),
     [
         ("object", r"a\.npy: expected a plain array"),
-        ("flat", r"a\.npy: expected numbers \[h,w,C\], found float16 \[4, 5\]"),
-        ("words", r"a\.npy: expected numbers \[h,w,C\], found <U1"),
+        ("flat", r"a\.npy: expected numbers of shape \[h,w,C\], found float16 of shape \[4, 5\]"),
+        ("words", r"a\.npy: expected numbers of shape \[h,w,C\], found <U1"),
         ("nan", r"a\.npy: expected finite numbers, found 12 that are NaN or infinite"),
         ("rows", r"a\.npz: expected rows -1 to 3, found 7 to 7"),
         ("other", r"a\.npz: expected features, or ids and codebook, found poses"),

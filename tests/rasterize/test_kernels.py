@@ -18,6 +18,7 @@ from gsjax.rasterize.projection import project_gaussians
 
 pytest.importorskip("warp", reason="the kernels are written in Warp: pip install 'gsjax[cuda]'")
 
+ON_A_CARD = pytest.mark.skipif(not fused.available(), reason="what a warp does together needs a GPU")
 WIDTH, HEIGHT, VIEWS = 70, 45, 2
 K = jnp.array([[60.0, 0, WIDTH / 2], [0, 60.0, HEIGHT / 2], [0, 0, 1]])
 
@@ -62,7 +63,8 @@ def test_lists_hold_the_same_gaussians_in_the_same_order(tile_size, masked):
     capacity = VIEWS * slots(plan.capacity).size
     lists, pairs, needed, overflow = fused.tile_lists(projected, mask, plan, capacity)
     np.testing.assert_array_equal(pairs, want.pairs)
-    assert (needed <= want.needed).all()
+    assert (needed <= want.needed).all()  # XLA counts tiles outside the mask too, in rows that touch it
+    assert masked or (needed == want.needed).all()
     assert not overflow.any()
     for view in range(VIEWS):
         for tile in range(plan.num_tiles):
@@ -72,8 +74,9 @@ def test_lists_hold_the_same_gaussians_in_the_same_order(tile_size, masked):
             np.testing.assert_array_equal(got, want.ids[view, start : start + count])
 
 
+@pytest.mark.parametrize("lanes", [1, pytest.param(32, marks=ON_A_CARD)])
 @pytest.mark.parametrize(("channels", "tile_size"), [(3, 8), (1, 4), (4, 16), (13, 8), (24, 32)])
-def test_images_and_gradients_of_tiles(channels, tile_size):
+def test_images_and_gradients_of_tiles(channels, tile_size, lanes):
     arrays, (viewmats, Ks) = gaussians(300), cameras(1)
     plan = gsjax.plan(*arrays, viewmats, Ks, WIDTH, HEIGHT, tile_size=tile_size)
     projected = project_gaussians(*arrays, jnp.ones(300, bool), viewmats[0], K, plan)
@@ -82,15 +85,17 @@ def test_images_and_gradients_of_tiles(channels, tile_size):
     values = jnp.asarray(rng.normal(size=(300, channels)), jnp.float32)
     splats = Splats(projected.means2d, projected.conics, projected.opacities, values)
     want = composite_forward(splats, lists, None, plan)
-    got = fused.composite_forward(splats, lists, plan, lanes=1)
+    got = fused.composite_forward(splats, lists, plan, lanes=lanes)
     close(got[:2], want[:2], 2e-6)
     np.testing.assert_array_equal(got[2], want[2])
     cotangents = tuple(jnp.asarray(rng.normal(size=a.shape), jnp.float32) for a in want[:2])
     rest = (lists, want[2], want[:2], cotangents, plan)
-    close(fused.gradients(splats, *rest, lanes=1), _gradients(splats, *rest), 1e-5)
+    close(fused.gradients(splats, *rest, lanes=lanes), _gradients(splats, *rest), 1e-5)
     values_only = (lists, want[2], cotangents[0], plan)
     close(
-        fused.values_gradients(splats, *values_only, lanes=1), _values_gradients(splats, *values_only), 1e-5
+        fused.values_gradients(splats, *values_only, lanes=lanes),
+        _values_gradients(splats, *values_only),
+        1e-5,
     )
 
 
@@ -116,6 +121,26 @@ def test_a_plan_that_is_too_small_draws_nothing_and_says_so(on_kernels):
     assert (image > 0).any()
 
 
+@pytest.mark.parametrize("dtype", ["float32", "bfloat16"])
+def test_options_of_a_call(dtype, monkeypatch):
+    arrays, views = gaussians(600), cameras()
+    colors = jnp.asarray(np.random.default_rng(4).uniform(size=(600, 3)), dtype)
+    roi = jnp.zeros((VIEWS, HEIGHT, WIDTH), bool).at[:, 10:30, 20:60].set(True)
+    plan = gsjax.plan(*arrays, *views, WIDTH, HEIGHT, max_per_tile=7, render_mode="RGB+D")
+
+    def image(colors):
+        drawn, _, meta = gsjax.rasterization(*arrays, colors, *views, WIDTH, HEIGHT, plan=plan, roi=roi)
+        return (drawn**2).sum(), (drawn, meta.reads)
+
+    want = jax.grad(image, has_aux=True)(colors)
+    monkeypatch.setattr(fused, "by_platform", lambda _, kernels, *args: partial(kernels, lanes=1)(*args))
+    jax.clear_caches()
+    got = jax.grad(image, has_aux=True)(colors)
+    jax.clear_caches()
+    close(got[1], want[1], 2e-6)
+    close(got[0].astype(jnp.float32), want[0].astype(jnp.float32), 1e-5 if dtype == "float32" else 1e-2)
+
+
 def test_vmap_is_a_loop(on_kernels):
     (means, *others), views = gaussians(200), cameras()
     plan = gsjax.plan(means, *others, *views, WIDTH, HEIGHT, headroom=2.0)
@@ -130,6 +155,7 @@ def test_vmap_is_a_loop(on_kernels):
     close(got, jnp.stack([jax.grad(loss)(means, shift) for shift in shifts]), 1e-5)
 
 
+@pytest.mark.skipif(jax.default_backend() == "gpu", reason="there they are available")
 def test_without_a_gpu_xla_draws():
     assert not fused.available()
     assert fused.by_platform(lambda a: a + 1, lambda a, lanes: a + 2, jnp.zeros(())) == 1

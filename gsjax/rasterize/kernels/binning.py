@@ -18,7 +18,8 @@ from gsjax.rasterize.plan import Plan
 from gsjax.rasterize.projection import Projected
 
 _TINY, _EPS = float(np.finfo(np.float32).tiny), float(np.finfo(np.float32).eps)
-_OPTIONS = {"enable_backward": False}
+# Without fused operations both kernels compute the same tiles, though they are compiled apart.
+_OPTIONS = {"enable_backward": False, "fuse_fp": False}
 
 
 @wp.struct
@@ -135,6 +136,7 @@ def _kernels(form: _Form, key_type: str):
         by_depth: wp.array[wp.int32],
         mask: wp.array[wp.bool],
         starts: wp.array[wp.int32],
+        counts: wp.array[wp.int32],
         n: int,
         keys: wp.array[Key],
         ids: wp.array[wp.int32],
@@ -143,6 +145,7 @@ def _kernels(form: _Form, key_type: str):
         view = thread // n
         g = view * n + by_depth[thread]
         slot = starts[thread] + 0
+        end = slot + counts[thread]
         if visible[g] and slot >= 0:
             e = ellipse(g, means2d, extents, conics, opacities)
             for row in range(e.first_row, e.end_row):
@@ -152,7 +155,7 @@ def _kernels(form: _Form, key_type: str):
                     wanted = bool(True)
                     if wp.static(masked):
                         wanted = mask[tile]
-                    if wanted:
+                    if wanted and slot < end:
                         keys[slot] = Key(tile)
                         ids[slot] = g
                         slot += 1
@@ -188,12 +191,13 @@ def count_pairs(projected: Projected, by_depth, mask, plan: Plan):
     return counts[0].reshape(views, n)
 
 
-def list_pairs(projected: Projected, by_depth, mask, starts, capacity: int, plan: Plan):
+def list_pairs(projected: Projected, by_depth, mask, starts, counts, capacity: int, plan: Plan):
     """Unsorted keys, view * tiles + tile, and ids, view * n + Gaussian, of all pairs, front to back.
 
     Args:
         projected, by_depth, mask, plan: as for `count_pairs`.
-        starts: the slot of each Gaussian's first pair [views, n]; -1 writes none.
+        starts: the slot of each Gaussian's first pair [views * n]; -1 writes none.
+        counts: the number of its pairs [views * n].
         capacity: number of slots. Unused ones get the largest key, views * tiles, and the id 0.
     """
     views, n = by_depth.shape
@@ -202,5 +206,5 @@ def list_pairs(projected: Projected, by_depth, mask, starts, capacity: int, plan
     keys = jnp.full(capacity, unused, jnp.uint16 if narrow else jnp.uint32)
     _, kernel = _kernels(_form(plan, mask), str(keys.dtype))
     call = wp.jax_kernel(kernel, num_outputs=2, vmap_method="sequential", in_out_argnames=["keys", "ids"])
-    inputs = (*_inputs(projected, by_depth, mask), starts.ravel(), n, keys, jnp.zeros(capacity, jnp.int32))
+    inputs = (*_inputs(projected, by_depth, mask), starts, counts, n, keys, jnp.zeros(capacity, jnp.int32))
     return call(*inputs, launch_dims=views * n)

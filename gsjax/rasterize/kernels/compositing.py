@@ -1,7 +1,7 @@
 """Compositing on a GPU: one warp of 32 threads per tile, written in Warp (https://github.com/NVIDIA/warp).
 
 XLA's loops over chunks and batches launch a few small programs for every chunk, and a GPU spends its time on
-launching them. Here one program reads a tile's list from front to back. Its pixels stay in registers: with
+launching them. Here one program reads a tile's list from front to back. Its pixels are in registers: with
 tiles of 8x8, two in each thread.
 
 Backward, a warp sums the gradients of its pixels and writes one row per entry; `sums.py` adds the rows of
