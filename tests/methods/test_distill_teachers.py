@@ -264,7 +264,7 @@ def test_objects_with_equal_embeddings_are_one_object_and_a_view_without_masks_i
     [
         ([np.zeros((3, 4, 5))], "maps: expected those of 2 views, found 1"),
         ([np.zeros((3, 4, 5)), np.zeros((3, 4, 6))], r"maps of view 1: expected \[h, w, 5\], found float64"),
-        ([np.zeros((3, 4, 5)), np.full((3, 4, 5), np.inf)], "maps of view 1: expected numbers"),
+        ([np.zeros((3, 4, 5)), np.full((3, 4, 5), np.inf)], "maps of view 1: expected finite numbers"),
         (
             [np.zeros((30, 40, 5)), np.zeros((40, 30, 5))],
             "expected the aspect ratio of its view, 48x36",

@@ -201,7 +201,7 @@ def test_features_ride_along(little):
 
 @pytest.mark.parametrize("shape", [(2, HEIGHT, WIDTH), (1, HEIGHT, WIDTH, 3), (2, HEIGHT, WIDTH + 1, 3)])
 def test_maps_of_another_size_are_refused(little, shape):
-    with pytest.raises(ValueError, match=r"maps: expected shape \[2, 16, 24, 'D'\] as the images"):
+    with pytest.raises(ValueError, match=r"maps: expected shape \[2, 16, 24, 'D'\] to match images"):
         project_features(*little, np.zeros(shape, np.float32))
 
 

@@ -85,7 +85,7 @@ def test_no_mask_is_refused_in_words(table):
 def test_bad_input_says_what_is_wrong(table):
     _, frames, mask = table()
     first = frames[0]
-    with pytest.raises(ValueError, match=r"mask: expected shape .* as the images"):
+    with pytest.raises(ValueError, match=r"mask: expected shape .* to match images"):
         labelled_cloud(first, mask[:-1], 0, START)
     with pytest.raises(ValueError, match="mask: expected an object, found none"):
         scene_from_cloud(labelled_cloud(first, 0 * mask, 0, START), START)
