@@ -27,6 +27,7 @@ from benchmarks.programs import BACKWARD, FORWARD, JVP, make_pool, make_programs
 from benchmarks.timing import MIN_CALLS, median_and_p95, sample
 from benchmarks.workloads import HD, VGA, Scene, Workload, ball_workload, choose, garden
 from gsjax.engine import machine
+from gsjax.geometry.spherical_harmonics import SH_C0
 from gsjax.io.atomic import write_json
 from gsjax.rasterize import fused
 from gsjax.rasterize.rasterization import plan as make_plan
@@ -37,7 +38,6 @@ SUITE = [
 ]
 AWAITED, STREAMED = 30, 60  # calls
 MAX_SECONDS = 1.5  # of either, per program
-SH_0 = 0.28209479177387814
 
 Program = Callable[[int], Any]  # starts the i-th call, and returns its results
 Wait = Callable[[Any], Any]
@@ -111,7 +111,7 @@ def splax_programs(workload: Workload, scene: Scene) -> Iterator[tuple[str, Prog
     inputs = []
     for one in make_pool(scene):
         odds = jnp.clip(one["opacities"], 1e-6, 1 - 1e-6)
-        colors = (one["colors"] - 0.5) / SH_0
+        colors = (one["colors"] - 0.5) / SH_C0
         trained = (one["means"], jnp.log(one["scales"]), one["quats"], colors, jnp.log(odds / (1 - odds)))
         inputs.append((trained, one["viewmats"][0]))
     for name, run in ((FORWARD, jax.jit(draw)), (BACKWARD, jax.jit(jax.value_and_grad(loss)))):

@@ -47,6 +47,9 @@ class Columns(NamedTuple):
     values: tuple[Float[Array, "*list"], ...] | Float[Array, "*list channels"]  # many channels stay together
 
 
+SHAPE = len(Columns._fields) - 1  # numbers per Gaussian before its values
+
+
 def in_columns(splats: Splats, limits: Limits) -> Columns:
     """The same list in columns. Opacities are bounded below alpha_min, where they have no effect, so that the
     logarithm has a derivative."""

@@ -14,13 +14,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, UInt
 
 from gsjax.rasterize.binning import depth_order, doubled, tile_rows, total
-from gsjax.rasterize.compositing import Lists, Splats, chunk_length
+from gsjax.rasterize.compositing import SHAPE, Lists, Splats, chunk_length, in_columns
 from gsjax.rasterize.plan import Plan
 from gsjax.rasterize.projection import Projected
 
 _GPU_LANES = 32  # threads per tile on a GPU; on a CPU it is 1
 MOST_VALUES = 10  # per pass: with the six numbers of a shape, four times four floats
-_SHAPE = 6  # u, v, A, B, C, log opacity
 
 
 @cache
@@ -125,7 +124,7 @@ def _summed(splats: Splats, lists: Lists, reads, d_values, behind, plan: Plan, l
         sums = row_sums(rows, order, first, lanes)
         return moments + sums[:, : moments.shape[1]], sums[:, moments.shape[1] :]
 
-    start = jnp.zeros((n, _SHAPE if shapes_move else 0), jnp.float32)
+    start = jnp.zeros((n, SHAPE if shapes_move else 0), jnp.float32)
     moments, d_colors = jax.lax.scan(one_pass, start, (passes, _of_passes(d_values), behind))
     d_colors = jnp.moveaxis(d_colors, 0, 1).reshape(n, -1)[:, :channels]
     return moments, d_colors.astype(splats.values.dtype)
@@ -157,7 +156,7 @@ def _of_passes(tiles: Float[Array, "tiles channels pixels"]) -> Float[Array, "pa
 
 
 def _shapes(splats: Splats, plan: Plan) -> Float[Array, "n 6"]:
-    logs = jnp.log(jnp.maximum(splats.opacities, 0.5 * plan.alpha_min))  # as in `in_columns`
+    logs = in_columns(splats, plan.limits).log_opacities
     return jnp.concatenate([splats.means2d, splats.conics, logs[:, None]], axis=1)
 
 

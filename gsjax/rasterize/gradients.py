@@ -40,7 +40,7 @@ from gsjax.rasterize.compositing import (
 )
 from gsjax.rasterize.plan import Limits, Plan
 
-_SMALL = 1e-6  # lower bound of 1 - alpha as a divisor
+SMALL = 1e-6  # lower bound of 1 - alpha as a divisor
 
 
 def composite(
@@ -180,7 +180,7 @@ def _chunk_gradients(piece: Columns, d_image, light, behind, *, pixels, monomial
     for i in range(0, alphas.shape[0], CHUNK):
         some = slice(i, i + CHUNK)
         suffix = _suffix(behind, passed[some])
-        slope = suffix * alphas[some] / jnp.maximum(1 - alphas[some], _SMALL)
+        slope = suffix * alphas[some] / jnp.maximum(1 - alphas[some], SMALL)
         moved = (weights[some] > 0) & (alphas[some] < limits.alpha_max * (1 - 0.5 * SATURATION))
         d_power.append(jnp.where(moved, passed[some] - slope, 0.0))
         for row in passed[some]:  # not .sum(), for which XLA:CPU calls a library

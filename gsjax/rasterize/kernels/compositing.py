@@ -17,11 +17,10 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import warp as wp
 
-from gsjax.rasterize.compositing import SATURATION
+from gsjax.rasterize.compositing import SATURATION, SHAPE
+from gsjax.rasterize.gradients import SMALL
 from gsjax.rasterize.kernels.warps import OPTIONS, STAGED, WARP, WARPS, in_any_lane, reader, writer
 from gsjax.rasterize.plan import Limits, Plan
-
-_SHAPE = 6  # numbers per Gaussian before its values: u, v, A, B, C, log opacity
 
 
 class Form(NamedTuple):
@@ -36,7 +35,7 @@ class Form(NamedTuple):
     @property
     def fours(self) -> int:
         """Groups of four numbers per Gaussian."""
-        return -(-(_SHAPE + self.values) // 4)
+        return -(-(SHAPE + self.values) // 4)
 
     @property
     def block(self) -> int | None:
@@ -145,7 +144,7 @@ def _forward(form: Form):
                     live = after > least_light
                     weight = wp.where(live, alphas[per_lane * j + k] * light[k], 0.0)
                     for c in range(values_per_pixel):
-                        sums[values_per_pixel * k + c] += weight * record[6 + c]
+                        sums[values_per_pixel * k + c] += weight * record[SHAPE + c]
                     light[k] = wp.where(live, after, -wp.abs(light[k]))
             entry += unroll
             alive = entry < count
@@ -178,7 +177,7 @@ def _backward(form: Form, shapes_move: bool):
     saturated_alpha = form.limits.alpha_max * (1 - 0.5 * SATURATION)
     read, (center, place, alpha) = reader(form.fours), _shared(form)
     fours, staged = form.fours, STAGED
-    first_value = _SHAPE if shapes_move else 0
+    first_value = SHAPE if shapes_move else 0
     write, Row = writer(first_value + values_per_pixel, lanes)
     Pixels = wp.types.vector(length=per_lane, dtype=wp.float32)
     Alphas = wp.types.vector(length=unroll * per_lane, dtype=wp.float32)
@@ -251,13 +250,15 @@ def _backward(form: Form, shapes_move: bool):
                         for c in range(values_per_pixel):
                             row[first_value + c] += weights[k] * d_image[values_per_pixel * k + c]
                             if wp.static(shapes_move):
-                                toward += record[6 + c] * d_image[values_per_pixel * k + c]
+                                toward += record[SHAPE + c] * d_image[values_per_pixel * k + c]
                         if wp.static(shapes_move):
                             one = alphas[per_lane * j + k]
                             passed = weights[k] * toward
                             behind[k] -= passed
                             moved = weights[k] > 0.0 and one < saturated_alpha
-                            d_power = wp.where(moved, passed - behind[k] * one / wp.max(1.0 - one, 1e-6), 0.0)
+                            d_power = wp.where(
+                                moved, passed - behind[k] * one / wp.max(1.0 - one, SMALL), 0.0
+                            )
                             dx, dy = x[k] - u, y[k] - v
                             row[0] += d_power * dx
                             row[1] += d_power * dy
@@ -300,6 +301,6 @@ def backward(form: Form, shapes_move: bool, records, ids, starts, reads, d_value
     """
     kernel = _backward(form, shapes_move)
     options = {"vmap_method": "sequential", "block_dim": form.block, "in_out_argnames": ["rows"]}
-    rows = jnp.zeros((len(ids), form.values + (_SHAPE if shapes_move else 0)), jnp.float32)
+    rows = jnp.zeros((len(ids), form.values + (SHAPE if shapes_move else 0)), jnp.float32)
     arrays = (records, ids, starts, reads, d_values, behind, plan.tiles_x, plan.num_tiles, rows)
     return wp.jax_kernel(kernel, **options)(*arrays, launch_dims=len(starts) * form.lanes)[0]
