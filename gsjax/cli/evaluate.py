@@ -16,7 +16,6 @@ from gsjax.data.photographs import Photographs
 from gsjax.engine.fit.judge import Compared, Judge, write_panel
 from gsjax.engine.folder import replaced_folder
 from gsjax.engine.machine import describe as describe_machine
-from gsjax.engine.machine import in_words
 from gsjax.engine.messages import Notes
 from gsjax.engine.options import Common
 from gsjax.engine.photographs import photographs_of_run, read_frames, split
@@ -267,5 +266,6 @@ def _summarize(folder: Path, record: Record, found: dict[str, Any]) -> Summary:
             )
         ],
         strips=[Media(folder / row["picture"], f"{row['view']}, {row['split']}") for row in rows[::every]],
-        notes=[*found["notes"], f"Machine: {in_words(found['machine'])}."],
+        notes=found["notes"],
+        machine=found["machine"],
     )

@@ -1,9 +1,11 @@
 """Opens recordings and sets of photographs in any layout that has a reader."""
 
 import inspect
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import NamedTuple
 from urllib.parse import parse_qsl
 
 import numpy as np
@@ -140,16 +142,11 @@ def _photographs(path: str | Path, options: ReadOptions) -> Photographs:
     if text.endswith(".json") and Path(path).is_file():
         return transforms.read_transforms(path, **_unit(options))
     root = _folder(path)
-    layout = _photograph_layout(root)
-    if layout == "nerfstudio":
-        return transforms.read_transforms(root, **_unit(options))
-    if layout == "COLMAP":
-        return colmap.read_colmap(root, options.images)
-    if layout == "LLFF":
-        return poses_bounds.read_llff(root, _axes(root, options), options.images)
+    if (layout := _photograph_layout(root)) is not None:
+        return layout.read(root, options)
     if is_recording(root):
         return photographs_of(open_sequence(root, options))
-    raise _unknown(root, _PHOTOGRAPHS | _RECORDINGS, options)
+    raise _unknown(root, {layout.mark: layout.name for layout in _PHOTOGRAPHS} | _RECORDINGS, options)
 
 
 def is_recording(path: str | Path) -> bool:
@@ -171,18 +168,40 @@ def is_photographs(path: str | Path) -> bool:
     )
 
 
-_PHOTOGRAPHS = {"transforms.json": "nerfstudio", "sparse/0/cameras.bin": "COLMAP", "poses_bounds.npy": "LLFF"}
+class _PhotographLayout(NamedTuple):
+    """A layout of photographs: its name, the file that marks it, whether a folder has it, and its reader."""
+
+    name: str
+    mark: str
+    is_layout_of: Callable[[Path], bool]
+    read: Callable[[Path, ReadOptions], Photographs]
 
 
-def _photograph_layout(root: Path) -> str | None:
-    """Name of the layout of a folder of photographs, judged by its files; None if it has none."""
-    if next(root.glob("transforms*.json"), None):
-        return "nerfstudio"
-    if any(colmap.find(root / place) for place in colmap.PLACES):
-        return "COLMAP"
-    if poses_bounds.find(root) and not next(root.glob("cam*.mp4"), None):
-        return "LLFF"
-    return None
+_PHOTOGRAPHS = (
+    _PhotographLayout(
+        "nerfstudio",
+        "transforms.json",
+        lambda root: next(root.glob("transforms*.json"), None) is not None,
+        lambda root, options: transforms.read_transforms(root, **_unit(options)),
+    ),
+    _PhotographLayout(
+        "COLMAP",
+        "sparse/0/cameras.bin",
+        lambda root: any(colmap.find(root / place) for place in colmap.PLACES),
+        lambda root, options: colmap.read_colmap(root, options.images),
+    ),
+    _PhotographLayout(
+        "LLFF",
+        "poses_bounds.npy",
+        lambda root: bool(poses_bounds.find(root)) and not next(root.glob("cam*.mp4"), None),
+        lambda root, options: poses_bounds.read_llff(root, _axes(root, options), options.images),
+    ),
+)
+
+
+def _photograph_layout(root: Path) -> _PhotographLayout | None:
+    """The layout of a folder of photographs, judged by its files; None if it has none."""
+    return next((layout for layout in _PHOTOGRAPHS if layout.is_layout_of(root)), None)
 
 
 def _open3d(root: Path, options: ReadOptions) -> Sequence:
@@ -249,7 +268,7 @@ def _unknown(root: Path, marks: dict[str, str], options: ReadOptions) -> DataErr
     for folder in (root, root / options.images):
         count = sum(path.suffix.lower() in SUFFIXES for path in folder.iterdir()) if folder.is_dir() else 0
         if count:
-            expected = f"poses of the photographs ({', '.join(_PHOTOGRAPHS)})"
+            expected = f"poses of the photographs ({', '.join(layout.mark for layout in _PHOTOGRAPHS)})"
             return DataError(root, expected, f"{count} photographs without poses", _find_poses(folder))
     expected = ", ".join(f"{mark} ({layout} layout)" for mark, layout in marks.items())
     names = sorted(entry.name for entry in root.iterdir())

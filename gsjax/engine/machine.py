@@ -2,7 +2,7 @@
 
 import os
 import platform
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -104,7 +104,7 @@ def name(machine: dict[str, Any]) -> str:
     return f"{machine['processor']}, {counted(machine['cores'], 'core')}{device}"
 
 
-def in_words(machine: dict[str, Any]) -> str:
+def in_words(machine: Mapping[str, Any]) -> str:
     """The description in one line."""
     extra = ", AVX-512" if machine["avx512"] else ""
     devices = f"{machine['devices']} x " if machine["devices"] > 1 else ""

@@ -32,7 +32,7 @@ def write_report(path: str | Path, summary: Summary) -> None:
     Raises:
         ValueError: a medium has a suffix that browsers do not show.
     """
-    notes = list(summary.notes)
+    notes = summary.all_notes
     sections = [
         _cards(summary.cards),
         _gallery("Videos", summary.videos, _video, notes),

@@ -6,6 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
+from gsjax.engine.machine import in_words
+
 Metrics = Mapping[str, Any]
 """The contents of a run's metrics.json."""
 Better = Literal["more", "less"]
@@ -135,7 +137,8 @@ class Summary:
         tables: figures in detail; those without rows are not drawn.
         videos, plots, images: media, by kind.
         strips: images of several pictures side by side, one below the other.
-        notes: what was not scored and why, warnings, the machine.
+        notes: what was not scored and why, and warnings.
+        machine: metrics.json's description of the machine, the last of the notes; None for none.
         hints: (label, command): what to do next.
         complete: False for a run that was stopped.
     """
@@ -149,8 +152,14 @@ class Summary:
     images: Sequence[Media] = ()
     strips: Sequence[Media] = ()
     notes: Sequence[str] = ()
+    machine: Mapping[str, Any] | None = None
     hints: Sequence[tuple[str, str]] = ()
     complete: bool = True
+
+    @property
+    def all_notes(self) -> list[str]:
+        """The notes, and the machine."""
+        return [*self.notes, *([] if self.machine is None else [f"Machine: {in_words(self.machine)}."])]
 
 
 def cards_of(scores: Iterable[Score], found: Metrics) -> list[Card]:

@@ -37,7 +37,7 @@ def print_summary(
         console.print(_cards(summary.cards))
     if summary.subtitle:
         console.print(Text(summary.subtitle, style="dim"), soft_wrap=not console.is_terminal)
-    for note in summary.notes if notes else ():
+    for note in summary.all_notes if notes else ():
         console.print(Text(note, style="dim"), soft_wrap=not console.is_terminal)
     if not summary.complete:
         console.print("[bold yellow]partial run[/]; continue with --resume")

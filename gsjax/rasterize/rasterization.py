@@ -20,7 +20,7 @@ from gsjax.rasterize.checks import check_inputs, is_concrete
 from gsjax.rasterize.compositing import Lists, Splats, untile
 from gsjax.rasterize.gradients import composite
 from gsjax.rasterize.lanes import LANES, slots
-from gsjax.rasterize.plan import OPTION_NAMES, UNSET, Plan, resolve
+from gsjax.rasterize.plan import HEADROOM, OPTION_NAMES, UNSET, Plan, resolve
 from gsjax.rasterize.projection import Projected, project_gaussians
 
 
@@ -158,7 +158,7 @@ def plan(
     width: int,
     height: int,
     *,
-    headroom: float = 1.25,
+    headroom: float = HEADROOM,
     roi: Bool[Array, "*batch c height width"] | None = None,
     near_plane: float = UNSET,
     far_plane: float = UNSET,

@@ -4,7 +4,6 @@ from typing import Any
 
 from gsjax.engine.deform.scores import OVER_TIME
 from gsjax.engine.folder import RunFolder
-from gsjax.engine.machine import in_words
 from gsjax.engine.summary import Column, Media, Metrics, Score, Summary, Table, at, cards_of, minutes
 from gsjax.viz.colors import label_color
 from gsjax.viz.plots import losses_over_steps, save
@@ -77,7 +76,8 @@ def summarize(folder: RunFolder, found: Metrics) -> Summary:
             for row in found["scores"]
             if "picture" in row
         ],
-        notes=[*names, *found["notes"], f"{_memory(found)}.", f"Machine: {in_words(found['machine'])}."],
+        notes=[*names, *found["notes"], f"{_memory(found)}."],
+        machine=found["machine"],
         complete=found["complete"],
     )
 

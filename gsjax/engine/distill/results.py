@@ -1,7 +1,6 @@
 """The summary of a distillation: agreement with the teacher, classes, pictures of the features."""
 
 from gsjax.engine.folder import RunFolder
-from gsjax.engine.machine import in_words
 from gsjax.engine.summary import Column, Media, Metrics, Score, Summary, Table, at, cards_of, minutes
 from gsjax.viz.plots import losses_over_steps, save
 
@@ -49,7 +48,8 @@ def summarize(folder: RunFolder, found: Metrics) -> Summary:
             for row in found["scores"]
             if "picture" in row
         ],
-        notes=[*names, *found["notes"], f"Machine: {in_words(found['machine'])}."],
+        notes=[*names, *found["notes"]],
+        machine=found["machine"],
         hints=[("query it", f"gsjax query {folder.path} TEXT")],
         complete=found["complete"],
     )

@@ -2,7 +2,6 @@
 
 from gsjax.engine.fit.orbit import NAME as ORBIT
 from gsjax.engine.folder import RunFolder
-from gsjax.engine.machine import in_words
 from gsjax.engine.messages import counted
 from gsjax.engine.summary import (
     Column,
@@ -73,6 +72,7 @@ def summarize(folder: RunFolder, found: Metrics) -> Summary:
         videos=[Media(orbit, "Around the scene")] if orbit.exists() else [],
         plots=[Media(plot, f"PSNR {looked} (blue), and the number of Gaussians (grey), over minutes")],
         strips=[Media(folder.path / row["picture"], row["view"]) for row in shown],
-        notes=[*found["notes"], f"Machine: {in_words(found['machine'])}."],
+        notes=found["notes"],
+        machine=found["machine"],
         complete=found["complete"],
     )

@@ -4,7 +4,6 @@ import shlex
 from collections.abc import Callable
 
 from gsjax.engine.folder import RunFolder
-from gsjax.engine.machine import in_words
 from gsjax.engine.messages import counted
 from gsjax.engine.scores import CAMERA_COLUMNS, camera_rows
 from gsjax.engine.summary import Column, Media, Metrics, Score, Summary, Table, at, cards_of, time_table
@@ -84,7 +83,8 @@ def summarize(folder: RunFolder, found: Metrics) -> Summary:
             time_table(_TIMES, found["seconds"]),
         ],
         videos=[Media(folder.video(row["name"]), f"Camera {row['name']}, {row['kind']}") for row in cameras],
-        notes=[*found["notes"], f"Machine: {in_words(found['machine'])}."],
+        notes=found["notes"],
+        machine=found["machine"],
         hints=_next_steps(folder, found),
         complete=found["complete"],
     )

@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from typing import Any
 
 from gsjax.engine.folder import RunFolder
-from gsjax.engine.machine import in_words
 from gsjax.engine.scores import CAMERA_COLUMNS, camera_rows
 from gsjax.engine.summary import Column, Media, Metrics, Score, Summary, Table, at, cards_of, time_table
 
@@ -96,7 +95,8 @@ def summarize(folder: RunFolder, found: Metrics, plots: Sequence[Media], images:
         ],
         plots=plots,
         images=images,
-        notes=[*found["notes"], f"Machine: {in_words(found['machine'])}."],
+        notes=found["notes"],
+        machine=found["machine"],
         complete=found["complete"],
     )
 

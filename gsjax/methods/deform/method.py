@@ -270,7 +270,7 @@ def _first_scene(gaussians: Gaussians, config: DeformConfig, frames: int, is_tau
     twists."""
     gaussians, _ = cull_invalid(gaussians)
     if not gaussians.num:
-        raise ValueError("gaussians: expected some that are valid, found none")
+        raise ValueError("gaussians: expected at least one that is valid, found none")
     twists = jnp.zeros((frames, 6)) if config.refine_poses else None
     scene = DeformingScene(jax.tree.map(jnp.array, gaussians), None, twists)
     if not is_taught:
