@@ -51,7 +51,7 @@ def run(options: Options) -> int:
     result = read_deformation(path)
     if result.meaning is None:
         raise ValueError(
-            f"{path}: expected a scene that knows what is what, found none; reconstruct it with two classes "
+            f"{path}: expected a scene with named things, found none; reconstruct it with two classes "
             "or more among the pixels that count (gsjax deform DATASET --tools draw), or with --features"
         )
     if len(result.names) < 2:

@@ -86,8 +86,8 @@ class Options(Common):
     """Options of `gsjax query`."""
 
     run: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
-    """Folder of a run of `gsjax track` or `gsjax deform`; of any run with a field (`gsjax distill`); or that
-    holds field.npz. The answer is written to query/ in it, in place of an earlier one."""
+    """Folder of a run of `gsjax track` or `gsjax deform`; of any run with a field (`gsjax distill`); or any
+    folder with field.npz. The answer is written to query/ in it, in place of an earlier one."""
     text: Annotated[str | None, tyro.conf.Positional, tyro.conf.arg(metavar="[TEXT]")] = None
     """The thing to find: "red can". Or use --image, --point or --box. Without any of them, everything in a
     run of `gsjax deform` is labelled."""

@@ -79,7 +79,7 @@ def read_colmap(path: str | Path, images: str = "images") -> Photographs:
     model = next((root / place for place in PLACES if find(root / place)), None)
     if model is None:
         raise DataError(
-            root, "cameras.bin or cameras.txt in sparse/0, sparse or here", "neither", "Give its folder."
+            root, "cameras.bin or cameras.txt in sparse/0, sparse or here", "neither", "Pass its folder."
         )
     suffix = find(model)
     cameras = _READERS[suffix]["cameras"](model / f"cameras{suffix}")

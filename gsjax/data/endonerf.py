@@ -215,7 +215,7 @@ def _stored_depth_unit(root: Path, meta: dict[str, Any], truth: dict[str, np.nda
     if stored is None:
         return _positive(root, "depth_unit_m", meta.get("depth_unit_m", DEFAULT_DEPTH_UNIT_M))
     if stored.size != 1 or stored.dtype.kind not in "fiu" or not 0 < stored.item() < np.inf:
-        expected, advice = "depth_unit_m to be one number above 0", "Regenerate the truth."
+        expected, advice = "depth_unit_m to be one number above 0", "Regenerate the file."
         raise DataError(root / "truth.npz", expected, f"{stored.tolist()}", advice)
     return float(stored.item())
 
@@ -247,10 +247,10 @@ def _read_truth(root: Path, arrays: dict[str, np.ndarray], frames: int) -> Truth
     poses = np.asarray(arrays["T_w_tool"], np.float64) if tool else np.zeros((frames, 0, 4, 4))
     if tracks.ndim != 3 or len(tracks) != frames or tracks.shape[2] != 3:
         expected = f"verts of shape ({frames}, V, 3): frames, vertices"
-        raise DataError(root / "truth.npz", expected, f"{tracks.shape}", "Regenerate the truth.")
+        raise DataError(root / "truth.npz", expected, f"{tracks.shape}", "Regenerate the file.")
     if tool and poses.shape != (frames, 4, 4):
         expected = f"T_w_tool of shape ({frames}, 4, 4): frames"
-        raise DataError(root / "truth.npz", expected, f"{poses.shape}", "Regenerate the truth.")
+        raise DataError(root / "truth.npz", expected, f"{poses.shape}", "Regenerate the file.")
     return Truth(
         names=(LABEL_NAMES[TOOL],) if tool else (),
         label_ids=np.array([TOOL] if tool else [], int),

@@ -250,7 +250,7 @@ def _folder(path: str | Path) -> Path:
     if not root.is_dir():
         known = ", ".join(SIMULATED_PREFIX + name for name in SIMULATED_SCENES)
         found = "a file" if root.exists() else "nothing there"
-        advice = f"Give its folder, or a built-in scene: {known}."
+        advice = f"Pass its folder, or a built-in scene: {known}."
         if clip.is_clip(root):
             found, advice = "a video, which has no poses", _find_poses(root)
         raise DataError(root, "a folder with a recording", found, advice)

@@ -260,7 +260,7 @@ def _read_truth(root: Path, frames: int, present: list[int]) -> Truth | None:
             names, poses = tuple(described[names_key]), np.asarray(arrays[key], np.float64)
             if poses.shape != (frames, len(names), 4, 4):
                 expected = f"{key} of shape {(frames, len(names), 4, 4)}: frames, {names_key} of meta.json"
-                raise DataError(path, expected, f"{poses.shape}", "Regenerate the truth.")
+                raise DataError(path, expected, f"{poses.shape}", "Regenerate the file.")
             labels = np.arange(first_label, first_label + len(names))
             joints = _read_joints(path, described.get("joints", {}), arrays.get("q"), names, frames)
             truth = Truth(names=names, label_ids=labels, poses=poses, robot=robot, joints=joints)
@@ -277,7 +277,7 @@ def _read_joints(
         return ()
     if values.shape != (frames, len(described)):
         expected = f"q of shape {(frames, len(described))}: frames, joints of meta.json"
-        raise DataError(path, expected, f"{values.shape}", "Regenerate the truth.")
+        raise DataError(path, expected, f"{values.shape}", "Regenerate the file.")
     columns = dict(zip(described, np.asarray(values, np.float64).T, strict=True))
     try:
         joints = {
@@ -286,7 +286,7 @@ def _read_joints(
         }
     except (KeyError, TypeError, ValueError) as error:
         expected = "joints with type (slide or hinge), axis_world and point_world"
-        raise DataError(path.parent / "meta.json", expected, f"{error}", "Regenerate the truth.") from None
+        raise DataError(path.parent / "meta.json", expected, f"{error}", "Regenerate the file.") from None
     return tuple(joints.get(name) for name in names)
 
 

@@ -109,7 +109,7 @@ def _read_frames(root: Path) -> tuple[list[int], Float[np.ndarray, "t 4 4"], lis
     if not names:
         parts = sorted(part.name for part in root.glob("seq-*"))
         found = f"the sequences {', '.join(parts)}" if parts else "no frame-NUMBER.pose.txt"
-        advice = f"Give one of them, such as {root / parts[0]}, unpacked." if parts else "Give its folder."
+        advice = f"Pass one of them, such as {root / parts[0]}, unpacked." if parts else "Pass its folder."
         raise DataError(root, "the frames of one sequence", found, advice)
     numbers, poses, images, depths = [], [], [], []
     lost: list[str] = []

@@ -55,7 +55,7 @@ class MotionConfig:
     """Largest number of photographs for which auto matches all pairs."""
     overlap: int = 10
     """In sequential matching, how many of the following photographs each one is matched with, besides those
-    1, 2, 4, ... places on."""
+    1, 2, 4, ... places later."""
     refine_center: bool = True
     """Finally refine the principal point too, if each camera took 20 photographs or more; otherwise it stays
     at the image centre, for which a rotation of all cameras partly compensates."""

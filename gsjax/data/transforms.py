@@ -117,7 +117,7 @@ def _files(path: Path) -> tuple[Path, dict[Path, str | None]]:
             else "nothing there"
         )
         raise DataError(
-            path, "transforms.json or transforms_train.json", found or "an empty folder", "Give its folder."
+            path, "transforms.json or transforms_train.json", found or "an empty folder", "Pass its folder."
         )
     return path, files
 

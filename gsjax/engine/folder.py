@@ -221,8 +221,8 @@ class RunFolder:
         if others:
             words = [f"{n} {stored.get(n)!r}, now it is {given.get(n)!r}" for n in others]
             raise ValueError(
-                f"--resume: the run in {self.path} was begun with {'; with '.join(words)}. Give the same, or "
-                "replace the run with --overwrite instead"
+                f"--resume: the run in {self.path} was started with {'; with '.join(words)}. Use the same, "
+                "or replace the run with --overwrite instead"
             )
 
     def write_metrics(self, metrics: Mapping[str, Any]) -> None:

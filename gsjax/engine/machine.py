@@ -41,7 +41,7 @@ def keep_to_cores(count: int | None) -> None:
     are restricted too.
 
     Raises:
-        ValueError: there are fewer, or this system does not let a process choose.
+        ValueError: there are fewer cores, or the system does not let a process choose its own.
     """
     if count is None:
         return

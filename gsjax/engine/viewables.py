@@ -61,8 +61,8 @@ def open_viewable(path: Path, notes: Notes, now: Whereabouts = AS_IT_WAS) -> tup
         return _of_deformation(path, notes, now.weights), path
     if not (path / "scene.ply").is_file():
         raise FileNotFoundError(
-            f"{path}: expected a run with scene.ply, found none: it is not finished, or of a command that "
-            "keeps no scene; finish it with --resume"
+            f"{path}: expected a run with scene.ply, found none; finish the run with --resume, unless its "
+            "command keeps no scene"
         )
     for file, of_run in (("parts.npz", _of_parts), ("trajectory.npz", _of_track)):
         if (path / file).is_file():

@@ -22,12 +22,12 @@ class SequenceLike(Protocol):
 
     @property
     def num_frames(self) -> int:
-        """T."""
+        """Number of frames, T."""
         ...
 
     @property
     def num_cameras(self) -> int:
-        """C."""
+        """Number of cameras, C."""
         ...
 
     @property

@@ -41,7 +41,7 @@ class PlaneSegmenter:
     min_support_fraction: float = 0.005
     """Smallest fraction of the image that counts as a minor support, whose rim must rise."""
     min_rising: float = 0.5
-    """Fraction of a minor support's rim that must rise."""
+    """Smallest fraction of a minor support's rim that must rise above it."""
     max_planes: int = 8
     """Largest number of planes to find."""
     depth_jump: float = 0.02

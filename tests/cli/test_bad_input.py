@@ -67,7 +67,7 @@ def test_unknown_built_in_scene(refused):
 def test_folder_of_several_sequences(refused, tmp_path):
     (tmp_path / "kitchen" / "seq-01").mkdir(parents=True)
     said = refused(tmp_path / "kitchen")
-    assert "expected the frames of one sequence, found the sequences seq-01. Give one of them" in said
+    assert "expected the frames of one sequence, found the sequences seq-01. Pass one of them" in said
 
 
 def test_missing_image(refused, recording):

@@ -213,7 +213,7 @@ def test_truth(folder):
     np.testing.assert_array_equal(truth.tracks, vertices[1:3])
     for arrays in ({"verts": vertices[:2]}, {"verts": vertices, "T_w_tool": tool[:2]}):
         np.savez(folder / "truth.npz", **arrays)
-        with pytest.raises(DataError, match=r"truth.npz: expected .* of shape \(4, .*Regenerate the truth"):
+        with pytest.raises(DataError, match=r"truth.npz: expected .* of shape \(4, .*Regenerate the file"):
             read_endonerf(folder)
 
 

@@ -121,7 +121,7 @@ def test_frames_without_an_image_are_counted_and_left_out(folder):
 def test_a_scene_of_several_sequences(folder):
     write_frame(folder.parent / "seq-02", 0)
     with pytest.raises(
-        DataError, match=r"found the sequences seq-01, seq-02. Give one of them, such as .*01"
+        DataError, match=r"found the sequences seq-01, seq-02. Pass one of them, such as .*01"
     ):
         open_sequence(folder.parent)
 

@@ -137,7 +137,7 @@ def labels(paths: Sequence[Path]) -> list[str]:
 
 def _data(record: Record, records: Sequence[Record]) -> tuple[str, Any]:
     """What runs must share to be compared. One that is not finished is of the data of which another was that
-    was begun with the same words."""
+    was started with the same words."""
     found = record.metrics
     if found is None and record.kind == "fit":
         named = _words(record)

@@ -35,7 +35,7 @@ def with_depth(sequence: Sequence, wanted: Depth, plane: float, notes: Notes) ->
     if wanted == "stereo" and not two:
         raise ValueError(
             f"--depth stereo: {sequence.name} has one camera, {sequence.camera_ids[0]}; expected a second "
-            "one beside it, as EndoNeRF's folders have in right/ (docs/data.md)"
+            "one to its right, as EndoNeRF's folders have in right/ (docs/data.md)"
         )
     if wanted == "data" or (wanted == "auto" and sequence.has_depth):
         return sequence, "data"

@@ -57,8 +57,7 @@ class QueryableField(Queryable):
         if question.camera is not None:
             if self.run.photographs is None:
                 raise ValueError(
-                    "--camera: expected photographs, found none (see the warning); --images says where they "
-                    "are"
+                    "--camera: expected photographs, found none (see the warning); pass their folder as --images"
                 )
             _index(self.run.photographs, question.camera)
         return 0

@@ -166,8 +166,8 @@ def _photographs(
         if images is not None:
             raise ValueError(f"--images {images}: {describe(error)}") from error
         notes.warn(
-            f"its photographs cannot be read, so nothing is drawn: {describe(error)} (--images says where "
-            "they are now)"
+            f"its photographs cannot be read, so nothing is drawn: {describe(error)}; pass the folder "
+            "that they are in now as --images"
         )
         return None
 

@@ -155,8 +155,8 @@ def run_there(
     worker = import_module("distributed").get_worker()
     if worker.state.nthreads != 1:
         raise ValueError(
-            f"worker {worker.address}: expected one thread, for cells share what a script has loaded, found "
-            f"{worker.state.nthreads}; start it with --nthreads 1"
+            f"worker {worker.address}: expected one thread, because cells share what a script has loaded, "
+            f"found {worker.state.nthreads}; start it with --nthreads 1"
         )
     _wait_until_collected(worker)
     # JAX keeps freed memory. A worker that Dask pauses for that would never continue.

@@ -124,7 +124,7 @@ def find_grasps(options: Options, saved: SavedRun, answer: Answer, console: Cons
     if not normals.any():
         raise ValueError(
             f"{saved.path}: expected normals of {answer.name}, found none: a run from known shapes has none, "
-            "and fingers need two sides to hold. Track it from depth images"
+            "and a grasp needs two sides that face away from each other. Track it from depth images"
         )
     approach = None if options.approach is None else jnp.asarray(options.approach, float)
     how = {"samples": options.samples, "approach": approach, "max_angle": options.max_angle}

@@ -313,7 +313,7 @@ def _facts(found: dict[str, Any]) -> dict[str, str]:
             "late": f"{found['late']} updates were over the budget",
         }
     if found["skipped"]:
-        facts["skipped"] = f"{found['skipped']} updates were not finite and were left out"
+        facts["skipped"] = f"{found['skipped']} updates gave non-finite values and were skipped"
     for title, key in (("lost", "frames_lost"), ("turn unknown", "frames_turn_unknown")):
         counts = [f"{name} in {count} updates" for name, count in found[key].items() if count]
         if counts:

@@ -93,6 +93,6 @@ def _saved_poses(folder: Path, frames: int, like: Pose) -> list[Pose]:
     if len(poses) != frames - 1:
         raise CheckpointError(
             f"{folder}: expected the poses of {frames - 1} updates, found {len(poses)}; parts are missing. "
-            "Begin anew without --resume"
+            "Start again without --resume"
         )
     return poses

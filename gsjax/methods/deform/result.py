@@ -137,8 +137,8 @@ class DeformResult:
     def _expect_features(self) -> Meaning:
         if self.meaning is None or self.scene.gaussians.features is None:
             raise ValueError(
-                "features: expected a scene that learned from a teacher, found none; give it two classes of "
-                'masks that count (tools="draw"), or another teacher'
+                "features: expected a scene that learned from a teacher, found none; it needs two "
+                'classes of masks (tools="draw" makes the tools one) or another teacher'
             )
         return self.meaning
 

@@ -124,4 +124,4 @@ def test_what_is_no_run_of_it_or_knows_nothing(gsjax, tmp_path):
     assert (code, "expected a scene that `gsjax deform` wrote" in said) == (2, True)
     bare = written(tmp_path / "bare", names=())
     code, said = gsjax("ask", bare)
-    assert (code, "knows what is what, found none" in said) == (2, True)
+    assert (code, "a scene with named things, found none" in said) == (2, True)

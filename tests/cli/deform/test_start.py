@@ -120,5 +120,5 @@ def test_what_is_not_there_is_named(gsjax, clip, tmp_path):
     assert "--depth data: pulled has none; leave it at auto" in said
     code, said = gsjax("deform", clip, "--out", tmp_path / "run", "--depth", "stereo")
     assert code == 2
-    assert "--depth stereo: pulled has one camera, 0; expected a second one beside it" in said
+    assert "--depth stereo: pulled has one camera, 0; expected a second one to its right" in said
     assert not (tmp_path / "run").exists()

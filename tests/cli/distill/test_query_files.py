@@ -59,7 +59,7 @@ def test_photographs_are_where_they_are_said_to_be(gsjax, field, pristine, scene
     code, said = gsjax("query", field, "can")
     assert code == 0, said
     assert "its photographs cannot be read, so nothing is drawn" in said
-    assert "--images says where they are now" in said
+    assert "pass the folder that they are in now as --images" in said
     assert not (field / "query" / "masks").exists()
     for options in (("can",), ("--point", "1,1")):
         code, said = gsjax("query", field, *options, "--camera", 0)

@@ -64,7 +64,7 @@ def test_other_options_are_no_resuming(pristine, gsjax_track, still, tmp_path):
     (tmp_path / "run" / "report.html").unlink()
     code, said = gsjax_track(pristine, "--cameras", "0", "--frames", "0:3", "--resume")
     assert code == 2
-    assert "was begun with frames '0:2', now it is '0:3'" in " ".join(said.split())
+    assert "was started with frames '0:2', now it is '0:3'" in " ".join(said.split())
     code, said = gsjax_track(pristine, "--cameras", "0", "--frames", "0:2", "--resume")
     assert code == 2
     assert "was stopped before its state was saved" in " ".join(said.split())
