@@ -38,7 +38,7 @@ class Record:
         path: its folder.
         kind: the command that made it.
         config: the contents of config.yml.
-        metrics: the contents of metrics.json; None while the run goes on, or if it was killed.
+        metrics: the contents of metrics.json; None while the run is in progress, or if it was killed.
         curve: the rows of metrics.jsonl, of a fit.
         evaluation: the scores of `gsjax eval` for the present scene; None without any.
         notes: what was ignored, and why.

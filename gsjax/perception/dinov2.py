@@ -19,8 +19,8 @@ class Dinov2Encoder:
     """Features of the last layer's patches, interpolated to pixels; from `load_dinov2`.
 
     Attributes:
-        model, processor: objects of transformers.
-        torch: the module.
+        model, processor: the network and its preprocessor, from the transformers package.
+        torch: the torch module.
         device: the device that holds the model.
         resolution: shorter side of the model's input, pixels, rounded to whole patches. Larger resolves more.
     """

@@ -57,7 +57,8 @@ class QueryableField(Queryable):
         if question.camera is not None:
             if self.run.photographs is None:
                 raise ValueError(
-                    "--camera: expected photographs, found none (see the warning); pass their folder as --images"
+                    "--camera: expected photographs, found none (see the warning); pass their folder "
+                    "as --images"
                 )
             _index(self.run.photographs, question.camera)
         return 0
