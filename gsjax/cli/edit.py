@@ -128,8 +128,8 @@ def _folder(options: Options) -> Path:
     if folder.is_dir() and any(folder.iterdir()):
         if not (folder / SCRIPT).is_file():
             raise FileExistsError(
-                f"{folder}: expected a new folder, an empty one or one of an earlier film (which has "
-                f"{SCRIPT}), found other files; name another --out"
+                f"{folder}: expected a new or empty folder, or that of an earlier film (with "
+                f"{SCRIPT}), found other files; choose another --out"
             )
         if not options.overwrite:
             raise FileExistsError(

@@ -11,7 +11,6 @@ from jaxtyping import Int
 from rich.console import Console
 from rich.progress import track
 
-from gsjax.data.errors import DataError
 from gsjax.data.photographs import Photographs
 from gsjax.engine.fit.judge import Compared, Judge, write_panel
 from gsjax.engine.folder import replaced_folder
@@ -167,12 +166,7 @@ def _choose(options: Options, record: Record) -> Chosen:
         ValueError: they cannot be read, are others than those of the fit, or none is held out.
     """
     config, dataset = record.config, options.images or str(record.config.get("dataset"))
-    try:
-        photographs = photographs_of_run(config, dataset)
-    except DataError as error:
-        raise ValueError(
-            f"{error} The fit read it from there; if it was moved, give its new place with --images"
-        ) from error
+    photographs = photographs_of_run(config, dataset)
     train, held_out = split(photographs, config["test_every"])
     names = [photographs.names[i] for i in held_out]
     known = (record.metrics or {}).get("views")

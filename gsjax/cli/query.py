@@ -59,9 +59,9 @@ class FieldOptions:
     image: Path | None = None
     """A picture of the thing to find; with an alpha channel, only its opaque part."""
     scene: Annotated[Path | None, tyro.conf.arg(metavar="PLY")] = None
-    """The scene's file, where it is now (default: where it was, or beside the field)."""
+    """Present path of the scene's file, if it was moved (default: its first path, or next to the field)."""
     images: Annotated[str | None, tyro.conf.arg(metavar="FOLDER")] = None
-    """The photographs, where they are now."""
+    """Present folder of the photographs, if they were moved."""
 
 
 @dataclass(frozen=True)
@@ -73,7 +73,7 @@ class DeformOptions:
     frame: Annotated[int | None, tyro.conf.arg(metavar="ID")] = None
     """The frame of --point or --box, whose Gaussians are written (default: the first)."""
     frames: Annotated[str | None, tyro.conf.arg(metavar="START:STOP[:STEP]")] = None
-    """Frames to draw, as Python slices them (default: the held-out ones)."""
+    """Frames to draw, as a Python slice (default: the held-out ones)."""
 
 
 @dataclass(frozen=True)
@@ -92,8 +92,8 @@ class Options(Common):
     """The thing to find: "red can". Or use --image, --point or --box. Without any of them, everything in a
     run of `gsjax deform` is labelled."""
     camera: Annotated[str | None, tyro.conf.arg(metavar="ID")] = None
-    """Camera (or photograph) to show it from, and of a --point. Default: for a tracked run the first held-out
-    one, else the first; for a field all."""
+    """Camera (or photograph) to show the result from, and that --point refers to. Default: for a tracked run
+    the first held-out camera or, without one, the first; for a field, all."""
     weights: Path | None = None
     """Folder of CLIP's weights, in Hugging Face's layout. For CLIP features: where the weights are now, if
     they were moved."""

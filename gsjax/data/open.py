@@ -235,8 +235,8 @@ def _axes(root: Path, options: ReadOptions) -> poses_bounds.Axes:
         return "endonerf"
     if options.axes is None:
         raise ValueError(
-            f"{root}: poses_bounds.npy does not state the meaning of its columns; give axes (--read.axes), "
-            "llff (down, right, back) or endonerf (right, up, back)"
+            f"{root}: poses_bounds.npy does not state the meaning of its columns; set axes (--read.axes) "
+            "to llff (down, right, back) or endonerf (right, up, back)"
         )
     return options.axes
 

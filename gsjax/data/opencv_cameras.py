@@ -109,7 +109,7 @@ def snapshots(cameras: Sequence[RgbdCamera]) -> Iterator[Snapshot]:
         sizes = {image.shape[:2] for image in (*images, *depths)}
         if len(sizes) > 1:
             raise DataError(
-                "cameras", "pictures of one size", f"{sorted(sizes)}", "Set one video mode for all."
+                "cameras", "pictures of the same size", f"{sorted(sizes)}", "Set the same video mode on all."
             )
         height, width = images[0].shape[:2]
         colors = jnp.asarray(np.stack(images)[..., ::-1], jnp.float32) / 255

@@ -234,9 +234,9 @@ def _present_frames(root: Path, names: list[list[str]]) -> list[int]:
     exists = np.array([[_image_path(root, name).exists() for name in frame] for frame in names])
     some, every = exists.any(1), exists.all(1)
     if not some.any():
-        found = f"none of {exists.size}, for example no {names[0][0]}"
+        found = f"none of {exists.size} ({names[0][0]} is missing, for example)"
         advice = "Was the folder copied completely?"
-        raise DataError(root / "ims", "the images listed in the meta", found, advice)
+        raise DataError(root / "ims", "the images listed in the metadata", found, advice)
     if (some & ~every).any():
         t = int(np.argmax(some & ~every))
         missing = [name for name, present in zip(names[t], exists[t], strict=True) if not present]

@@ -38,10 +38,10 @@ def read_llff(path: str | Path, axes: Axes, images: str = "images") -> Photograp
     Args:
         path: the folder.
         axes: meaning of the columns of R: "llff" down, right, back; "endonerf" right, up, back.
-        images: name of the photographs' folder in it; the photographs may be downscaled copies.
+        images: name of the folder of photographs inside `path`; the photographs may be downscaled copies.
 
     Raises:
-        DataError: a file is missing or malformed, or the number of photographs and rows differ.
+        DataError: a file is missing or malformed, or the numbers of photographs and rows differ.
         ValueError: `axes` is invalid, or a pose is not a rigid motion.
     """
     root = Path(path)

@@ -78,7 +78,7 @@ def check_tool(load: Callable[[int], np.ndarray], frames: int, tool: Tool, where
     advice = f"Are they inverted? Then the tool is {other}: set tool (--read.tool {other})."
     if (shares == 1).all():
         found = f"only tool in all {len(shares)} checked frames"
-        raise DataError(where, f"masks with the tool {tool} and some tissue", found, advice)
+        raise DataError(where, f"masks with a {tool} tool and some tissue", found, advice)
     many = np.sum(shares > 0.5)
     if 2 * many > len(shares):
         found = f"in {many} of {len(shares)} frames the tool covers more than half of the picture"

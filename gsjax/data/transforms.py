@@ -136,7 +136,7 @@ def _named_splits(file: Path, meta: dict[str, Any]) -> dict[Path, str]:
             f"only {' and '.join(key for key in (f'{split}_filenames' for split in SPLITS) if meta.get(key))}"
         )
         advice = "Add it, or remove the other lists."
-        raise DataError(file, "train_filenames besides other lists", found, advice)
+        raise DataError(file, "train_filenames as well as the other lists", found, advice)
     known = {Path(str(entry.get("file_path"))) for entry in meta["frames"] if isinstance(entry, dict)}
     if unknown := [str(name) for name in named if name not in known]:
         expected = "names of frames in train_filenames, val_filenames and test_filenames"

@@ -162,7 +162,7 @@ class OfRecording(Common, Resuming, HeldOut, Selection, DatasetAndOut):
 
 @dataclass(frozen=True, kw_only=True)
 class OfDataset(Common, Resuming, Timed, Seeded, HeldOutFrames, Selection, DatasetAndOut):
-    """Options of commands that make a run from a dataset by learning step by step."""
+    """Options of commands that train on a dataset and write a run."""
 
 
 def checked(options: AnyOptions) -> AnyOptions:

@@ -89,16 +89,22 @@ def photographs_of_run(settings: Mapping[str, Any], dataset: str | None = None) 
     """The photographs of a fit, by the settings of its config.yml; `dataset` is their path if it has changed.
 
     Raises:
-        DataError: they cannot be read.
+        ValueError: they cannot be read.
         KeyError, TypeError, ValueError: the settings are not those of a fit.
     """
     more = {name: settings[name] for name in ("frames", "cameras", "eval_cameras") if name in settings}
-    return choose_photographs(
-        dataset or str(settings["dataset"]),
-        read_options(settings.get("read") or {}),
-        scale=float(settings.get("scale", 1.0)),
-        **more,
-    )
+    try:
+        return choose_photographs(
+            dataset or str(settings["dataset"]),
+            read_options(settings.get("read") or {}),
+            scale=float(settings.get("scale", 1.0)),
+            **more,
+        )
+    except DataError as error:
+        raise ValueError(
+            f"{error} The fit read its photographs from there; if they were moved, pass their new folder as "
+            "--images"
+        ) from error
 
 
 def split(photographs: Photographs, every: int) -> tuple[Int[np.ndarray, "a"], Int[np.ndarray, "b"]]:

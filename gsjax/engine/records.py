@@ -155,6 +155,6 @@ def _expect(file: Path, found: Any, wanted: tuple[str, ...]) -> None:
     missing = [name for name in wanted if not isinstance(found, dict) or name not in found]
     if missing:
         raise ValueError(
-            f"{file}: expected {', '.join(wanted)}, found no {missing[0]}: it is of another version of "
-            "gsjax; run it again"
+            f"{file}: expected {', '.join(wanted)}, found no {missing[0]}: the file is of another "
+            "version of gsjax; run the command again"
         )

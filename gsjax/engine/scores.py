@@ -56,10 +56,10 @@ class CameraScores:
 
 
 class Scores:
-    """Pictures, depth and labels against what the cameras saw.
+    """Scores of rendered pictures, depth and labels against what the cameras saw.
 
     Args:
-        values: the mask value that each group of the scene stands for, [K+1]; None scores no labels.
+        values: the mask value that each group of the scene stands for, [K+1]; None: labels are not scored.
         robot: the robot's mask value, or None.
     """
 

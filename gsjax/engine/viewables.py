@@ -132,9 +132,7 @@ def _of_fit(path: Path, notes: Notes, now: Whereabouts) -> Viewable:
             photographs = photographs_of_run(settings, now.images)
             shots = _shots_of(photographs)
         except (ValueError, OSError) as error:
-            notes.warn(
-                f"its photographs are not shown: {describe(error)} (--images gives their present path)"
-            )
+            notes.warn(f"its photographs are not shown: {describe(error)}")
     except (yaml.YAMLError, KeyError, TypeError, AttributeError) as error:
         raise ValueError(f"{config}: expected the settings of a fit, found others ({error})") from error
     background = photographs.background if photographs is not None and behind == "data" else None

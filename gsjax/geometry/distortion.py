@@ -79,8 +79,9 @@ def undistort(points: Float[Array, "*n 2"], coeffs: Coeffs, model: str = "opencv
     """The inverse of `distort`, by Newton's method, differentiated exactly by the implicit function theorem.
 
     A point is invalid if it lies beyond the fold (nothing is distorted to there) or so near to it that the
-    condition number exceeds 1e4, if it is 90 degrees off axis, or if it is not finite; all points are invalid
-    if a coefficient is not finite. For invalid points the result is finite and its gradients are zero.
+    condition number exceeds 1e4, if it is 90 degrees or more off axis, or if it is not finite; all points
+    are invalid if a coefficient is not finite. For invalid points the result is finite and its gradients are
+    zero.
 
     Args:
         points: distorted, normalised.

@@ -210,8 +210,8 @@ def _read(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         ) from error
     if written != _FORMAT:
         raise CheckpointError(
-            f"{path}: expected a checkpoint of format {_FORMAT}, found format {written}, of another version "
-            f"of gsjax; {_ANEW}"
+            f"{path}: expected a checkpoint of format {_FORMAT}, found format {written}, written by another "
+            f"version of gsjax; {_ANEW}"
         )
     if not intact:
         raise CheckpointError(

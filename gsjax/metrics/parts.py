@@ -124,8 +124,8 @@ def joint_error(found: Joint, true: Joint, middle: Float[np.ndarray, "3"], ancho
     """Compare two joints over the same frames.
 
     An axis and its opposite, with values of opposite sign, describe the same joint; the found joint is taken
-    with the axis closer to the true one. Values are relative to the part's pose in the canonical scene, which
-    may be ajar for the true joint, so only differences from the anchor's value are compared.
+    with the axis closer to the true one. Values are relative to the part's pose in the canonical scene, where
+    the true joint may be ajar, so only differences from the anchor's value are compared.
 
     The axes of two nearly parallel hinges approach each other somewhere, possibly far away, so their smallest
     distance would miss half of the error. The distance is therefore measured from the point on the true axis

@@ -282,6 +282,6 @@ def _read(file: Path) -> dict[str, np.ndarray]:
         return _READERS[file.suffix.lower()](file)
     except (ValueError, KeyError, TypeError, AttributeError, EOFError, zipfile.BadZipFile) as error:
         raise ValueError(
-            f"{file}: expected arrays by name, found a file that cannot be read ({error}); make it again. "
-            f"{CONVERT}"
+            f"{file}: expected named arrays, found a file that cannot be read ({error}); convert the "
+            f"weights again. {CONVERT}"
         ) from error

@@ -33,7 +33,7 @@ class MaskClipEncoder:
 
     @property
     def min_score(self) -> float:
-        """A query whose best cosine is lower matches nothing in view; that of `ClipEncoder`."""
+        """A query whose best cosine is lower matches nothing in view; the same as for `ClipEncoder`."""
         return self.clip.min_score
 
     def __call__(self, images: Num[np.ndarray, "C H W 3"]) -> Float[np.ndarray, "C h w D"]:

@@ -134,7 +134,7 @@ def load_sam(path: str | os.PathLike, device: str = "cpu") -> SamSegmenter:
     """SAM from a folder of weights in the layout of Hugging Face.
 
     Raises:
-        FileNotFoundError: the folder or a file of it is missing.
+        FileNotFoundError: the folder, or a file in it, is missing.
         ValueError: the folder points to pickled weights.
         MissingExtra: torch or transformers is not installed.
     """

@@ -1,7 +1,7 @@
 """Segmenters without weights: objects are what protrudes from planes, or regions of similar colour.
 
-They use only geometry and colour, not semantics, and are named accordingly. Masks of a foundation model, or
-from files, are better where available.
+They use only geometry and colour, not semantics, and are named accordingly. Masks from a
+foundation model or from files are better, where available.
 """
 
 from dataclasses import dataclass, field
@@ -47,7 +47,7 @@ class PlaneSegmenter:
     depth_jump: float = 0.02
     """Largest relative difference of depth between neighbouring pixels of one object."""
     color_jump: float | None = None
-    """Largest difference of smoothed CIELAB colour between neighbouring pixels of one object; None does not
+    """Largest difference in smoothed CIELAB colour between neighbouring pixels of one object; None does not
     split by colour."""
     min_pixels: int = 60
     """Smaller components are dropped."""
@@ -129,7 +129,7 @@ class RegionSegmenter:
     sigma: float = 0.8
     """Standard deviation of the blur before segmentation, pixels."""
     merge_distance: float = 12.0
-    """Largest difference of mean CIELAB colour at which neighbouring regions are merged."""
+    """Largest difference in mean CIELAB colour at which neighbouring regions are merged."""
     max_fraction: float = 0.25
     """A region that covers more of the image is background."""
     max_border_fraction: float = 0.1

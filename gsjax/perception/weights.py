@@ -77,7 +77,7 @@ def _check_no_pickles(folder: Path) -> None:
         )
     if (adapter := folder / "adapter_config.json").exists():
         raise ValueError(
-            f"{adapter}: expected the weights of a whole model, found an adapter to one; merge it into the "
+            f"{adapter}: expected the weights of a whole model, found only an adapter; merge it into the "
             "model (with merge_and_unload and save_pretrained of peft)"
         )
     if not (folder / _WHOLE).is_file():

@@ -75,7 +75,7 @@ def start_tile(num_pixels: int, channels: int, dtype=jnp.float32) -> TileState:
     """The state of pixels that nothing covers yet.
 
     Args:
-        num_pixels: P.
+        num_pixels: number of pixels, P.
         channels: number of composited channels.
         dtype: type of values and light.
     """

@@ -88,7 +88,7 @@ def rasterization(
     tiles_per_batch: int | None = UNSET,
     sort: str = UNSET,
 ) -> tuple[Float[Array, "*batch c height width d"], Float[Array, "*batch c height width 1"], Meta]:
-    """Draw 3D Gaussians (Kerbl et al. 2023) into one or many cameras.
+    """Render 3D Gaussians (Kerbl et al. 2023) for one or more cameras.
 
     Differentiable in everything continuous: means, quats, scales, opacities, colors, features, viewmats, Ks,
     backgrounds, means2d_offset. Gaussians that cannot be drawn (NaN, a zero quaternion, no area, a colour

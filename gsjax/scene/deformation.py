@@ -30,8 +30,9 @@ class DeformationConfig:
     """Sizes of a deformation field, and what it changes besides positions, orientations and scales."""
 
     kind: Literal["hexplane", "mlp", "voxels"] = "hexplane"
-    """Encoding of position and time: six planes per level, one for each pair of axes (Cao and Johnson 2023);
-    sinusoids of both; or dense voxels in space with sinusoids of the time (SurstSplat, section 2.1)."""
+    """Encoding of position and time: six planes per level, one for each pair of axes (hexplane; Cao and
+    Johnson 2023); sinusoids of both (mlp); or dense voxels in space with sinusoids of time (voxels;
+    SurstSplat, section 2.1)."""
     rotation: Literal["exp", "add"] = "exp"
     """Axis and angle composed with the rotation, as in SurstSplat, or a difference of quaternions, as in
     GaussianClin."""

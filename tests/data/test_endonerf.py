@@ -129,7 +129,7 @@ def test_a_tool_that_is_near_in_a_few_frames_is_no_inverted_mask(folder):
 def test_masks_with_only_tool_are_refused(folder, tool, value):
     each(folder, "masks", lambda mask: np.full_like(mask, value))
     other = {"white": "black", "black": "white"}[tool]
-    says = rf"masks: expected masks with the tool {tool} .*only tool in all 4 .*--read.tool {other}"
+    says = rf"masks: expected masks with a {tool} tool .*only tool in all 4 .*--read.tool {other}"
     with pytest.raises(DataError, match=says):
         read_endonerf(folder, tool=tool)
 
@@ -249,7 +249,7 @@ def test_axes_are_required_for_an_ambiguous_layout(folder):
     for path in (folder / "depth").iterdir():
         path.unlink()
     (folder / "depth").rmdir()
-    with pytest.raises(ValueError, match=r"does not state the meaning of its columns; give axes"):
+    with pytest.raises(ValueError, match=r"does not state the meaning of its columns; set axes"):
         open_sequence(folder)
     sequence = open_sequence(folder, ReadOptions(axes="endonerf"))
     assert (sequence.depth(0, 0), sequence.has_masks) == (None, True)

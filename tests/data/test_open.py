@@ -104,7 +104,7 @@ def test_photographs_are_no_recording(tmp_path, write, layout):
 def test_options_for_what_a_folder_leaves_open_are_required(tmp_path):
     llff(tmp_path)
     with pytest.raises(
-        ValueError, match=r"does not state the meaning of its columns; give axes \(--read.axes\)"
+        ValueError, match=r"does not state the meaning of its columns; set axes \(--read.axes\)"
     ):
         open_photographs(tmp_path)
     (tmp_path / "images").rename(tmp_path / "images_8")

@@ -271,7 +271,7 @@ def with_all(**changes):
         (with_all(test_filenames=[["a"]]), r"expected test_filenames, a list of names"),
         (
             with_all(val_filenames=["images/0.png"], test_filenames=["images/1.png"]),
-            r"transforms.json: expected train_filenames besides other lists, found only val_filenames and te",
+            r"transforms.json: expected train_filenames as well as the other lists, found only val_filenames",
         ),
         (
             with_all(train_filenames=["images/0.png", "images/7.png"]),

@@ -114,10 +114,10 @@ def test_masks_with_maps_give_the_weighted_mean_of_both_losses(scene, weight):
 
 
 def test_teachers_that_do_not_match_are_refused():
-    with pytest.raises(ValueError, match="expected one of masks and one of maps"):
+    with pytest.raises(ValueError, match="expected one with masks and one with maps"):
         with_maps(maps(), objects())
     other = teacher_of_maps([np.ones((9, 12, 5))] * 3, [(HEIGHT, WIDTH)] * 3)
-    with pytest.raises(ValueError, match="expected features of 24 numbers as the objects have, found 5"):
+    with pytest.raises(ValueError, match="expected features of dimension 24 as the objects have, found 5"):
         with_maps(objects(), other)
     fewer = maps()._replace(maps=maps().maps[:2])
     with pytest.raises(ValueError, match="expected maps of 3 views, found 2"):

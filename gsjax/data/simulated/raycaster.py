@@ -47,7 +47,7 @@ class Scene:
         viewmats: world to camera, OpenCV axes, [T,C,4,4].
         width: pixels.
         height: pixels.
-        sizes: for primitives that deform, by index: their size in each frame, [T,n], instead of their own.
+        sizes: size in each frame, [T,n], of each primitive that deforms, by its index; replaces its own size.
     """
 
     primitives: tuple[Primitive, ...]

@@ -81,7 +81,9 @@ def compare(records: Sequence[Record], same_views: Callable[[list[Record], str],
     kinds = {record.kind: [str(r.path) for r in records if r.kind == record.kind] for record in records}
     if len(kinds) > 1:
         listed = " and ".join(f"`gsjax {kind}` ({', '.join(names)})" for kind, names in kinds.items())
-        raise ValueError(f"expected runs of one command, found those of {listed}; compare each alone")
+        raise ValueError(
+            f"expected runs of one command, found those of {listed}; compare each command's runs separately"
+        )
     labelled = dict(zip(labels([record.path for record in records]), records, strict=True))
     kind, notes = records[0].kind, [note for record in records for note in record.notes]
     groups: dict[Any, Group] = {}

@@ -236,8 +236,8 @@ def _has_classes(sequence: Sequence, count: int, features: str) -> bool:
         raise ValueError(f"--features classes: {sequence.name} has no masks; leave it at auto, or give masks")
     if features == "classes" and count < 2:
         raise ValueError(
-            "--features classes: expected two classes or more among pixels that count, found "
-            f"{count}; --tools draw counts tools too"
+            "--features classes: expected two classes or more to learn, found "
+            f"{count}; --tools draw makes the tools one of them"
         )
     return count >= 2 and features != NO_TEACHER
 

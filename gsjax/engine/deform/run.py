@@ -52,7 +52,7 @@ class Options(TeacherOptions, OfDataset):
     """Mask values that are tools, whatever their names."""
     depth: Depth = "auto"
     """Source of the depth: data (files), stereo (matching the training camera with the next one) or plane (no
-    depth: the scene starts as a plane, and lengths have no unit). auto: the first of these that exists."""
+    depth: the scene starts as a plane, and lengths have no unit). auto: the first that is available."""
     deform: DeformConfig = field(default_factory=lambda: PRESETS["surst"])
     """Settings of the scene and its training."""
 

@@ -10,7 +10,6 @@ import jax.numpy as jnp
 import numpy as np
 import tyro
 
-from gsjax.data.errors import DataError
 from gsjax.data.open import ReadOptions
 from gsjax.data.photographs import Photographs, photographs_of
 from gsjax.engine.files import read_arrays, reopen
@@ -33,8 +32,9 @@ class SceneAndImages:
     """Folder of a run of `gsjax fit`, `gsjax track` (its first frame) or `gsjax parts` (its canonical frame);
     or a PLY file from any program, with --images and --out."""
     images: str | None = None
-    """Photographs of a PLY file's scene, posed in its world, of which --frames, --cameras, --eval-cameras
-    and --test-every select some. For a run: the present location of its photographs."""
+    """Photographs of a PLY file's scene, with poses in its coordinates, among which --frames, --cameras,
+    --eval-cameras and --test-every select. For a run: the present folder of its photographs, if they
+    were moved."""
 
 
 @dataclass(frozen=True)
@@ -122,12 +122,7 @@ def scene_of_run(path: Path, images: str | None = None, gaussians: Gaussians | N
         first = recording.judged.select(frames=slice(0, 1))
         indices, count = list(range(first.num_cameras)), recording.tracked.num_cameras
         return FieldScene(file, gaussians, photographs_of(first), indices[:count], indices[count:])
-    try:
-        photographs = photographs_of_run(record.config, images)
-    except DataError as error:
-        raise ValueError(
-            f"{error} The fit read it from there; if it was moved, give its new place with --images"
-        ) from error
+    photographs = photographs_of_run(record.config, images)
     photographs = _as_learned(photographs, path / "cameras.npz")
     mode = "antialiased" if record.config["fit"].get("antialiased") else "classic"
     return FieldScene(file, gaussians, photographs, *_split(photographs, record.config["test_every"]), mode)

@@ -53,7 +53,7 @@ def read_config(path: Path, root: Path) -> tuple[Config, tuple[Column, ...], Fig
     folder of all experiments, `root`, must contain the script.
 
     Raises:
-        ValueError: it is no YAML, or a key is invalid.
+        ValueError: the file is not YAML, or a key is invalid.
     """
     try:
         found = yaml.safe_load(path.read_text(encoding="utf-8"))

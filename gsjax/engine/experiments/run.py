@@ -152,7 +152,7 @@ def _check_executor(options: Run) -> None:
         check_scheduler(options.scheduler, options.workers)
     elif options.workers is not None or options.scheduler != PROCESSES:
         given = "--workers" if options.workers is not None else "--scheduler"
-        raise ValueError(f"{given}: expected with --executor dask, found --executor local")
+        raise ValueError(f"{given}: expected --executor dask, found --executor local; leave {given} out")
 
 
 def _line(cell: Cell, record: dict[str, Any]) -> Text:

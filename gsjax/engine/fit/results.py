@@ -48,7 +48,7 @@ _TIMES = {
 
 
 def summarize(folder: RunFolder, found: Metrics) -> Summary:
-    """The summary of a fit, whose curve is drawn into the folder."""
+    """The summary of a fit; also draws its curve into the folder."""
     photographs = found["photographs"]
     looked = f"of {counted(photographs['looked_at'], 'held-out view')}"
     plot = save(fit_curve(found["curve"]), folder.plot("curve"))

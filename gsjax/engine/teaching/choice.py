@@ -25,9 +25,10 @@ class TeacherOptions(SamWeights, ClipWeights):
     each mask; no foundation model), clip or maskclip (with --weights), or a folder of feature files
     (LangSplat's, Feature-3DGS's, LERF's, .npy, .npz; named like the pictures, or by frame number). auto:
     classes if there are mask files, else closed. gsjax deform also accepts none, and its auto means none if
-    the pixels that count have fewer than two mask classes."""
+    fewer than two mask classes are left to learn (tools are left out by default)."""
     masks: Masks = "auto"
-    """Source of the masks: the recording's own files, or a segmenter without weights. auto: files, if any."""
+    """Source of the masks: the recording's own files, or a segmenter without weights. auto: the
+    files, or the segmenter if there are none."""
     level: Level = "default"
     """Size of objects in LangSplat's files."""
 

@@ -41,7 +41,7 @@ class Source:
         """The inverse of `plain`.
 
         Raises:
-            KeyError, TypeError, ValueError: it is not what `plain` makes.
+            KeyError, TypeError, ValueError: `stored` is not what `plain` makes.
         """
         names = {int(label): str(name) for label, name in stored["names"].items()}
         if stored["kind"] not in ABOUT:

@@ -58,8 +58,8 @@ def metrics(
     motion: dict[int, ObjectScore],
     values: np.ndarray | None,
 ) -> dict[str, Any]:
-    """The scores of metrics.json; what was not scored is None: the motion of an object that is not tracked,
-    though some Gaussian may lie on it. docs/track.md explains each score.
+    """The scores of metrics.json; what was not scored is None, for example the motion of an object that
+    is not tracked. docs/track.md explains each score.
 
     Args:
         tracking: the scene and its poses.

@@ -22,8 +22,8 @@ class Answer(NamedTuple):
 
     Attributes:
         text: a sentence.
-        value: the value; None if it is unknown, such as for a class that is not in view, or given by the
-            sentence only.
+        value: the value; None if it is unknown (for example, if a class is not in view) or given only in the
+            sentence.
         unit: unit of the value, "" if it has none.
     """
 

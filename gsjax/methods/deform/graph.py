@@ -47,9 +47,9 @@ class GraphConfig:
     nodes: int = 256
     """Number of nodes."""
     neighbors: int = 8
-    """Edges from a node within its frame."""
+    """Number of edges from each node to others of its frame."""
     matches: int = 4
-    """Edges from a node to each other frame of the window."""
+    """Number of edges from each node to every other frame of the window."""
     window: int = 2
     """Number of frames on either side of a step's frame."""
     tau_x: float = 0.1

@@ -100,7 +100,9 @@ def text_prompt(
     """
     if meaning.source.kind == "classes" or plain_words(text) in map(plain_words, meaning.names):
         if negatives is not None:
-            raise ValueError("--negatives: a name is compared with the other names; leave it out")
+            raise ValueError(
+                "--negatives: the name of a class is compared with the other names; leave --negatives out"
+            )
         return _name_prompt(meaning, meaning.codebook, _row_of(meaning.names, text))
     try:
         loaded = meaning.source.encoder() if encoder is None else encoder()

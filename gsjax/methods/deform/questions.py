@@ -191,7 +191,7 @@ def parse_question(text: str, names: Sequence[str]) -> Question:
     if unknown is not None:
         raise ValueError(f"{text!r}: expected things of this scene, found {unknown!r}; there are: {known}")
     raise ValueError(
-        f"{text!r}: expected one of these questions, with frames F and G, and X and Y of {known}: "
+        f"{text!r}: expected one of these questions, where F and G are frames, X and Y among {known}: "
         + " ".join(kind.example for kind in QUESTIONS)
     )
 

@@ -22,7 +22,7 @@ _LEAST_NORM = 1e-12
 def gaussian_cosines(
     field: FeatureField, located: Located | None, queries: Float[Array, "q d"]
 ) -> Float[Array, "n q"]:
-    """cos(W f_i, q) of each Gaussian and query, exactly; 0 where one of them has length 0.
+    """cos(W f_i, q) of each Gaussian and query, exactly; 0 where either vector has length 0.
 
     Args:
         field: the field of all Gaussians.

@@ -141,13 +141,13 @@ def with_maps(objects: Teacher, dense: Teacher) -> Teacher:
         ValueError: views or dimensions differ, or a teacher is of the wrong kind.
     """
     if objects.codebook is None or dense.maps is None:
-        raise ValueError("teachers: expected one of masks and one of maps, found others")
+        raise ValueError("teachers: expected one with masks and one with maps, found other kinds")
     if len(objects.ids) != len(dense.maps):
         raise ValueError(f"dense: expected maps of {len(objects.ids)} views, found {len(dense.maps)}")
     if objects.dimension != dense.dimension:
         raise ValueError(
-            f"dense: expected features of {objects.dimension} numbers as the objects have, found "
-            f"{dense.dimension}; both must come from one encoder"
+            f"dense: expected features of dimension {objects.dimension} as the objects have, found "
+            f"{dense.dimension}; both must come from the same encoder"
         )
     return objects._replace(maps=dense.maps)
 

@@ -69,7 +69,7 @@ class GrowthConfig:
     opacity_cost: float = 0.01
     """Weight of the mean opacity in the loss, which frees Gaussians that are not needed."""
     scale_cost: float = 0.01
-    """Weight of the mean scale in the loss, in scene radii."""
+    """Weight in the loss of the mean scale, which is measured in scene radii."""
 
     def __post_init__(self):
         expect(self, "growth.", every=(1, np.inf), begin=(0, np.inf), end=(0, 1), factor=(1, np.inf))
@@ -131,7 +131,7 @@ class FitConfig:
     """At the end, remove the least needed Gaussians, which together contribute at most this share of the
     light of any photograph."""
     exposure: bool = False
-    """Learn an affine colour transform for each photograph, where exposure or white balance differ."""
+    """Learn an affine colour transform for each photograph, for sets of varying exposure or white balance."""
     refine_poses: bool = False
     """Learn corrections of the cameras' poses."""
     seed: int = 0

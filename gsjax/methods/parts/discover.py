@@ -74,7 +74,9 @@ def begin(
         ValueError: there is only one camera, there are too few Gaussians, or nothing may move.
     """
     if sequence.num_cameras < 2:
-        raise ValueError("cameras: expected at least 2, synchronised, found 1; parts are found in 3D")
+        raise ValueError(
+            "cameras: expected at least 2, synchronised, found 1; one view does not show motion in 3D"
+        )
     if gaussians.num <= _NEIGHBORS:
         raise ValueError(
             f"gaussians: expected more than {_NEIGHBORS}, found {gaussians.num}; fit the anchor frame first"

@@ -130,7 +130,7 @@ def vector(wanted: str, least: float = 0.0) -> Checked:
 
 
 def instance(kind: type, wanted: str) -> Checked:
-    """A value of a type; text must not be empty."""
+    """A value of the given type; text must not be empty."""
 
     def check(value: Any) -> Any:
         if not isinstance(value, kind) or value == "":

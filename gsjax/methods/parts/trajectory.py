@@ -35,7 +35,7 @@ class PartScene(eqx.Module):
 
     @property
     def num_parts(self) -> int:
-        """P, the background included."""
+        """Number of parts, P, including the background."""
         return self.centers.shape[0]
 
 
@@ -56,7 +56,7 @@ class Trajectory(eqx.Module):
 
     @property
     def num_parts(self) -> int:
-        """P, the background included."""
+        """Number of parts, P, including the background."""
         return self.opacities.shape[1]
 
 

@@ -107,7 +107,7 @@ def unified(
     mine = {int(p): points[labels == p] for p in np.flatnonzero(alive & (sizes > 0)) if p != BACKGROUND}
 
     def apart(p: int, q: int) -> float:
-        """The gap between two parts, relative to the largest one of parts that move alike."""
+        """The gap between two parts, as a fraction of the largest gap of parts that move alike."""
         own = motions.since(int(max(since[p], since[q])))
         moved = min(extent(own, part, mine[part]) for part in (p, q))
         if moved <= noise_m:

@@ -79,7 +79,7 @@ class AlignConfig:
     max_thickness: float = 0.06
     """Measured depth that differs from the model's by more than this belongs to another object, metres."""
     shading: float = 0.3
-    """Weight of brightness relative to chroma, 0 to 1: objects that turn are lit differently."""
+    """Weight of brightness relative to chroma, 0 to 1; low, because shading changes as objects turn."""
     widen: float = 2.0
     """Factor on both scales while the start may be far off."""
     reach: float = 0.045
@@ -176,7 +176,7 @@ class TrackConfig:
     matching: bool = False
     """Also start the alignment from the result of template matching."""
     warm_start: bool = True
-    """Start from the last frame's motion too: delta_i as it was, and D_k as one of the starts."""
+    """Also use the last frame's motion: keep its delta_i, and try its D_k as one of the starts."""
     cameras: tuple[int, ...] = ()
     """Indices of the cameras to track with; default: all."""
     shrink: int = 1

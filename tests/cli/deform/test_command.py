@@ -118,7 +118,7 @@ def test_a_recipe_by_its_name(gsjax, tmp_path):
             "--eval-cameras: expected a camera other than the training camera",
         ),
         (("--test-every", 1), "--test-every: expected 0 (none), or 2 or more, found 1"),
-        (("--features", "classes"), "expected two classes or more among pixels that count, found 1"),
+        (("--features", "classes"), "expected two classes or more to learn, found 1"),
         (("--tools", "draw", "--deform.channels", 1), "--deform.channels 1: expected at least 2"),
         (("--scale", 2), "--scale: expected above 0 and at most 1"),
     ],

@@ -152,7 +152,7 @@ def test_without_a_prompt_all_are_named(gsjax, run):
         (("tool", "--threshold", 1), "--threshold: expected a finite number below 1"),
         (("tool", "--threshold", 0.99999), "best score"),
         (("tool", "--camera", 1), "--camera: a run of `gsjax deform` has no use for it"),
-        (("tool", "--negatives", "tissue"), "--negatives: a name is compared with"),
+        (("tool", "--negatives", "tissue"), "--negatives: the name of a class is compared with"),
         (("--point", "3,3", "--negatives", "tissue"), "--negatives: expected a TEXT too"),
         (("tool", "--image", "x.png"), "--image: a run of `gsjax deform` has no use for it"),
         (("tool", "--min-score", 0.1), "--min-score: a run of `gsjax deform` has no use for it"),

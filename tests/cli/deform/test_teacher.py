@@ -242,7 +242,7 @@ def test_classes_are_named_and_nothing_else():
     names = ("tissue", "tool")
     meaning = Meaning(Source("classes", dict(enumerate(names, 1))), names, np.eye(2), np.eye(5, 2))
     assert text_prompt(meaning, "Tool").name == "tool"
-    with pytest.raises(ValueError, match="--negatives: a name is compared with the other names"):
+    with pytest.raises(ValueError, match="--negatives: the name of a class is compared with the other names"):
         text_prompt(meaning, "tool", ("x",))
     with pytest.raises(ValueError, match="no class 'forceps'"):
         text_prompt(meaning, "forceps")

@@ -231,8 +231,8 @@ def test_a_job_of_slurm_is_one_worker_with_all_its_cores(defaults):
 @pytest.mark.parametrize(
     ("options", "says"),
     [
-        (("--workers", "2"), "--workers: expected with --executor dask, found --executor local"),
-        (("--scheduler", "slurm"), "--scheduler: expected with --executor dask, found --executor local"),
+        (("--workers", "2"), "--workers: expected --executor dask, found --executor local"),
+        (("--scheduler", "slurm"), "--scheduler: expected --executor dask, found --executor local"),
         (("--executor", "dask", "--workers", "0"), "--workers: expected 1 or more, found 0"),
         (
             ("--executor", "dask", "--scheduler", "slum"),

@@ -30,7 +30,7 @@ def test_what_a_layout_leaves_open_is_asked_for_and_taken(tmp_path, capfd):
     for i in range(2):
         cv2.imwrite(str(tmp_path / "images" / f"{i}.png"), np.full((36, 48, 3), 40 * i, np.uint8))
     assert main(["info", str(tmp_path)]) == 2
-    assert "give axes (--read.axes), llff" in capfd.readouterr().err
+    assert "set axes (--read.axes) to llff" in capfd.readouterr().err
     assert main(["info", str(tmp_path), "--read.axes", "endonerf"]) == 0
     out, _ = capfd.readouterr()
     assert "2: 0.png to 1.png" in out

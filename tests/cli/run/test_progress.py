@@ -32,7 +32,9 @@ def test_what_a_version_before_saved_is_refused(tmp_path):
     assert load_run(tmp_path, run, progress)[0] is run
     header = json.dumps({"format": 1, "metadata": {}, "sha256": ""})
     np.savez(tmp_path / "state.npz", __header__=np.array(header))
-    with pytest.raises(CheckpointError, match="found format 1, of another version of gsjax; start again"):
+    with pytest.raises(
+        CheckpointError, match="found format 1, written by another version of gsjax; start again"
+    ):
         load_run(tmp_path, run, progress)
     save_run(tmp_path, run.having(step=3), progress)
     assert load_run(tmp_path, run, progress)[0].step == 3
