@@ -117,7 +117,7 @@ def _sequence(path: str | Path, options: ReadOptions) -> Sequence:
         return read_endovis(root, K=options.K, baseline_m=options.baseline_m)
     photographs = _photograph_layout(root)
     if photographs:
-        found = f"photographs ({photographs} layout), which are not ordered in time"
+        found = f"photographs ({photographs.name} layout), which are not ordered in time"
         raise DataError(root, "a recording over time", found, "Use gsjax fit for photographs.")
     if clip.is_clip(root, options.images, options.masks):
         return _clip(root, options)

@@ -218,7 +218,7 @@ class TestLearning:
         _, run = Deform(CONFIG).start(frames, gaussians=spoilt)
         assert run.params.gaussians.num == given.num - 3
         nowhere = eqx.tree_at(lambda g: g.means, given, given.means * jnp.nan)
-        with pytest.raises(ValueError, match="gaussians: expected some"):
+        with pytest.raises(ValueError, match="gaussians: expected at least one"):
             Deform(CONFIG).start(frames, gaussians=nowhere)
 
     def test_given_gaussians_are_not_donated(self, frames):

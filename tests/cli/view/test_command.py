@@ -160,7 +160,7 @@ def test_a_run_that_is_not_finished(view, fitted):
     (fitted / "scene.ply").unlink()
     code, said = view(fitted)
     assert code == 2
-    assert "expected a run with scene.ply, found none: it is not finished" in said
+    assert "expected a run with scene.ply, found none; finish the run with --resume" in said
 
 
 def test_a_fit_with_foreign_settings(view, fitted):
