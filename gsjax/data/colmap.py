@@ -46,7 +46,7 @@ _MODELS = {
 _UNIT_TOLERANCE = 0.01  # on a quaternion's length: text files often have few digits
 _COUNTS = dict(_MODELS.values())
 _UNDISTORT = "Run COLMAP's image_undistorter, and give its folder."
-_AGAIN = "It may be cut off: fetch or export it again."
+_AGAIN = "The file may be truncated: fetch or export it again."
 
 
 class _Camera(NamedTuple):

@@ -64,8 +64,8 @@ class ReadOptions:
     tool: Tool = "white"
     """Colour of the tool in black-and-white masks (EndoNeRF, videos): white or black."""
     depth_unit_m: float | None = None
-    """Length of one step of a depth image (Open3D, nerfstudio, EndoNeRF); default: as the data state, else
-    0.001."""
+    """Metres per unit of the stored depth values (Open3D, nerfstudio, EndoNeRF); default: the value given in
+    the data, else 0.001."""
     depth_percentiles: tuple[float, float] | None = None
     """Lowest and highest percentile of each frame's depth to keep (EndoNeRF), for example 3 99.8 for depth
     from stereo matching; default: keep all."""

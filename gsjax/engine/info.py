@@ -93,7 +93,7 @@ def describe_photographs(photographs: Photographs) -> dict[str, str]:
 
 
 def first_masks(sequence: Sequence) -> dict[int, np.ndarray]:
-    """The first mask of each camera that has one, by camera id. One is enough, so files may be missing."""
+    """The first mask of each camera that has one, by camera id; cameras without are left out."""
     masks = {}
     for c, camera in enumerate(sequence.camera_ids):
         with suppress(MissingFile):

@@ -25,8 +25,8 @@ class Common:
     """Options of every command."""
 
     cores: int | None = None
-    """Number of processor cores to use (the highest-numbered ones); default: all. The tracker's updates take
-    the steadiest time on 1. To run two programs at once, give each its own cores with taskset."""
+    """Number of processor cores to use (the highest-numbered ones); default: all. The tracker's update
+    times vary least on 1. To run two programs at once, give each its own cores with taskset."""
     debug: bool = False
     """Show Python's traceback when something fails."""
 
@@ -45,7 +45,7 @@ class Resuming(Overwriting):
     """Options of commands that can be stopped and resumed."""
 
     resume: bool = False
-    """Resume the unfinished run in the same folder, with the same options."""
+    """Resume the unfinished run in this folder; repeat the options that it was started with."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -82,8 +82,8 @@ class Selection(Reading):
     cameras: Ids = ()
     """Ids of the cameras to use; default: all that are not held out."""
     scale: float = 1.0
-    """Size of the pictures (width and height) relative to the original, as in 0.5; time is proportional to
-    the number of pixels."""
+    """Size of the pictures (width and height) relative to the original, for example 0.5; time is
+    proportional to the number of pixels."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -45,7 +45,7 @@ class Options(Common, Overwriting):
     stills: int = 100
     """Number of pictures to take from a video: the sharpest in each of as many equal intervals."""
     compare: str | None = None
-    """A dataset with poses of the same photographs, by name, to compare the result with."""
+    """A dataset with poses of the same photographs (matched by file name), to compare the result with."""
     place: Annotated[MotionConfig, tyro.conf.arg(name="")] = field(default_factory=MotionConfig)
     """Settings of the reconstruction."""
 

@@ -306,7 +306,7 @@ class _Display:
         self._bar.stop()
 
     def show(self) -> None:
-        """Show a step; a log gets a line for each tenth of the steps, once there is a row."""
+        """Update the bar; a log gets a line for each tenth of the run, once there is something to log."""
         rows, words = self._progress.rows, self._schedule.words
         if rows and perf_counter() - self._at > _SHOWN_EVERY_S:
             share, reached = self._share(), self._reached()

@@ -83,7 +83,7 @@ class Question:
 
     @property
     def words(self) -> str:
-        """The query in short."""
+        """A short description of the query, for messages."""
         if self.point is not None:
             camera = "" if self.camera is None else f" of {self.camera}"
             return f"what is at {self.point[0]:g},{self.point[1]:g}{camera}"

@@ -81,7 +81,7 @@ def spatial_edges(positions: Float[Array, "t n c"], k: int, valid: NodeMask | No
 def temporal_edges(
     features: Features, k: int, window: int, valid: NodeMask | None = None, matching: Matching = Matching()
 ) -> Edges:
-    """Edges from each node to the `k` of highest affinity in every other frame at most `window` away
+    """Edges from each node to the `k` of highest affinity in each of the other frames at most `window` away
     (SurstSplat, Algorithm 1).
 
     One matrix serves both directions: rows rank nodes of the later frame, columns those of the earlier.
@@ -104,7 +104,7 @@ def temporal_edges(
 
 def similar_edges(features: Features, k: int, window: int = 0, valid: NodeMask | None = None) -> Edges:
     """Edges from each node to the `k` of highest cosine similarity in its own frame (GaussianClin, eq. 7), or
-    with a `window` in every other frame at most that far away. Features of length zero have no edges.
+    with a `window` in each of the other frames at most that far away. Features of length zero have no edges.
 
     Args:
         features: features of n nodes in t frames.

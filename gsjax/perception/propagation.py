@@ -56,7 +56,9 @@ class FlowPropagator:
             ValueError: labels and images differ in size, or the images are too small for the flow.
         """
         if labels.shape != images.shape[1:3]:
-            raise ValueError(f"labels: expected shape {images.shape[1:3]} like images, found {labels.shape}")
+            raise ValueError(
+                f"labels: expected shape {images.shape[1:3]} to match images, found {labels.shape}"
+            )
         found, lab = [labels], rgb2lab(unit_floats(images[0]))
         for before, image in pairwise(images):
             lab_before, lab = lab, rgb2lab(unit_floats(image))

@@ -51,7 +51,9 @@ class Sam2Propagator:
             ValueError: labels and images differ in size.
         """
         if labels.shape != images.shape[1:3]:
-            raise ValueError(f"labels: expected shape {images.shape[1:3]} like images, found {labels.shape}")
+            raise ValueError(
+                f"labels: expected shape {images.shape[1:3]} to match images, found {labels.shape}"
+            )
         names = np.append(0, _objects(labels))
         found = np.zeros(images.shape[:3], labels.dtype)
         found[0] = labels

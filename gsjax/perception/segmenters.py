@@ -131,9 +131,9 @@ class RegionSegmenter:
     merge_distance: float = 12.0
     """Largest difference in mean CIELAB colour at which neighbouring regions are merged."""
     max_fraction: float = 0.25
-    """A region that covers more of the image is background."""
+    """A region that covers more than this fraction of the image is background."""
     max_border_fraction: float = 0.1
-    """A region that covers more of the image's border is background."""
+    """A region that covers more than this fraction of the image's border is background."""
     min_pixels: int = 60
     """Smaller regions are dropped."""
 

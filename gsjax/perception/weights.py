@@ -86,8 +86,8 @@ def _check_no_pickles(folder: Path) -> None:
             str(part).endswith(".safetensors") for part in parts.values()
         ):
             raise ValueError(
-                f"{folder / _INDEX}: expected a weight_map to .safetensors files, found other files; save "
-                "the model again with save_pretrained"
+                f"{folder / _INDEX}: expected a weight_map that names .safetensors files only, found none; "
+                "save the model again with save_pretrained"
             )
 
 

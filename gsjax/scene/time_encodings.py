@@ -33,8 +33,9 @@ def _clamped(x: Float[Array, "*n"]) -> Float[Array, "*n"]:
 
 
 class HexPlane(eqx.Module):
-    """Planes for all pairs of x, y, z and t; a position and a time are encoded as the product of their six
-    values (4DGS, Wu et al. 2023, eq. 6, after HexPlane, Cao and Johnson 2023), concatenated over levels.
+    """Planes for all pairs of x, y, z and t; a position and a time are encoded as the product of the six
+    planes' values there (4DGS, Wu et al. 2023, eq. 6, after HexPlane, Cao and Johnson 2023), concatenated
+    over levels.
 
     At a fixed time the planes of t reduce to lines, which are computed once for all positions.
 

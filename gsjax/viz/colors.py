@@ -175,7 +175,8 @@ def side_by_side(
     labels: Integer[np.ndarray, "h w"] | None = None,
     captions: Sequence[str] = ("input", "render", "error", "labels"),
 ) -> UInt8[np.ndarray, "rows cols 3"]:
-    """One panel: input, render, error and labels, each with a caption; even-sized, as video codecs want.
+    """One panel: input, render, error and labels, each with a caption; width and height are even, as video
+    codecs require.
 
     Args:
         image, render: colours.

@@ -68,7 +68,7 @@ class TestScripts:
         [
             ("edits: [", "expected YAML, found a fault in line 1"),
             ("- {op: speed}", "expected the keys fps, length, edits, found"),
-            ("edit: []", "edit: expected the keys fps, length, edits, found 'edit'; did you mean 'edits'?"),
+            ("edit: []", "edit: expected one of fps, length, edits, found 'edit'; did you mean 'edits'?"),
             ("fps: fast", "fps: expected frames a second, 0.1 to 1000, found 'fast'"),
             ("length: 0", "length: expected seconds, 0.01 to 86400, found 0"),
             ("edits: 3", "edits: expected a list of edits, found 3"),
@@ -131,7 +131,7 @@ class TestScripts:
             ),
             (
                 "edits: [{op: composite, parts: 1, from_run: a, place: {too: 1}}]",
-                "edit 1 (composite): place: too: expected the keys to, axis, degrees, scale, found 'too'; "
+                "edit 1 (composite): place: too: expected one of to, axis, degrees, scale, found 'too'; "
                 "did you mean 'to'?",
             ),
             (

@@ -133,7 +133,7 @@ class TestLength:
 
     def test_one_moment_needs_fps(self):
         with pytest.raises(
-            ValueError, match="fps: expected a frame rate, as the recording has only one moment"
+            ValueError, match="fps: expected a frame rate, as the recording has only one frame"
         ):
             film_of(layer=layer_of(moments=1))
         assert len(film_of(layer=layer_of(moments=1), fps=10, length=1)[0].trajectory.times) == 10

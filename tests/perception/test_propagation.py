@@ -147,6 +147,6 @@ def test_one_picture_is_done_and_labels_of_another_size_are_refused():
     image, labels = squares((20, 20))
     np.testing.assert_array_equal(FlowPropagator()(image[None], labels), labels[None])
     with pytest.raises(
-        ValueError, match=r"labels: expected shape \(96, 128\) like images, found \(95, 128\)"
+        ValueError, match=r"labels: expected shape \(96, 128\) to match images, found \(95, 128\)"
     ):
         FlowPropagator()(image[None], labels[1:])

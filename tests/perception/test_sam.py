@@ -335,6 +335,6 @@ def test_without_objects_sam2_is_not_asked_and_labels_of_another_size_are_refuse
     propagate = Sam2Propagator(None, None, None, None)
     assert not propagate(images, 0 * labels).any()
     with pytest.raises(
-        ValueError, match=r"labels: expected shape \(96, 130\) like images, found \(95, 130\)"
+        ValueError, match=r"labels: expected shape \(96, 130\) to match images, found \(95, 130\)"
     ):
         propagate(images, labels[1:])

@@ -119,7 +119,8 @@ def compare(records: Sequence[Record], same_views: Callable[[list[Record], str],
 
 
 def labels(paths: Sequence[Path]) -> list[str]:
-    """A short name of each folder: as many of the last parts of its path as tell it from the others.
+    """A short name for each folder: the last parts of its path, as many as it takes to tell it from the
+    others.
 
     Raises:
         ValueError: a folder is named twice.

@@ -161,9 +161,8 @@ class QueryableField(Queryable):
         """The vector of a picture."""
         picture = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
         if picture is None:
-            raise ValueError(
-                f"--image {path}: expected a picture, found {'another file' if path.exists() else 'nothing'}"
-            )
+            found = "a file of another kind" if path.exists() else "nothing"
+            raise ValueError(f"--image {path}: expected a picture, found {found}")
         if picture.ndim == 2:
             picture = np.repeat(picture[..., None], 3, axis=2)
         opaque = picture[..., 3] > 127 if picture.shape[2] == 4 else np.ones(picture.shape[:2], bool)

@@ -158,9 +158,9 @@ def read_experiment(root: Path, name: str, out: Path) -> Experiment:
     # Shells complete the path of the folder, with a slash at its end.
     name = next((n for n in names if Path(name) in (Path(n), root / n)), name)
     below = [n for n in names if n.startswith(name.rstrip("/") + "/")]
-    known = ", ".join(below or names) or f"none; make one as {root}/NAME/{CONFIG}"
+    known = ", ".join(below or names) or f"none; create one as {root}/NAME/{CONFIG}"
     if name not in names:
-        raise ValueError(f"{root}: no experiment {name!r}; there are: {known}")
+        raise ValueError(f"{root}: no experiment {name!r}; available: {known}")
     path = root / name / CONFIG
     config, columns, figure = read_config(path, root)
     cells, text = _cells(config, path), (path.parent / config.script).read_text(encoding="utf-8")

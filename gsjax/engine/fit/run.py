@@ -53,7 +53,7 @@ class Options(OfDataset):
     save_every: float = 30.0
     """Seconds of fitting that a run may lose when it is killed."""
     tensorboard: bool = False
-    """Write the curve for TensorBoard too, into RUN/tensorboard."""
+    """Also log loss, PSNR and number of Gaussians for TensorBoard, in RUN/tensorboard."""
     fit: FitConfig = field(default_factory=FitConfig)
     """Settings of the fit."""
 

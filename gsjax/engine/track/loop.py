@@ -34,15 +34,16 @@ class Tracking:
 
     Attributes:
         scene: the scene at the first frame.
-        poses: poses of the moving Gaussians in each frame, after the first with those that join; on the host.
+        poses: poses of the moving Gaussians in each frame, on the host; from the second frame on they include
+            those that joined.
         tick: the newest tick, with what has joined the objects; None before the first update.
         joined: number of Gaussians that had joined by each frame.
         update_s: seconds of each update; 0 for the first frame, which is initialisation.
         compile_s: seconds spent compiling, since the run began or was resumed.
-        planning_s: seconds before the first update spent on its plan, and on compiling what plans.
+        planning_s: seconds spent on the plan before the first update, including compiling the planner.
         loading_s: seconds that the loop waited for images.
         loop_s: seconds of the whole loop.
-        plans: number of plans; more than one means that it had to plan again.
+        plans: number of plans; more than one means that a plan had become too small.
         visible: [K] per update: which objects some camera saw.
         lost: [K] per update: which objects were not where they were believed to be.
         turn_known: [K] per update: whether the rotation of each object since the first frame is known.

@@ -49,7 +49,7 @@ class GraphConfig:
     neighbors: int = 8
     """Number of edges from each node to others of its frame."""
     matches: int = 4
-    """Number of edges from each node to every other frame of the window."""
+    """Number of edges from each node to each of the other frames in the window."""
     window: int = 2
     """Number of frames on either side of a step's frame."""
     tau_x: float = 0.1

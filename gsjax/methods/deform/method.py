@@ -296,7 +296,9 @@ def _check(frames: Sequence[Frame], config: DeformConfig, lesson: Lesson | None)
                     f"frames: expected {name} {shape[:3]} to match images, found {value.shape} in frame {i}"
                 )
     if not any(frame.masks is None or frame.masks.any() for frame in frames):
-        raise ValueError("masks: expected pixels that count, found none in any frame; are masks inverted?")
+        raise ValueError(
+            "masks: expected pixels that count, found none in any frame; are the masks inverted?"
+        )
     if lesson is None:
         return
     if len(lesson.ids) != len(frames):

@@ -228,7 +228,7 @@ def rows_of(question: Question, frames: Sequence[int]) -> list[int]:
     for number in question.frames:
         if number not in places:
             raise ValueError(
-                f"frame {number}: expected one of the recording's {len(places)} frames, {min(places)} to "
-                f"{max(places)}, found none of this number"
+                f"frame {number}: expected one of the recording's {len(places)} frames, numbered "
+                f"{min(places)} to {max(places)}, found none with this number"
             )
     return [places[number] for number in question.frames] or list(range(len(frames)))

@@ -38,7 +38,7 @@ class DistillWeightsConfig:
     contrast: float = 1.0
     """Weight of the contrastive loss: pixels of one object attract, pixels of different objects repel."""
     tv: float = 1.0
-    """Weight of the total variation between neighbouring pixels."""
+    """Weight of the total variation of the rendered features."""
     map: float = 1.0
     """Weight of a pixel of a map relative to a pixel of a mask, for a teacher with both."""
 

@@ -45,7 +45,7 @@ class RatesConfig:
     exposures: float = 1e-3
     """Learning rate of each photograph's colour transform, if exposure is learned."""
     twists: float = 2e-4
-    """Learning rate of the cameras' rotations, radians, and translations, scene radii; it falls to a
+    """Learning rate of the cameras' rotations (in radians) and translations (in scene radii); it falls to a
     hundredth by the end."""
 
     def __post_init__(self):

@@ -42,7 +42,7 @@ class StreamConfig:
     depth_weight: float = 0.1
     """Weight of the depth loss, for cameras that measure depth."""
     depth_limit: float = 0.05
-    """Depth error at which the loss saturates, metres; a larger one belongs to another object."""
+    """Depth error at which the loss saturates, metres; a larger one means that another object is seen."""
     tear_weight: float = 0.05
     """Weight of the penalty on neighbours that move apart, in a frame's first step; it falls to a fifth by
     the last. It makes surfaces that no camera sees follow what they touch."""

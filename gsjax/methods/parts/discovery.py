@@ -19,7 +19,8 @@ from gsjax.optim.method import Run
 from gsjax.scene.handles import HandlePose, at_rest
 
 Pairs = tuple[tuple[int, int], ...]
-"""Joined parts, (part, into which), or divided ones, (new part, from which)."""
+"""Joined parts, as (part, the part that it was joined to), or divided ones, as (new part, the part that it
+was split from)."""
 _REWARM = 100  # steps that fit a grid after parts were joined or divided
 _REST = 4  # rounds of divisions for which a newly divided part is left alone
 
@@ -35,12 +36,12 @@ class Discovery(NamedTuple):
         quats, translations: poses at all frames, [T,P,4] and [T,P,3]; at rest where not yet found.
         found: rank of each frame in the order of discovery; 0 is the anchor, -1 is not yet found.
         born: number of found frames when each part's own motion began.
-        rests: number of found frames until which each part is not divided again.
+        rests: number of found frames from which each part may be divided again.
         frame: the frame whose pose is being found, or was found last; -1 before the first.
         weights: weights of the movable Gaussians before `frame`, or the final ones once all frames are found.
         predicted: poses of the handles before the first step of `frame`.
-        joined: joined parts: (part, into which).
-        divided: divided parts: (new part, from which).
+        joined: joined parts.
+        divided: divided parts.
     """
 
     canonical: Canonical

@@ -52,7 +52,7 @@ def read(kind: type[Kind], found: Any) -> Kind:
         raise ValueError(f"expected the keys {', '.join(keys)}, found {shown(found)}")
     for key in found:
         if key not in keys:
-            raise ValueError(f"{key}: expected the keys {', '.join(keys)}, found {did_you_mean(key, keys)}")
+            raise ValueError(f"{key}: expected one of {', '.join(keys)}, found {did_you_mean(key, keys)}")
     # A missing field without default is None, which its check refuses with its own message.
     given = {f: found.get(key) for key, f in keys.items() if key in found or f.default is MISSING}
     return kind(**{f.name: _checked(f, value) for f, value in given.items()})

@@ -223,7 +223,7 @@ def _numbers(parts: Sequence[str | int], names: Names, num: int) -> list[int]:
 def _frame_time(times: Float[np.ndarray, "T"]) -> float:
     """Seconds from one moment to the next."""
     if len(times) < 2:
-        raise ValueError("fps: expected a frame rate, as the recording has only one moment; found none")
+        raise ValueError("fps: expected a frame rate, as the recording has only one frame; found none")
     return float(np.median(np.diff(times)))
 
 

@@ -131,9 +131,9 @@ def test_list_shows_the_sound_ones_beside_a_broken_one(toy, gsjax):
             ("list", "--root", "nowhere"),
             "nowhere: expected a folder of experiments (--root names another), found none there",
         ),
-        (("run", "../toy"), "experiments: no experiment '../toy'; there are: toy"),
-        (("run", "to"), "experiments: no experiment 'to'; there are: toy"),
-        (("table", "tyo"), "experiments: no experiment 'tyo'; there are: toy"),
+        (("run", "../toy"), "experiments: no experiment '../toy'; available: toy"),
+        (("run", "to"), "experiments: no experiment 'to'; available: toy"),
+        (("table", "tyo"), "experiments: no experiment 'tyo'; available: toy"),
     ],
 )
 def test_what_is_not_there(toy, gsjax, arguments, says):

@@ -323,7 +323,7 @@ def test_what_cannot_be_done(gsjax, run, options, says):
     ("text", "says"),
     [
         (b"edits: [", "bad.yaml: expected YAML, found a fault in line"),
-        (b"speed: 2", "bad.yaml: speed: expected the keys fps, length, edits"),
+        (b"speed: 2", "bad.yaml: speed: expected one of fps, length, edits"),
         (b"edits: [{op: speed, parts: 1}]", "bad.yaml: edits: edit 1 (speed): factor: expected a factor"),
         (b"\xff\xfe\x00", "bad.yaml: expected a YAML file of edits, found no text"),
     ],
