@@ -27,7 +27,16 @@ def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
     path = folder.parents[1] / "field_scenes" / f"{options['recording']}_all"
     if not (path / "report.html").is_file():
         words = ["track", recorded(options["recording"]), "--out", path, "--overwrite"]
-        words += ["--mask-camera", MASK_CAMERA, "--cameras", *CAMERAS, "--eval-cameras", *HELD_OUT]
+        words += [
+            "--preset",
+            "accurate",
+            "--mask-camera",
+            MASK_CAMERA,
+            "--cameras",
+            *CAMERAS,
+            "--eval-cameras",
+            *HELD_OUT,
+        ]
         succeeded(*words)
     first, saved = scene_of_run(path), open_run(path)
     names, codes = codebook_of(first.photographs)

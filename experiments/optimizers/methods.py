@@ -20,17 +20,16 @@ from trimesh.registration import procrustes
 from experiments.shared.one_update import Update
 from experiments.shared.timing import jitted, median_ms, timed
 from gsjax.geometry.cameras import pixel_grid, unproject
-from gsjax.methods.track.align import align, widened
-from gsjax.methods.track.config import AlignConfig, RefineConfig
+from gsjax.methods.track.config import PRESETS, RefineConfig
 from gsjax.methods.track.motion import Motion, place
 from gsjax.methods.track.points import tone_images
 from gsjax.methods.track.refine import refine_loss, refine_residual
-from gsjax.methods.track.search import first_watch, search
+from gsjax.methods.track.search import align_groups, first_watch, search
 from gsjax.optim.least_squares import least_squares_step
 from gsjax.optim.step import Step
 from gsjax.scene.render import render
 
-ALIGN, REFINE = AlignConfig(), RefineConfig(delta_rate=3e-5)
+ALIGN, REFINE = PRESETS["accurate"].align, RefineConfig(delta_rate=3e-5)
 # Tuned on updates other than those of the table: see docs/results-optimizers.md.
 TRANSLATION_RATE, ROTATION_RATE = 6e-3, 3e-2  # Adam's at first, metres and radians
 BLOCKS, SOFTNESS = (8,) * 6 + (4,) * 4, 0.3  # Levenberg-Marquardt's, iteration by iteration
@@ -162,15 +161,11 @@ def icp(update: Update, counts: list[int], reach: float = ICP_REACH) -> Trace:
     return Trace(counts, [found[n] for n in counts], [times[0] + n * each if n else 0.0 for n in counts])
 
 
-over_groups = jax.vmap(align, in_axes=(0, 0, 0, None, None))
-
-
 @partial(jitted, static_argnames="config")
 def aligned(start, points, centers, frame, config=ALIGN):
     """Wide scales first, then narrow ones, as in `search`."""
     images = tone_images(frame, config.shading)
-    wide = over_groups(start, points, centers, images, widened(config))
-    return over_groups(wide, points, centers, images, config)
+    return align_groups(start, points, centers, images, config)
 
 
 @partial(jitted, static_argnames="config")

@@ -65,7 +65,16 @@ def first_tracked(
     path = folder.parents[1] / "field_scenes" / f"{name}_tracked"
     if not (path / "report.html").is_file():
         words = ["track", recorded(name), "--out", path, "--frames", "0:2", "--overwrite"]
-        words += ["--mask-camera", mask_camera, "--cameras", *cameras, "--eval-cameras", *eval_cameras]
+        words += [
+            "--preset",
+            "accurate",
+            "--mask-camera",
+            mask_camera,
+            "--cameras",
+            *cameras,
+            "--eval-cameras",
+            *eval_cameras,
+        ]
         succeeded(*words)
     return scene_of_run(path)
 

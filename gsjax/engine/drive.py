@@ -67,6 +67,16 @@ class Tick:
         return self.method.result(self.problem, self.run)
 
 
+UPDATE = "/gsjax/update"
+"""Event of `jax.monitoring` after each tick, with its seconds, for those who listen."""
+
+
+def announced(tick: Tick) -> Tick:
+    """The tick, after its event."""
+    jax.monitoring.record_event_duration_secs(UPDATE, tick.seconds)
+    return tick
+
+
 class Drive(Iterator[Tick]):
     """Iterates over the steps of a method; see `drive`.
 
@@ -116,7 +126,7 @@ class Drive(Iterator[Tick]):
                 break
             self.run = self.run.grown(names, info["needed"], self._headroom)
         self.run = self.run.having(step=run.step + 1)
-        self.tick = Tick(method, problem, self.run, info, *clock.read(), progress)
+        self.tick = announced(Tick(method, problem, self.run, info, *clock.read(), progress))
         return self.tick
 
 

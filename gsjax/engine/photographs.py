@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Int
 from rich.console import Console
 
-from gsjax.data.errors import DataWarning
+from gsjax.data.errors import DataError, DataWarning
 from gsjax.data.open import ReadOptions, is_photographs, is_recording, open_photographs
 from gsjax.data.photographs import Photographs, photographs_of
 from gsjax.engine.files import read_options

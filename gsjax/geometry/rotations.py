@@ -7,6 +7,7 @@ from functools import partial
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 MIN_SQUARED_NORM = 1e-12
@@ -33,6 +34,22 @@ def quats_to_matrices(quats: Float[Array, "*batch 4"]) -> Float[Array, "*batch 3
         [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
     ]
     return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+_SKEW = np.cross(np.eye(3)[:, None], -np.eye(3))  # [k, i, j]: -epsilon_kij
+
+
+@partial(jax.jit, inline=True)
+def matrix_of(vector: Float[Array, "3"]) -> Float[Array, "3 3"]:
+    """Rotation matrix of a rotation vector, radians. As `jaxlie.SO3.exp(vector).as_matrix()`, which stacks
+    nine numbers; a stack takes XLA:CPU long to compile, and this has none."""
+    squared = jnp.sum(vector * vector)
+    small = squared < 1e-12
+    angle = jnp.sqrt(jnp.where(small, 1.0, squared))
+    half = jnp.where(small, 0.5 - squared / 48, jnp.sin(angle / 2) / angle) * vector
+    real = jnp.where(small, 1 - squared / 8, jnp.cos(angle / 2))
+    skew = sum(_SKEW[k] * half[k] for k in range(3))
+    return (1 - 2 * half @ half) * jnp.eye(3) + 2 * half[:, None] * half + 2 * real * skew
 
 
 @partial(jax.jit, inline=True)

@@ -18,6 +18,7 @@ from gsjax.rasterize.projection import Projected
 from gsjax.rasterize.sorting import argsort_keys, repeat, running_sum, sort_keys
 
 _TOO_MANY = 2**30  # above this an int32 running sum is no longer trusted
+_COUNTED = 2**16  # rows that are counted together when a plan is made
 
 
 class TileLists(NamedTuple):
@@ -51,7 +52,8 @@ def bin_gaussians(projected: Projected, tile_mask: Bool[Array, "tiles"] | None, 
     rows = total(num_rows)
     enough_rows = rows <= plan.capacity // 2
     num_rows = jnp.where(enough_rows, num_rows, 0)
-    spans = _spans(projected, tile_mask, by_depth, first_row, num_rows, plan)
+    laid_out = _lay_out(by_depth, first_row, num_rows, plan)
+    spans = _spans(projected, tile_mask, laid_out, slots(plan.capacity // 2), laid_out.starts, plan)
     pairs = total(spans.count)
     overflow = ~enough_rows | (pairs > plan.capacity)
     needed = jnp.where(enough_rows, jnp.maximum(pairs, 2 * rows), _bounding_pairs(projected, plan))
@@ -74,19 +76,30 @@ def bin_gaussians(projected: Projected, tile_mask: Bool[Array, "tiles"] | None, 
 def needed_capacity(
     projected: Projected, tile_mask: Bool[Array, "tiles"] | None, plan: Plan
 ) -> Int[Array, ""]:
-    """The capacity that `bin_gaussians` needs: exact if the plan holds twice the rows; else twice the rows.
+    """The capacity that `bin_gaussians` needs; the largest int32 if it cannot be counted. The plan's own
+    capacity does not matter: rows are counted a few at a time, by one program for all capacities.
 
     Args:
         projected: Gaussians projected into the camera.
         tile_mask: tiles that are drawn (default: all).
-        plan: its capacity determines how many rows fit.
+        plan: options.
     """
     first_row, num_rows = tile_rows(projected, tile_mask, plan)
     rows = total(num_rows)
-    num_rows = jnp.where(rows <= plan.capacity // 2, num_rows, 0)
+    num_rows = jnp.where(rows > _TOO_MANY // 2, 0, num_rows)
     unordered = jnp.arange(num_rows.shape[0], dtype=jnp.int32)
-    spans = _spans(projected, tile_mask, unordered, first_row, num_rows, plan)
-    return jnp.maximum(total(spans.count), doubled(rows))
+    laid_out = _lay_out(unordered, first_row, num_rows, plan)
+
+    def count(state):
+        first, pairs = state
+        begins = jnp.maximum(laid_out.starts - first, 0)
+        spans = _spans(projected, tile_mask, laid_out, slots(_COUNTED) + first, begins, plan)
+        more = pairs + spans.count.sum(dtype=jnp.int32)
+        return first + _COUNTED, jnp.where(pairs > _TOO_MANY, jnp.iinfo(jnp.int32).max, more)
+
+    start = (jnp.int32(0), jnp.int32(0))
+    _, pairs = jax.lax.while_loop(lambda state: state[0] < laid_out.total, count, start)
+    return jnp.maximum(pairs, doubled(rows))
 
 
 def total(counts: Int[Array, "*n"]) -> Int[Array, ""]:
@@ -147,16 +160,36 @@ def _bounding_pairs(projected: Projected, plan: Plan) -> Int[Array, ""]:
     return jnp.maximum(total(columns * rows), doubled(total(rows)))
 
 
-def _spans(projected: Projected, tile_mask, by_depth, first_row, num_rows, plan: Plan) -> _Spans:
-    """Lay out the rows of all Gaussians, and find the columns that each covers in them."""
-    slot = slots(plan.capacity // 2)
+class _Rows(NamedTuple):
+    """Rows of tiles of all Gaussians, one Gaussian after the other."""
+
+    gaussians: Int[Array, "n"]  # in the order in which they are laid out
+    first_row: Int[Array, "n"]  # of each
+    starts: Int[Array, "n"]  # where its rows start
+    total: Int[Array, ""]
+
+
+def _lay_out(gaussians, first_row, num_rows, plan: Plan) -> _Rows:
     ends = running_sum(num_rows, plan.sort)
-    starts = ends - num_rows
-    ranks = jnp.arange(num_rows.shape[0], dtype=jnp.int32)
-    rank = repeat(ranks, starts, slot.size, plan.sort).reshape(slot.shape)
-    row = slot + (first_row - starts)[rank]
-    low, high = _columns_in_row(projected, by_depth[rank], row, plan)
-    count = jnp.where(slot < ends[-1], jnp.maximum(high - low, 0), 0)
+    return _Rows(gaussians, first_row, ends - num_rows, ends[-1])
+
+
+def _spans(projected: Projected, tile_mask, laid_out: _Rows, slot, begins, plan: Plan) -> _Spans:
+    """The columns that Gaussians cover in their rows.
+
+    Args:
+        projected: the Gaussians.
+        tile_mask: tiles that are drawn (default: all).
+        laid_out: their rows.
+        slot: consecutive ones of these rows.
+        begins: where each Gaussian's rows start among `slot`, 0 if before it.
+        plan: options.
+    """
+    ranks = jnp.arange(begins.shape[0], dtype=jnp.int32)
+    rank = repeat(ranks, begins, slot.size, plan.sort).reshape(slot.shape)
+    row = slot + (laid_out.first_row - laid_out.starts)[rank]
+    low, high = _columns_in_row(projected, laid_out.gaussians[rank], row, plan)
+    count = jnp.where(slot < laid_out.total, jnp.maximum(high - low, 0), 0)
     if tile_mask is not None:
         grid = tile_mask.reshape(plan.tiles_y, plan.tiles_x).astype(jnp.int32)
         before = jnp.pad(jnp.cumsum(grid, axis=1), ((0, 0), (1, 0))).ravel()

@@ -215,19 +215,51 @@ def planned_for(views, bare: Plan, headroom: float) -> Plan:
         )
     if values[0].shape[1] == 0:
         return bare.grown(0, headroom)
-    # Rows of tiles first, then the pairs, which are counted row by row.
-    enough_rows = bare.grown(int(_needed(_Views(*values), bare)))
-    return bare.grown(int(_needed(_Views(*values), enough_rows)), headroom)
+    return bare.grown(_needed(_Views(*jax.tree.map(np.asarray, tuple(values))), bare), headroom)
+
+
+_LEAST_COUNTED = 2**14  # Gaussians
+
+
+def _needed(views: _Views, plan: Plan) -> int:
+    """The largest capacity that a view needs. Scenes are padded to a power of two and views counted one by
+    one, so that many scenes share one compiled program."""
+    size = max(_LEAST_COUNTED, 1 << (views.means.shape[1] - 1).bit_length())
+    counting = Plan(plan.width, plan.height, 0, **{name: getattr(plan, name) for name in _COUNTING})
+
+    def padded(a, axis):
+        return np.pad(a, [(0, (size - a.shape[axis]) if i == axis else 0) for i in range(a.ndim)])
+
+    with np.errstate(over="ignore", invalid="ignore"):
+        scenes = (*views[:4], _usable(views))
+    scenes, needs = [padded(a, 1) for a in scenes], []
+    for b, c in np.ndindex(views.viewmats.shape[:2]):
+        per_view = (views.viewmats, views.Ks, views.means2d_offset, views.tile_mask)
+        viewmat, K, offset, mask = (None if a is None else a[b, c] for a in per_view)
+        offset = None if offset is None else padded(offset, 0)
+        needs.append(_needed_in(*(a[b] for a in scenes), viewmat, K, offset, mask, plan=counting))
+    return max(map(int, needs), default=0)
+
+
+_COUNTING = ("near_plane", "far_plane", "eps2d", "rasterize_mode", "alpha_min", "tile_size", "sort")
+"""Options that a capacity depends on."""
 
 
 @partial(jax.jit, static_argnames="plan")
-def _needed(views: _Views, plan: Plan) -> Int[Array, ""]:
-    projected = _project_all(views, plan)
-    count = partial(needed_capacity, plan=plan)
-    mask_axis = None if views.tile_mask is None else 0
-    return jax.vmap(jax.vmap(count, (0, mask_axis)), (0, mask_axis))(projected, views.tile_mask).max(
-        initial=0
-    )
+def _needed_in(means, quats, scales, opacities, usable, viewmat, K, offset, mask, plan: Plan):
+    projected = project_gaussians(means, quats, scales, opacities, usable, viewmat, K, plan, offset)
+    return needed_capacity(projected, mask, plan)
+
+
+def _usable(views: _Views) -> Bool[Array | np.ndarray, "b n"]:
+    """Gaussians whose values can be drawn: overflowing squares would corrupt others' gradients."""
+
+    def paintable(a):
+        a = a.astype(views.means.dtype)
+        return (abs(a * a) < math.inf).all(axis=(1, *range(3, a.ndim)))
+
+    usable = paintable(views.colors)
+    return usable if views.features is None else usable & paintable(views.features[:, None])
 
 
 def _project_all(views: _Views, plan: Plan) -> Projected:
@@ -236,20 +268,10 @@ def _project_all(views: _Views, plan: Plan) -> Projected:
     def one_camera(means, quats, scales, opacities, usable, viewmat, K, offset):
         return project_gaussians(means, quats, scales, opacities, usable, viewmat, K, plan, offset)
 
-    # Whether a Gaussian can be drawn also depends on its values: if their squares overflow, they would
-    # corrupt the gradients of all Gaussians that share a pixel with it.
-    def paintable(a):
-        a = a.astype(views.means.dtype)
-        return jnp.isfinite(a * a).all(axis=(1, *range(3, a.ndim)))
-
-    usable = paintable(views.colors)
-    if views.features is not None:
-        usable &= paintable(views.features[:, None])
-
     offset_axis = None if views.means2d_offset is None else 0
     cameras = jax.vmap(one_camera, in_axes=(None,) * 5 + (0, 0, offset_axis))
     scenes = jax.vmap(cameras, in_axes=(0,) * 7 + (offset_axis,))
-    gaussians = (views.means, views.quats, views.scales, views.opacities, usable)
+    gaussians = (*views[:4], _usable(views))
     return scenes(*gaussians, views.viewmats, views.Ks, views.means2d_offset)
 
 

@@ -133,9 +133,9 @@ def test_a_preset_is_where_the_trackers_settings_begin(monkeypatch, tmp_path):
     chosen = []
     monkeypatch.setattr("gsjax.cli.track.run", lambda options: chosen.append(options) or 0)
     command = ["track", "simulated:tabletop", "--out", str(tmp_path / "run")]
-    for more in ([], ["--preset", "fast"], ["--preset=fast", "--track.align.iterations", "3"]):
+    for more in ([], ["--preset", "accurate"], ["--preset=accurate", "--track.align.iterations", "3"]):
         assert main([*command, *more]) == 0
-    accurate, fast, changed = (options.track for options in chosen)
-    assert accurate == TrackConfig() == PRESETS["accurate"]
-    assert fast == PRESETS["fast"]
-    assert changed == replace(fast, align=replace(fast.align, iterations=3))
+    fast, accurate, changed = (options.track for options in chosen)
+    assert fast == TrackConfig() == PRESETS["fast"]
+    assert accurate == PRESETS["accurate"]
+    assert changed == replace(accurate, align=replace(accurate.align, iterations=3))

@@ -167,7 +167,7 @@ def test_binary_files_that_are_cut_off_anywhere(tmp_path, name):
     for length in range(len(content)):
         file.write_bytes(content[:length])
         with pytest.raises(
-            DataError, match=rf"{name}.bin: expected a (complete )?COLMAP file, found .*cut off"
+            DataError, match=rf"{name}.bin: expected a (complete )?COLMAP file, found .*truncated"
         ):
             read_colmap(tmp_path)
 
@@ -276,7 +276,7 @@ def test_what_is_wrong_with_text(tmp_path, name, change, says):
             "cameras",
             12,
             b"\x63",
-            r"cameras.bin: expected one of the camera model ids \[0, 1, .*found id 99\. It may",
+            r"cameras.bin: expected one of the camera model ids \[0, 1, .*found id 99\. The file may",
         ),
         ("cameras", 0, b"\xff" * 8, r"cameras.bin: .*found 18446744073709551615 items announced in 64 bytes"),
         ("cameras", 16, b"\0" * 8, r"a.png: expected a width and a height above 0, found 0x72"),

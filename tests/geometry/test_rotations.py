@@ -4,9 +4,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
 from scipy.spatial.transform import Rotation
 
-from gsjax.geometry.rotations import multiply_quats, normalize_quats, quats_to_matrices
+from gsjax.geometry.rotations import matrix_of, multiply_quats, normalize_quats, quats_to_matrices
 
 pytestmark = pytest.mark.usefixtures("x64")
 
@@ -45,3 +48,18 @@ def test_length_has_no_gradient():
     quat = jnp.asarray(random_quats())
     along = jax.jvp(quats_to_matrices, (quat,), (quat,))[1]
     np.testing.assert_allclose(along, 0, atol=1e-13)
+
+
+@given(arrays(np.float64, 3, elements=st.floats(-6, 6)))
+def test_a_rotation_vector_becomes_its_matrix(vector):
+    expected = Rotation.from_rotvec(vector).as_matrix()
+    np.testing.assert_allclose(matrix_of(jnp.asarray(vector)), expected, atol=1e-12)
+
+
+@pytest.mark.parametrize("length", [0.0, 1e-8, 1e-4, 1.0])
+def test_the_matrix_of_a_rotation_vector_has_a_derivative_also_at_rest(length):
+    vector, step = length * np.array([0.6, 0.0, -0.8]), 1e-6
+    found = jax.jacobian(matrix_of)(jnp.asarray(vector))
+    for i, along in enumerate(step * np.eye(3)):
+        ahead, behind = (Rotation.from_rotvec(vector + s * along).as_matrix() for s in (1, -1))
+        np.testing.assert_allclose(found[..., i], (ahead - behind) / (2 * step), atol=1e-8)

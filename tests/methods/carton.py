@@ -1,13 +1,15 @@
 """The carton of the simulated table as alignment sees it, and how well points that stand for it fit."""
 
+from dataclasses import replace
+
 import jax.numpy as jnp
 import numpy as np
 
+from gsjax.methods.track import PRESETS
 from gsjax.methods.track.align import disagreement
-from gsjax.methods.track.config import AlignConfig
 from gsjax.methods.track.points import tone_images
 
-CONFIG = AlignConfig(iterations=12)
+CONFIG = replace(PRESETS["accurate"].align, iterations=12)
 CARTON = 2
 SIZE = {"width": 160, "height": 120}
 

@@ -13,7 +13,6 @@ from gsjax.methods.track import (
     PRESETS,
     MatchConfig,
     RefineConfig,
-    StartConfig,
     TrackConfig,
     start_scene,
 )
@@ -22,7 +21,7 @@ from tests.methods.carton import CARTON, CONFIG, SIZE, middle, see
 
 QUICK = replace(
     PRESETS["paper"],
-    start=StartConfig(iterations=5),
+    start=replace(PRESETS["paper"].start, iterations=5),
     match=MatchConfig(patch=32, radius=12),
     refine=RefineConfig(iterations=3),
 )

@@ -196,7 +196,10 @@ class TestParsing:
             ("Is there tissue?", "expected a frame, found none"),
             ("Does the tissue move?", "expected two frames, found none"),
             ("When is the tissue fastest in frame 10?", "expected no frame, found 1"),
-            ("Is there tissue in frame 14?", "frame 14: expected one of the recording's 4 frames, 10 to 13"),
+            (
+                "Is there tissue in frame 14?",
+                "frame 14: expected one of the recording's 4 frames, numbered 10 to 13",
+            ),
         ],
     )
     def test_invalid_questions_are_explained(self, facts, question, words):

@@ -13,9 +13,8 @@ from hypothesis import strategies as st
 
 from gsjax import track
 from gsjax.geometry.cameras import camera_centers
-from gsjax.methods.track import GrowConfig, RefineConfig, first_pose
+from gsjax.methods.track import PRESETS, GrowConfig, RefineConfig, first_pose
 from gsjax.methods.track.align import coarse_shifts
-from gsjax.methods.track.config import AlignConfig
 from gsjax.methods.track.layers import Shown
 from gsjax.methods.track.lost import FOUND, LOST, group_confidence, is_found
 from gsjax.methods.track.motion import facing
@@ -50,7 +49,7 @@ def carton(table):
     labels = np.stack([sequence.mask(6, c) for c in range(2)])
     images = tone_images(frames[6], 0.3)
     labels = jnp.asarray(np.where(labels == CARTON, 1, 0), jnp.int32)
-    return images, pixels_of_groups(images, labels, images.depths, 1, AlignConfig())
+    return images, pixels_of_groups(images, labels, images.depths, 1, PRESETS["accurate"].align)
 
 
 def moved(points: Points, *twist: float) -> Points:
@@ -179,13 +178,13 @@ def one(table, started, quick):
 
 
 def strangers_of(images, strange) -> Points:
-    found = pixels_of_groups(images, strange.astype(jnp.int32), images.depths, 1, AlignConfig())
+    found = pixels_of_groups(images, strange.astype(jnp.int32), images.depths, 1, PRESETS["accurate"].align)
     return jax.tree.map(lambda a: a[0], found)
 
 
 def test_guesses_bring_points_to_unexplained_pixels_or_stay_near(one):
     reference, center, images, shown = one
-    config, guess = AlignConfig(), jnp.array([0.3, 0.0, 0.1, 0.0, 0.5, 0.0])
+    config, guess = PRESETS["accurate"].align, jnp.array([0.3, 0.0, 0.1, 0.0, 0.5, 0.0])
     unexplained_pixels, shifts = strangers_of(images, shown), coarse_shifts(config, images)
 
     def draw(seed, unexplained_pixels=unexplained_pixels, config=config):
@@ -221,7 +220,7 @@ def test_a_lost_group_is_recovered_over_frames_but_not_at_another_object(one):
         means=carry(Points(reference.means, reference.tones, reference.real), off, center).means,
         normals=jnp.einsum("ij,jp->ip", jaxlie.SO3.exp(off[3:]).as_matrix(), reference.normals),
     )
-    others, config = jnp.where(shown, 0.0, images.depths), AlignConfig()
+    others, config = jnp.where(shown, 0.0, images.depths), PRESETS["accurate"].align
     unexplained_pixels = strangers_of(images, shown)
     look = jax.jit(
         lambda seed, guess, around: recover(

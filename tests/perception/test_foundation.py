@@ -320,13 +320,13 @@ def test_pickled_weights_are_refused_with_advice_on_how_to_convert_them(load, tm
         ("config.json", '{"transformers_weights": "adapter_model.bin"}', "expected no transformers_weights"),
         ("config.json", "[]", "expected a JSON object, found list"),
         ("config.json", "{", "expected JSON, found"),
-        ("adapter_config.json", "{}", "expected the weights of a whole model, found an adapter"),
+        ("adapter_config.json", "{}", "expected the weights of a whole model, found only an adapter"),
         (
             "model.safetensors.index.json",
             '{"weight_map": {"a": "a.bin"}}',
-            r"expected a weight_map to .* found other files",
+            r"expected a weight_map that names .* found none",
         ),
-        ("model.safetensors.index.json", "{}", r"expected a weight_map to .* found other files"),
+        ("model.safetensors.index.json", "{}", r"expected a weight_map that names .* found none"),
     ],
 )
 def test_files_that_lead_to_a_pickle_are_refused(tmp_path, name, holds, says):

@@ -108,3 +108,21 @@ def test_a_count_beyond_int32_saturates_instead_of_wrapping():
     counts = jnp.full(100_000, 32_400, jnp.int32)  # 3.2e9 pairs
     assert int(total(counts)) == np.iinfo(np.int32).max
     assert int(total(counts[:10])) == 324_000
+
+
+def test_the_needed_capacity_is_counted_in_parts_whatever_the_plan_holds():
+    rng = np.random.default_rng(0)
+    n, plan = 3000, Plan(70, 1600, capacity=0)  # 100 rows of tiles, and 240,000 rows of Gaussians
+    means = np.c_[rng.uniform(-0.5, 0.5, (n, 2)), rng.uniform(1, 2, n)]
+    arrays = (means, rng.normal(size=(n, 4)), rng.uniform(5, 10, (n, 3)), rng.uniform(0.1, 1, n))
+    K = jnp.array([[50.0, 0.0, 35.0], [0.0, 50.0, 800.0], [0.0, 0.0, 1.0]])
+    projected = project_gaussians(
+        *(jnp.asarray(a, jnp.float32) for a in arrays), jnp.ones(n, bool), jnp.eye(4), K, plan
+    )
+    enough = plan.grown(int(needed_capacity(projected, None, plan)))
+    lists = jax.jit(bin_gaussians, static_argnames="plan")(projected, None, plan=enough)
+    assert not lists.overflow
+    assert int(lists.needed) == int(needed_capacity(projected, None, enough)) > 2 * 2**16
+    mask = jnp.arange(plan.num_tiles) % 7 == 3
+    lists = jax.jit(bin_gaussians, static_argnames="plan")(projected, mask, plan=enough)
+    assert int(lists.needed) == int(needed_capacity(projected, mask, plan))

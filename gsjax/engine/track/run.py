@@ -58,19 +58,15 @@ class Options(FirstMasks, OfRecording):
     budget_ms: float | None = None
     """Time that an update may take, milliseconds. Settings are then chosen by measured cost; of those under
     --track, only the initial scene, the limit on its growth, and the seed are used."""
-    preset: Literal["accurate", "balanced", "fast", "paper"] = "accurate"
-    """Default settings of the tracker: for small errors (accurate), for 30 Hz (fast), between the two
+    preset: Literal["fast", "balanced", "accurate", "paper"] = "fast"
+    """Default settings of the tracker: for 30 Hz (fast), for small errors (accurate), between the two
     (balanced), or as in the paper."""
     track: TrackConfig = field(default_factory=TrackConfig)
     """The tracker's own settings."""
 
 
 def options_for(arguments: list[str]) -> tuple[type[Options], list[str]]:
-    """The class of options, with the defaults of the preset that is named, and the arguments to parse. A
-    budget implies the preset `fast`, which starts from fewer Gaussians."""
-    flags = [argument.split("=")[0].replace("_", "-") for argument in arguments]
-    if "--budget-ms" in flags and "--preset" not in flags:
-        return preset_options(Options, [*arguments, "--preset", "fast"], "track", PRESETS)
+    """The class of options, with the defaults of the preset that is named, and the arguments to parse."""
     return preset_options(Options, arguments, "track", PRESETS)
 
 

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gsjax.engine.drive import Clock, Tick
+from gsjax.engine.drive import Clock, Tick, announced
 from gsjax.engine.interrupts import raise_if_interrupted, shielded
 from gsjax.losses.extra import ExtraLosses
 from gsjax.methods.track.budget import Costs, Governor, choose, ladder
@@ -110,7 +110,7 @@ def _ticks(
         run, info, seconds, compile_seconds = shielded(advance, run, frame, everywhere)
         if governor is not None:
             governor.spent(seconds, int(info["looked_for"].sum()))
-        yield Tick(method, shape, run, info, seconds, compile_seconds)
+        yield announced(Tick(method, shape, run, info, seconds, compile_seconds))
 
 
 def _begun(

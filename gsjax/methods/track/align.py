@@ -12,25 +12,17 @@ refinement by rendering converges. All functions here are for one group and one 
 many.
 """
 
-from dataclasses import replace
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import jaxlie
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from gsjax.methods.track.config import AlignConfig
 from gsjax.methods.track.points import Points, ToneImages, carry, rotated, sum_of_three
 from gsjax.optim.compiler import in_memory
-
-
-def widened(config: AlignConfig) -> AlignConfig:
-    """The configuration with wider scales of the residuals, for starts that are far off."""
-    factor = config.widen
-    return replace(config, color_scale=factor * config.color_scale, depth_scale=factor * config.depth_scale)
-
 
 _CHANNELS = (3, 1)  # number of channels of colour, each of which has the mean of the three, and of depth
 
@@ -82,10 +74,15 @@ class Residuals(NamedTuple):
     gradients: Float[Array, "c 3 d p"]  # with respect to the point, per metre
 
 
-def _residuals(points: Points, images: ToneImages, config: AlignConfig) -> Residuals:
+def _residuals(
+    points: Points, images: ToneImages, config: AlignConfig, widen: Float[ArrayLike, ""] = 1.0
+) -> Residuals:
     """The residuals of one group's points."""
     height, width, channels = images.pixels.shape[1:]
-    scales = jnp.array([config.color_scale] * 3 + [config.depth_scale] * (channels - 3))[:, None]
+    scales = widen * jnp.array([config.color_scale] * 3 + [config.depth_scale] * (channels - 3))[:, None]
+    # Masks instead of updates of single rows, which would be programs of their own.
+    is_depth, is_color_kind = np.arange(channels)[:, None] == 3, np.arange(2)[:, None] == 0
+    is_z = np.arange(3.0)[:, None, None] == 2
 
     def one(means, tones, viewmat, K, image):
         local = rotated(viewmat[:3, :3], means) + viewmat[:3, 3:]
@@ -98,25 +95,24 @@ def _residuals(points: Points, images: ToneImages, config: AlignConfig) -> Resid
         wanted, counts = tones, inside[None]
         if channels == 4:
             # No surface has the depth between pixels on two surfaces: take the nearest pixel's there.
-            smooth = jnp.abs(found[3] - nearest[3]) < config.depth_scale
-            found = found.at[3].set(jnp.where(smooth, found[3], nearest[3]))
-            across, along = (slope.at[3].set(jnp.where(smooth, slope[3], 0.0)) for slope in (across, along))
-            wanted = jnp.concatenate([tones, local[2:]])
-            counts = jnp.stack([inside, inside & (nearest[3] > 0)])
-        # d pixel / d local = (K - pixel e_z^T) / z
+            rough = is_depth & (jnp.abs(found[3] - nearest[3]) >= scales[3])
+            found = jnp.where(rough, nearest, found)
+            across, along = (jnp.where(rough, 0.0, slope) for slope in (across, along))
+            wanted = jnp.where(is_depth, local[2], jnp.pad(tones, [(0, 1), (0, 0)]))
+            counts = inside & (is_color_kind | (nearest[3] > 0))
+        # d pixel / d local = (K - pixel e_z^T) / z, and depth is z itself
         gradients = K[0, :, None, None] * (across / z) + K[1, :, None, None] * (along / z)
-        gradients = gradients.at[2].add(-(x * across + y * along) / z)
-        if channels == 4:
-            gradients = gradients.at[2, 3].add(-1.0)
+        gradients -= jnp.where(is_z, (x * across + y * along) / z + is_depth, 0.0)
         gradients = jnp.swapaxes(rotated(viewmat[:3, :3].T, jnp.swapaxes(gradients / scales, 0, 1)), 0, 1)
         return Residuals((found - wanted) / scales, counts, gradients)
 
     return jax.vmap(one)(points.means, points.tones, images.cameras.viewmat, images.cameras.K, images.pixels)
 
 
-def _by_kind(products: Float[Array, "c d p"]) -> list[Float[Array, "c p"]]:
+def _by_kind(products: Float[Array, "*n c d p"]) -> list[Float[Array, "*n c p"]]:
     """Sums over the channels of colour and, if there is one, of depth."""
-    return [sum_of_three(products[:, :3], axis=1), *(products[:, i] for i in range(3, products.shape[1]))]
+    color, channels = sum_of_three(products[..., :3, :], axis=-2), products.shape[-2]
+    return [color, *(products[..., i, :] for i in range(3, channels))]
 
 
 def _squared(residuals: Residuals) -> list[Float[Array, "c p"]]:
@@ -140,39 +136,44 @@ def _normal_equations(
     center: Float[Array, "3"],
     images: ToneImages,
     config: AlignConfig,
+    widen: Float[ArrayLike, ""] = 1.0,
 ) -> _Fit:
     """Cost, J^T W J and J^T W r after `twist`, for a small twist about the moved centre that follows it."""
     moved = carry(points, twist, center)
-    residuals = _residuals(moved, images, config)
+    residuals = _residuals(moved, images, config, widen)
     squared = _squared(residuals)
     kinds = list(zip(_CHANNELS[: len(squared)], squared, jnp.moveaxis(residuals.counts, 1, 0), strict=True))
     # Where there is nothing to compare with, a point costs half as much as one that disagrees entirely.
     costs = points.seen * sum(n * jnp.where(counts, r / (1 + r), 0.5) for n, r, counts in kinds)
     weights = [points.seen * counts / (1 + r) ** 2 for _, r, counts in kinds]
-    arms = tuple(jnp.moveaxis(moved.means - (center + twist[:3])[:, None], 1, 0))
-    x, y, z = jnp.moveaxis(residuals.gradients, 1, 0)
+    arms = jnp.moveaxis(moved.means - (center + twist[:3])[:, None], 1, 0)
+    levers = jnp.pad(arms, [(1, 0), (0, 0), (0, 0)], constant_values=1.0)
+    slopes = jnp.moveaxis(residuals.gradients, 1, 0)
 
-    def over_channels(a, b) -> Float[Array, "c p"]:
-        return sum(w * ab for w, ab in zip(weights, _by_kind(a * b), strict=True))
+    def over_channels(products: Float[Array, "*n c d p"]) -> Float[Array, "*n c p"]:
+        return sum(w * product for w, product in zip(weights, _by_kind(products), strict=True))
 
-    # A row of the Jacobian is (g, arm x g), so a point adds (F, F A^T; A F, A F A^T) with A v = arm x v and F
-    # the sum of g g^T over its channels. No row is stored, which XLA:CPU would do for a matrix product.
-    products = [over_channels(*pair) for pair in ((x, x), (x, y), (x, z), (y, y), (y, z), (z, z))]
-    pulls = [over_channels(a, residuals.values) for a in (x, y, z)]
-    (xx, xy, xz, yy, yz, zz), pulls, costs = in_memory((products, pulls, costs), images.cameras.K)
-    forces = ((xx, xy, xz), (xy, yy, yz), (xz, yz, zz))
-    levers = [_cross(arms, force) for force in forces]  # the columns of A F
-    torques = [_cross(arms, lever) for lever in zip(*levers, strict=True)]
-    upper = [(*force, *lever) for force, lever in zip(forces, levers, strict=True)]
-    lower = [(*lever, *torque) for lever, torque in zip(zip(*levers, strict=True), torques, strict=True)]
-    hessian = jnp.stack([jnp.stack(row).sum((1, 2)) for row in upper + lower])
-    *gradient, cost = jnp.stack([*pulls, *_cross(arms, pulls), costs]).sum((1, 2))
-    return _Fit(twist, cost, hessian, jnp.stack(gradient))
+    # A row of the Jacobian is (g, arm x g), which is linear in the products of g and (1, arm). So their sums
+    # over all points are enough, and no row is stored.
+    forces, pulls = over_channels(slopes[:, None] * slopes), over_channels(slopes * residuals.values)
+    terms = in_memory((levers[:, None] * levers, levers, forces, pulls, costs), images.cameras.K)
+    squares, levers, forces, pulls, costs = (jax.lax.collapse(a, a.ndim - 2) for a in terms)
+    order = [(2, 3), (0, 2), (0, 1)]  # sums over the points first
+    hessian = jnp.einsum("rai,sbj,abn,ijn->rs", _ROWS, _ROWS, squares, forces, optimize=order)
+    gradient = jnp.einsum("rai,an,in->r", _ROWS, levers, pulls, optimize=[(1, 2), (0, 1)])
+    return _Fit(twist, costs.sum(), hessian, gradient)
 
 
-def _cross(a, b):
-    """a x b, with three arrays each."""
-    return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
+def _rows() -> Float[np.ndarray, "6 4 3"]:
+    """(g, arm x g) from the products of (1, arm) and g."""
+    rows = np.zeros((6, 4, 3))
+    for i in range(3):
+        j, k = (i + 1) % 3, (i + 2) % 3
+        rows[i, 0, i], rows[3 + i, 1 + j, k], rows[3 + i, 1 + k, j] = 1, 1, -1
+    return rows
+
+
+_ROWS = _rows()
 
 
 def align(
@@ -181,6 +182,7 @@ def align(
     center: Float[Array, "3"],
     images: ToneImages,
     config: AlignConfig,
+    widen: Float[ArrayLike, ""] = 1.0,
 ) -> Float[Array, "6"]:
     """The twist (translation, metres, and rotation vector) that Levenberg-Marquardt finds.
 
@@ -189,6 +191,8 @@ def align(
         points: points of one group, in the last frame.
         center: its centroid in the last frame, metres.
         images: the new frame.
+        config: configuration of the alignment.
+        widen: factor on the scales of the residuals; `config.widen` for starts that are far off.
     """
     longest = jnp.array([config.max_step] * 3 + [config.max_turn] * 3)
     # Regularises directions that no pixel constrains.
@@ -196,7 +200,7 @@ def align(
 
     def iterate(carried, _):
         best, trial, damping = carried
-        new = _normal_equations(trial, points, center, images, config)
+        new = _normal_equations(trial, points, center, images, config, widen)
         better = new.cost < best.cost
         best = jax.tree.map(lambda a, b: jnp.where(better, a, b), new, best)
         damping = jnp.clip(jnp.where(better, damping * 0.3, damping * 10.0), 1e-4, 1e4)
@@ -208,6 +212,21 @@ def align(
     start = (jax.tree.map(jnp.asarray, nothing), twist, jnp.asarray(1e-2, twist.dtype))
     (best, *_), _ = jax.lax.scan(iterate, start, None, length=config.iterations + 1)
     return best.twist
+
+
+def align_from_afar(
+    twist: Float[Array, "6"],
+    points: Points,
+    center: Float[Array, "3"],
+    images: ToneImages,
+    config: AlignConfig,
+) -> Float[Array, "6"]:
+    """The twist after `align` with wide scales, from there with the usual ones. Arguments as for `align`."""
+
+    def once(twist, widen):
+        return align(twist, points, center, images, config, widen), None
+
+    return jax.lax.scan(once, twist, jnp.array([config.widen, 1.0], twist.dtype))[0]
 
 
 def ball_grid(radius: float, spacing: float) -> Float[np.ndarray, "n 3"]:
@@ -247,12 +266,13 @@ def disagreement(
     center: Float[Array, "3"],
     images: ToneImages,
     config: AlignConfig,
+    widen: Float[ArrayLike, ""] = 1.0,
 ) -> Float[Array, ""]:
     """Disagreement of a group's points with the images after its twist: 0 perfect, 1 not at all.
 
     Colour and depth have equal weight; a point outside the image counts half. Arguments as for `align`.
     """
-    residuals = _residuals(carry(points, twist, center), images, config)
+    residuals = _residuals(carry(points, twist, center), images, config, widen)
     kinds = list(zip(_squared(residuals), jnp.moveaxis(residuals.counts, 1, 0), strict=True))
     cost = sum(counts * r / (1 + r) for r, counts in kinds)
     compared = sum(counts.astype(cost.dtype) for _, counts in kinds)

@@ -13,9 +13,9 @@ from gsjax.methods.settings import ABOVE_ZERO, expect
 class StartConfig:
     """How the first frame becomes Gaussians."""
 
-    object_pixels: float = 1.5
+    object_pixels: float = 2.5
     """Width of the voxels in which one point of an object is kept, in pixels of the camera that saw it."""
-    background_pixels: float = 4.0
+    background_pixels: float = 6.0
     """The same for the background, which is only rendered."""
     max_extent: float = 0.35
     """Longest extent of a rigid object, metres. Longer ones (a robot arm) are tracked in parts."""
@@ -60,18 +60,18 @@ class MatchConfig:
 class AlignConfig:
     """Direct alignment of points with the images, without rendering."""
 
-    iterations: int = 6
+    iterations: int = 4
     """Levenberg-Marquardt iterations per start; 0, with `reach` 0 and `turns` (), disables alignment."""
     color_scale: float = 0.1
     """Scale of the difference of log colours, which span about 0 to 1."""
     depth_scale: float = 0.01
     """Scale of the depth difference, metres."""
-    centers: int = 256
+    centers: int = 64
     """Gaussians of a group whose centres are aligned."""
     center_weight: float = 1.0
     """Weight of a centre relative to a pixel. Centres prevent drift; pixels are closer in appearance to the
     new frame."""
-    pixels: int = 192
+    pixels: int = 96
     """Pixels aligned per group and camera: this many from the last frame and as many from the group's
     keyframe."""
     keyframe_turn: float = 0.4
@@ -86,8 +86,8 @@ class AlignConfig:
     """Radius in which shifts of a group are tried, metres."""
     spacing: float = 0.015
     """Distance between those shifts, metres."""
-    everywhere: int | None = None
-    """Groups per frame to search for throughout that radius, those that agree worst first; default: all."""
+    everywhere: int | None = 2
+    """Groups per frame to search for throughout that radius, those that agree worst first; None: all."""
     turns: tuple[float, ...] = (0.2, 0.6)
     """Angles by which the best start is rotated, both ways about each principal axis, radians."""
     max_step: float = 0.1
@@ -147,7 +147,7 @@ class GrowConfig:
 
     slots: int = 4096
     """Gaussians that may join over the whole recording; 0 disables growth."""
-    candidates: int = 256
+    candidates: int = 16
     """Pixels that are examined per frame."""
     reach: int = 6
     """Largest distance of those pixels from an object's outline, pixels."""
@@ -183,7 +183,7 @@ class TrackConfig:
     """Factor by which images are first downscaled along each axis, by averaging."""
     redraw: Literal["all", "moving"] = "moving"
     """What an update draws: the whole scene, or the moving Gaussians over a background that is drawn once."""
-    coarseness: int = 1
+    coarseness: int = 2
     """With "moving": images shrink by this factor along each axis, and every coarseness^2-th Gaussian is
     drawn."""
     headroom: float = 1.5
@@ -195,31 +195,31 @@ class TrackConfig:
         expect(self, "track.", headroom=(1, np.inf), coarseness=(1, np.inf), shrink=(1, np.inf))
         if self.coarseness > 1 and (self.redraw == "all" or self.matching):
             raise ValueError(
-                "track.coarseness: expected 1 unless redraw is moving and matching is off, found "
-                f"{self.coarseness}"
+                "track.coarseness: expected 1 if redraw is all or matching is on, found "
+                f"{self.coarseness}; set it to 1"
             )
         if self.redraw not in ("all", "moving"):
             raise ValueError(f"track.redraw: expected all or moving, found {self.redraw!r}")
         if self.redraw == "moving" and self.refine.iterations:
             raise ValueError(
                 "track.redraw: expected all if refine.iterations is above 0, found moving; set "
-                "refine.iterations to 0, or redraw all"
+                "refine.iterations to 0, or redraw to all and coarseness to 1"
             )
 
 
-PAPER = TrackConfig(refine=RefineConfig(), matching=True, redraw="all")
 BALANCED = TrackConfig(
-    start=StartConfig(object_pixels=2.5, background_pixels=6.0),
-    align=AlignConfig(pixels=128, centers=128),
+    align=AlignConfig(iterations=6, pixels=128, centers=128, everywhere=None),
     grow=GrowConfig(candidates=64),
+    coarseness=1,
 )
-FAST = replace(
+ACCURATE = replace(
     BALANCED,
-    align=AlignConfig(iterations=4, pixels=96, centers=64, everywhere=2),
-    grow=GrowConfig(candidates=16),
-    coarseness=2,
+    start=StartConfig(object_pixels=1.5, background_pixels=4.0),
+    align=replace(BALANCED.align, pixels=192, centers=256),
+    grow=GrowConfig(candidates=256),
 )
-PRESETS = {"accurate": TrackConfig(), "balanced": BALANCED, "fast": FAST, "paper": PAPER}
-"""`accurate`, `balanced` and `fast` align fewer and fewer points; `fast` is for 30 Hz on one core, and
-searches everywhere for two objects per update. `paper` has all stages of the paper, including template
+PAPER = replace(ACCURATE, refine=RefineConfig(), matching=True, redraw="all")
+PRESETS = {"fast": TrackConfig(), "balanced": BALANCED, "accurate": ACCURATE, "paper": PAPER}
+"""`fast`, the default, is for 30 Hz on one core, and searches everywhere for two objects per update;
+`balanced` and `accurate` align more and more points. `paper` has all stages of the paper, including template
 matching and photometric refinement, which cost much and gain little: see docs/results-tracking.md."""

@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Shaped
 
 from gsjax.geometry.cameras import Camera, unproject
+from gsjax.geometry.rotations import matrix_of
 from gsjax.methods.track.config import AlignConfig
 from gsjax.rasterize.sorting import sort_keys
 from gsjax.scene.frame import Frame
@@ -80,8 +81,7 @@ def where_groups(chosen: Bool[Array, "k"], a: Shaped[Array, "k *d"], b: Shaped[A
 
 def carry(points: Points, twist: Float[Array, "6"], center: Float[Array, "3"]) -> Points:
     """The points of one group after its twist (translation, metres, and rotation vector) about its center."""
-    turn = jaxlie.SO3.exp(twist[3:]).as_matrix()
-    moved = rotated(turn, points.means - center[:, None]) + (center + twist[:3])[:, None]
+    moved = rotated(matrix_of(twist[3:]), points.means - center[:, None]) + (center + twist[:3])[:, None]
     return points._replace(means=moved)
 
 

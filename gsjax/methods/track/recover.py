@@ -6,6 +6,7 @@ The result is again a guess, from which the next frame continues, until enough o
 to be found, in two frames: among many guesses one may agree by chance.
 """
 
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -13,7 +14,7 @@ import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Bool, Float, Key
 
-from gsjax.methods.track.align import align, coarse_shifts, compose, turn_hypotheses, widened
+from gsjax.methods.track.align import align_from_afar, coarse_shifts, compose, turn_hypotheses
 from gsjax.methods.track.config import AlignConfig
 from gsjax.methods.track.layers import Shown
 from gsjax.methods.track.lost import COLOR_SCALE, Confidence, group_confidence
@@ -78,9 +79,7 @@ def recover(
     def aligned(twist):
         faces = points_facing(reference, twist, center, images).seen
         points = points_facing(reference, jnp.zeros_like(twist), center, images)._replace(seen=faces)
-        for scales in (widened(config), config):
-            twist = align(twist, points, center, images, scales)
-        return twist
+        return align_from_afar(twist, points, center, images, config)
 
     def places(twists) -> tuple[Float[Array, "n 6"], Confidence]:
         """The twists as they are, and then aligned."""
@@ -96,13 +95,22 @@ def recover(
         drawn = draw_guesses(key, shifts, reference, center, context.unexplained_pixels, guess, config)
         most = jax.lax.top_k(evidence(shown(drawn, few)), min(_STARTS, len(drawn)))[1]
         tried = jnp.concatenate([tried, drawn[most]])
-    found = places(tried)
-    _, of_guess = best(jax.tree.map(lambda a: a[:: len(tried)], found))  # the guess as it is, and aligned
-    twist, confidence = best(found)
-    if config.max_turn and config.turns:
-        for _ in range(_ROUNDS):
-            twist, confidence = best(places(turn_hypotheses(twist, jnp.eye(3), config.turns)))
-    return Relocation(twist, confidence, of_guess)
+    rounds = _ROUNDS if config.max_turn and config.turns else 0
+    count = max(len(tried), 1 + 6 * len(config.turns)) if rounds else len(tried)
+    tried = jnp.concatenate([tried, jnp.broadcast_to(guess, (count - len(tried), 6))])
+
+    def one_round(i, last: Relocation) -> Relocation:
+        """What was drawn, and then turns of the best, all by one program."""
+        turned = turn_hypotheses(last.twists, jnp.eye(3), config.turns) if rounds else tried
+        turned = jnp.concatenate([turned, jnp.broadcast_to(last.twists, (count - len(turned), 6))])
+        found = places(jnp.where(i == 0, tried, turned))
+        of_guess = best(jax.tree.map(lambda a: a[::count], found))[1]  # the guess as it is, and aligned
+        of_guess = jax.tree.map(partial(jnp.where, i == 0), of_guess, last.guess_confidence)
+        return Relocation(*best(found), of_guess)
+
+    nothing = jnp.zeros((), guess.dtype)
+    unknown = Confidence(nothing, nothing, nothing > 0)
+    return jax.lax.fori_loop(0, 1 + rounds, one_round, Relocation(guess, unknown, unknown))
 
 
 def evidence(confidence: Confidence) -> Float[Array, "*k"]:

@@ -7,11 +7,10 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import jaxlie
 from jaxtyping import Array, Bool, Float
 
 from gsjax.geometry.cameras import Camera, camera_centers
-from gsjax.geometry.rotations import quats_to_matrices
+from gsjax.geometry.rotations import matrix_of, quats_to_matrices
 from gsjax.geometry.spherical_harmonics import SH_C0
 from gsjax.methods.track.config import AlignConfig
 from gsjax.methods.track.layers import Shown, seen_from
@@ -76,7 +75,7 @@ def points_facing(
         images: their cameras.
     """
     moved = carry(Points(reference.means, reference.tones, reference.real), twist, center)
-    normals = rotated(jaxlie.SO3.exp(twist[3:]).as_matrix(), reference.normals)
+    normals = rotated(matrix_of(twist[3:]), reference.normals)
     rays = camera_centers(images.cameras.viewmat)[:, :, None] - moved.means
     one_sided = jnp.any(normals != 0, axis=0)
     toward = sum_of_three(normals * rays, axis=1)

@@ -15,7 +15,13 @@ import jaxlie
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from gsjax.methods.track.align import align, coarse_shifts, disagreement, turn_hypotheses, widened
+from gsjax.methods.track.align import (
+    align,
+    align_from_afar,
+    coarse_shifts,
+    disagreement,
+    turn_hypotheses,
+)
 from gsjax.methods.track.config import AlignConfig
 from gsjax.methods.track.lost import DOUBTFUL, LOST, Confidence, is_found
 from gsjax.methods.track.points import Points, ToneImages
@@ -49,8 +55,8 @@ class SearchResult(NamedTuple):
     leads: Float[Array, "k"]  # see `search_everywhere`; infinite if unknown
 
 
-align_groups = jax.vmap(align, in_axes=(0, 0, 0, None, None))
-"""`align` of many groups, each from its own start."""
+align_groups = jax.vmap(align_from_afar, in_axes=(0, 0, 0, None, None))
+"""`align_from_afar` of many groups, each from its own start."""
 disagreements = jax.vmap(disagreement, in_axes=(0, 0, 0, None, None))
 """`disagreement` of many groups, each after its own twist."""
 
@@ -98,28 +104,30 @@ def search_everywhere(
         config: configuration of the alignment.
         shifts: twists that are added to the starts.
     """
-    wide, half = widened(config), jax.tree.map(lambda a: a[..., ::2], points)
+    half = jax.tree.map(lambda a: a[..., ::2], points)
 
-    def judged(twists, points, config) -> Float[Array, "h"]:
-        over_twists = jax.vmap(disagreement, in_axes=(0, None, None, None, None))
-        return over_twists(twists, points, center, images, config)
+    def judged(twists, points, widen=1.0) -> Float[Array, "h"]:
+        over_twists = jax.vmap(disagreement, in_axes=(0, None, None, None, None, None))
+        return over_twists(twists, points, center, images, config, widen)
 
     def aligned(twists):
-        over_twists = jax.vmap(align, in_axes=(0, None, None, None, None))
-        return over_twists(twists, half, center, images, wide)
+        over_twists = jax.vmap(align, in_axes=(0, None, None, None, None, None))
+        return over_twists(twists, half, center, images, config, config.widen)
 
     tried = jnp.concatenate([starts, known.twists[None]])
     if len(shifts):
         few, count = jax.tree.map(lambda a: a[..., ::4], points), len(starts)
         shifted = [starts[i] + shifts[i::count] for i in range(count)]
-        parts = jnp.split(judged(jnp.concatenate(shifted), few, wide), np.cumsum([*map(len, shifted)])[:-1])
+        parts = jnp.split(
+            judged(jnp.concatenate(shifted), few, config.widen), np.cumsum([*map(len, shifted)])[:-1]
+        )
         tried = jnp.stack([*tried, *(best_of(*part).twists for part in zip(parts, shifted, strict=True))])
     tried = aligned(tried)
-    residuals = judged(tried, half, config)
+    residuals = judged(tried, half)
     if config.max_turn and config.turns:
         axes = principal_axes(points, center)
         tried = aligned(turn_hypotheses(best_of(residuals, tried).twists, axes, config.turns))
-        residuals = judged(tried, half, config)
+        residuals = judged(tried, half)
     last = align(best_of(residuals, tried).twists, points, center, images, config)
     ends = jnp.stack([known.twists, last])
     best = best_of(jnp.stack([known.residuals, disagreement(last, points, center, images, config)]), ends)
@@ -221,8 +229,7 @@ def search(
     """
     over_starts = jax.vmap(disagreements, in_axes=(0, None, None, None, None))
     best = best_of(over_starts(starts, points, centers, images, config), starts)
-    aligned = align_groups(best.twists, points, centers, images, widened(config))
-    aligned = align_groups(aligned, points, centers, images, config)
+    aligned = align_groups(best.twists, points, centers, images, config)
     residuals = jnp.stack([best.residuals, disagreements(aligned, points, centers, images, config)])
     estimate = best_of(residuals, jnp.stack([best.twists, aligned]))
     steady = estimate.residuals < _STEADY_FACTOR * watch.usual

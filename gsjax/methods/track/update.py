@@ -72,8 +72,8 @@ def track_step(
     if named_losses(extra_losses) and not config.refine.iterations:
         raise ValueError(
             "extra_losses: expected none with config.refine.iterations 0, because they are added to the "
-            f"refinement's; found {len(extra_losses)}: take PRESETS['paper'], or set redraw to all and "
-            "refine.iterations above 0"
+            f"refinement's; found {len(extra_losses)}: take PRESETS['paper'], or set redraw to all, "
+            "coarseness to 1 and refine.iterations above 0"
         )
 
     def update(params: Tracked, state: TrackState, batch: TrackBatch, *, step: Any, key: Key[Array, ""]):

@@ -111,7 +111,7 @@ def test_without_a_question_it_says_what_can_be_asked(gsjax, scene):
     [
         ("is it safe?", "expected one of these questions"),
         ("is there a liver in frame 5?", "found 'liver'; there are: tissue, tool"),
-        ("is there a tool in frame 9?", "frame 9: expected one of the recording's 3 frames, 5 to 7"),
+        ("is there a tool in frame 9?", "frame 9: expected one of the recording's 3 frames, numbered 5 to 7"),
     ],
 )
 def test_what_cannot_be_answered_is_said(gsjax, scene, question, words):
