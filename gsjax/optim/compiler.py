@@ -115,7 +115,7 @@ def keep_freed_memory() -> bool:
     return bool(mallopt(_TRIM_THRESHOLD, _KEPT))
 
 
-_MOST_BYTES, _WORTH_S = 2**30, 0.3  # size of the cache on disk; faster compilations are not cached
+_MOST_BYTES, _WORTH_S = 2**30, 0.0  # size of the cache on disk; the seconds from which a program is kept
 
 
 def keep_programs(folder: str | Path | None = None) -> Path | None:

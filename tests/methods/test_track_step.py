@@ -13,8 +13,8 @@ import pytest
 from gsjax.methods.track import PLAN, PRESETS, AlignConfig, Track, TrackBatch, first_look
 from gsjax.methods.track.grow import empty_slots
 
-# Looks nowhere but where things were, which compiles fast.
-LITTLE = AlignConfig(iterations=2, reach=0.0, turns=(), pixels=32, centers=32)
+# Looks nowhere but where things were, which compiles fast, and for all groups, so that rounding chooses none.
+LITTLE = AlignConfig(iterations=2, reach=0.0, turns=(), pixels=32, centers=32, everywhere=None)
 CONFIG = replace(PRESETS["fast"], align=LITTLE)
 
 

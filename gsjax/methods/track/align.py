@@ -80,9 +80,6 @@ def _residuals(
     """The residuals of one group's points."""
     height, width, channels = images.pixels.shape[1:]
     scales = widen * jnp.array([config.color_scale] * 3 + [config.depth_scale] * (channels - 3))[:, None]
-    # Masks instead of updates of single rows, which would be programs of their own.
-    is_depth, is_color_kind = np.arange(channels)[:, None] == 3, np.arange(2)[:, None] == 0
-    is_z = np.arange(3.0)[:, None, None] == 2
 
     def one(means, tones, viewmat, K, image):
         local = rotated(viewmat[:3, :3], means) + viewmat[:3, 3:]
@@ -95,14 +92,16 @@ def _residuals(
         wanted, counts = tones, inside[None]
         if channels == 4:
             # No surface has the depth between pixels on two surfaces: take the nearest pixel's there.
-            rough = is_depth & (jnp.abs(found[3] - nearest[3]) >= scales[3])
-            found = jnp.where(rough, nearest, found)
-            across, along = (jnp.where(rough, 0.0, slope) for slope in (across, along))
-            wanted = jnp.where(is_depth, local[2], jnp.pad(tones, [(0, 1), (0, 0)]))
-            counts = inside & (is_color_kind | (nearest[3] > 0))
-        # d pixel / d local = (K - pixel e_z^T) / z, and depth is z itself
+            smooth = jnp.abs(found[3] - nearest[3]) < scales[3]
+            found = found.at[3].set(jnp.where(smooth, found[3], nearest[3]))
+            across, along = (slope.at[3].set(jnp.where(smooth, slope[3], 0.0)) for slope in (across, along))
+            wanted = jnp.concatenate([tones, local[2:]])
+            counts = jnp.stack([inside, inside & (nearest[3] > 0)])
+        # d pixel / d local = (K - pixel e_z^T) / z
         gradients = K[0, :, None, None] * (across / z) + K[1, :, None, None] * (along / z)
-        gradients -= jnp.where(is_z, (x * across + y * along) / z + is_depth, 0.0)
+        gradients = gradients.at[2].add(-(x * across + y * along) / z)
+        if channels == 4:
+            gradients = gradients.at[2, 3].add(-1.0)
         gradients = jnp.swapaxes(rotated(viewmat[:3, :3].T, jnp.swapaxes(gradients / scales, 0, 1)), 0, 1)
         return Residuals((found - wanted) / scales, counts, gradients)
 
@@ -146,34 +145,30 @@ def _normal_equations(
     # Where there is nothing to compare with, a point costs half as much as one that disagrees entirely.
     costs = points.seen * sum(n * jnp.where(counts, r / (1 + r), 0.5) for n, r, counts in kinds)
     weights = [points.seen * counts / (1 + r) ** 2 for _, r, counts in kinds]
-    arms = jnp.moveaxis(moved.means - (center + twist[:3])[:, None], 1, 0)
-    levers = jnp.pad(arms, [(1, 0), (0, 0), (0, 0)], constant_values=1.0)
-    slopes = jnp.moveaxis(residuals.gradients, 1, 0)
+    arms = tuple(jnp.moveaxis(moved.means - (center + twist[:3])[:, None], 1, 0))
+    x, y, z = jnp.moveaxis(residuals.gradients, 1, 0)
 
-    def over_channels(products: Float[Array, "*n c d p"]) -> Float[Array, "*n c p"]:
-        return sum(w * product for w, product in zip(weights, _by_kind(products), strict=True))
+    def over_channels(a, b) -> Float[Array, "c p"]:
+        return sum(w * ab for w, ab in zip(weights, _by_kind(a * b), strict=True))
 
-    # A row of the Jacobian is (g, arm x g), which is linear in the products of g and (1, arm). So their sums
-    # over all points are enough, and no row is stored.
-    forces, pulls = over_channels(slopes[:, None] * slopes), over_channels(slopes * residuals.values)
-    terms = in_memory((levers[:, None] * levers, levers, forces, pulls, costs), images.cameras.K)
-    squares, levers, forces, pulls, costs = (jax.lax.collapse(a, a.ndim - 2) for a in terms)
-    order = [(2, 3), (0, 2), (0, 1)]  # sums over the points first
-    hessian = jnp.einsum("rai,sbj,abn,ijn->rs", _ROWS, _ROWS, squares, forces, optimize=order)
-    gradient = jnp.einsum("rai,an,in->r", _ROWS, levers, pulls, optimize=[(1, 2), (0, 1)])
-    return _Fit(twist, costs.sum(), hessian, gradient)
-
-
-def _rows() -> Float[np.ndarray, "6 4 3"]:
-    """(g, arm x g) from the products of (1, arm) and g."""
-    rows = np.zeros((6, 4, 3))
-    for i in range(3):
-        j, k = (i + 1) % 3, (i + 2) % 3
-        rows[i, 0, i], rows[3 + i, 1 + j, k], rows[3 + i, 1 + k, j] = 1, 1, -1
-    return rows
+    # A row of the Jacobian is (g, arm x g), so a point adds (F, F A^T; A F, A F A^T) with A v = arm x v and F
+    # the sum of g g^T over its channels. No row is stored, which XLA:CPU would do for a matrix product.
+    products = [over_channels(*pair) for pair in ((x, x), (x, y), (x, z), (y, y), (y, z), (z, z))]
+    pulls = [over_channels(a, residuals.values) for a in (x, y, z)]
+    (xx, xy, xz, yy, yz, zz), pulls, costs = in_memory((products, pulls, costs), images.cameras.K)
+    forces = ((xx, xy, xz), (xy, yy, yz), (xz, yz, zz))
+    levers = [_cross(arms, force) for force in forces]  # the columns of A F
+    torques = [_cross(arms, lever) for lever in zip(*levers, strict=True)]
+    upper = [(*force, *lever) for force, lever in zip(forces, levers, strict=True)]
+    lower = [(*lever, *torque) for lever, torque in zip(zip(*levers, strict=True), torques, strict=True)]
+    hessian = jnp.stack([jnp.stack(row).sum((1, 2)) for row in upper + lower])
+    *gradient, cost = jnp.stack([*pulls, *_cross(arms, pulls), costs]).sum((1, 2))
+    return _Fit(twist, cost, hessian, jnp.stack(gradient))
 
 
-_ROWS = _rows()
+def _cross(a, b):
+    """a x b, with three arrays each."""
+    return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
 
 
 def align(

@@ -101,7 +101,8 @@ _STEP = gradient_step(fit_loss, per_field_adam(RATES))
 @cache
 def _advance() -> Callable:
     """The jitted step, made on first use, because its compiler options depend on the machine."""
-    return jax.jit(
-        lambda params, state, batch, i: _STEP.update(params, state, batch, step=i, key=None),
-        compiler_options=host_options(),
-    )
+
+    def fit_first_frame(params, state, batch, i):
+        return _STEP.update(params, state, batch, step=i, key=None)
+
+    return jax.jit(fit_first_frame, compiler_options=host_options())
