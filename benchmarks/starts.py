@@ -32,7 +32,7 @@ _STAGES = {
 }
 _UPDATE = "/gsjax/update"
 _HIT = "/jax/compilation_cache/cache_hits"
-_LISTED = 12  # programs in the table
+_LISTED = 12  # programs in a record
 
 COMMANDS: dict[str, tuple[str, ...]] = {
     "track": ("track", _TABLE, "--frames", "0:30", "--cameras", "0", "1", "--mask-camera", "1",
@@ -104,7 +104,7 @@ def _by_program(spans: list[tuple[str, str, float, float]]) -> list[dict[str, An
         row[stage] += end - begin
         row["count"] += stage == "compiling"
     compiled = [row for row in rows.values() if row["count"]]
-    return sorted(compiled, key=lambda row: -sum(row[stage] for stage in _STAGES.values()))
+    return sorted(compiled, key=lambda row: -sum(row[stage] for stage in _STAGES.values()))[:_LISTED]
 
 
 def measure(name: str, out: Path, cache: Path, label: str) -> dict[str, Any]:
