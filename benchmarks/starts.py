@@ -21,6 +21,7 @@ from rich.console import Console
 from rich.table import Table
 
 from gsjax.engine import machine
+from gsjax.engine.drive import UPDATE
 from gsjax.io.atomic import write_json
 
 _TABLE = "simulated:tabletop?width=240&height=180"
@@ -30,7 +31,6 @@ _STAGES = {
     "/jax/core/compile/jaxpr_to_mlir_module_duration": "lowering",
     "/jax/core/compile/backend_compile_duration": "compiling",
 }
-_UPDATE = "/gsjax/update"
 _HIT = "/jax/compilation_cache/cache_hits"
 _LISTED = 12  # programs in a record
 
@@ -67,7 +67,7 @@ def watch(record: Path, begun: float, arguments: Sequence[str]) -> int:
         now = time() - begun
         if event in _STAGES:
             spans.append((_STAGES[event], str(about.get("fun_name", "?")), now - seconds, now))
-        elif event == _UPDATE:
+        elif event == UPDATE:
             updates.append(now)
 
     def hit(event: str, **_: Any) -> None:
@@ -113,8 +113,8 @@ def measure(name: str, out: Path, cache: Path, label: str) -> dict[str, Any]:
     arguments = [part.format(fit=fit) for part in COMMANDS[name]]
     run, record = out / "runs" / f"{name}-{label}", out / f"{name}-{label}.json"
     words = [*arguments, "--out", str(run), "--overwrite"]
-    environment = os.environ | {"JAX_COMPILATION_CACHE_DIR": "", "XDG_CACHE_HOME": str(cache)}
-    del environment["JAX_COMPILATION_CACHE_DIR"]
+    environment = {k: v for k, v in os.environ.items() if k != "JAX_COMPILATION_CACHE_DIR"}
+    environment["XDG_CACHE_HOME"] = str(cache)
     command = [sys.executable, "-m", "benchmarks.starts", "--watch", str(record), str(time()), *words]
     log = out / f"{name}-{label}.log"
     begun = perf_counter()
