@@ -9,6 +9,7 @@ Every command runs in a process of its own: first with an empty cache of compile
 import argparse
 import json
 import os
+import runpy
 import subprocess
 import sys
 import tempfile
@@ -57,8 +58,6 @@ def watch(record: Path, begun: float, arguments: Sequence[str]) -> int:
     """
     import jax
 
-    from gsjax.cli import main
-
     spans: list[tuple[str, str, float, float]] = []
     updates: list[float] = []
     hits = [0]
@@ -76,7 +75,12 @@ def watch(record: Path, begun: float, arguments: Sequence[str]) -> int:
     jax.monitoring.register_event_duration_secs_listener(ended)
     jax.monitoring.register_event_listener(hit)
     ready = time() - begun
-    code = main(arguments)
+    sys.argv = ["gsjax", *arguments]
+    try:
+        runpy.run_module("gsjax.cli", run_name="__main__")
+        code = 0
+    except SystemExit as left:
+        code = left.code if isinstance(left.code, int) else 1
     found = {"imported_s": ready, "first_s": updates[0] if updates else None, "total_s": time() - begun}
     found |= {f"{stage}_s": _union([s[2:] for s in spans if s[0] == stage]) for stage in _STAGES.values()}
     compiled = [span for span in spans if span[0] == "compiling"]

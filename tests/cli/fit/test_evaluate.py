@@ -166,7 +166,7 @@ def test_photographs_that_moved(gsjax_eval, photographs, run, tmp_path):
     code, said, _ = gsjax_eval()
     assert code == 2
     assert "gone" in said
-    assert "give its new place with --images" in said
+    assert "pass their new folder as --images" in said
     code, said, found = gsjax_eval("--images", str(moved))
     assert code == 0, said
     assert found["mean"]["held out"]["psnr"] == pytest.approx(
