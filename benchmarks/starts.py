@@ -144,7 +144,9 @@ def main(arguments: Sequence[str]) -> int:
     """Measure the starts of the chosen commands, and write starts.json."""
     if arguments[:1] == ["--watch"]:
         return watch(Path(arguments[1]), float(arguments[2]), arguments[3:])
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.starts", description=(__doc__ or "").split("\n")[0])
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.starts", description=(__doc__ or "").split("\n")[0]
+    )
     parser.add_argument("--only", nargs="+", choices=list(COMMANDS), default=list(COMMANDS))
     parser.add_argument("--out", type=Path, default=Path("runs/starts"))
     options = parser.parse_args(arguments)
