@@ -14,7 +14,6 @@ from experiments.static_fit.static_fit import SCENES
 from gsjax.data import open_photographs
 from gsjax.engine.drive import drive
 from gsjax.engine.fit.judge import Judge
-from gsjax.engine.fit.schedule import Budget
 from gsjax.engine.photographs import split
 from gsjax.engine.progress import Progress
 from gsjax.geometry.cameras import on_device
@@ -58,13 +57,17 @@ def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
     config = replace(SETTINGS[setting], seed=seed, depth_weight=depth_weight)
     method, spent, rows = Fit(config), Progress(), []
     problem, run = method.start(frames)
-    budget, judge = Budget(config.steps, MINUTES, spent), Judge(config, problem.background)
+    judge = Judge(config, problem.background)
+
+    def budget(step: int) -> float:
+        return max(step / config.steps, spent.seconds / 60 / MINUTES)  # compiling is not on it
+
     judged = [(str(i), frame) for i, frame in enumerate(held_out)]
     recent: list[float] = []
     ticks = drive(method, problem, run, progress=budget)
     for now in ticks:
         recent = [*recent[-49:], now.seconds]
-        spent.seconds += now.seconds  # compiling is not on the budget
+        spent.seconds += now.seconds
         if budget(now.step) >= 1 or spent.seconds > (len(rows) + 1) * JUDGED_EVERY_S:
             rows.append((spent.seconds / 60, judge(now.run.params.gaussians, judged).mean()["psnr"]))
     gaussians, steps = ticks.result, ticks.run.step

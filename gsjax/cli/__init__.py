@@ -107,7 +107,7 @@ _SHARED = {
     "--scale 0.5": "pictures at half their width and height",
     "--preset NAME": "default settings; each is an option too: --fit.steps",
     "--seed 1": "random seed",
-    "--minutes 5": "stop after this time, and write the result so far",
+    "--minutes 5": "be done within this time, with the result by then",
     "--resume": "resume a run that was stopped",
     "--overwrite": "replace a finished run",
 }

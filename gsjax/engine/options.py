@@ -53,8 +53,8 @@ class Timed:
     """Options of commands that learn step by step."""
 
     minutes: float | None = None
-    """Stop after this many minutes of steps, compiling included, and score and write what was learned by
-    then. The first run on a machine compiles for a minute or so; later ones find the compiled programs."""
+    """Time for the whole command, reading, compiling, scores and report included. The first run on a machine
+    compiles for a minute or so; later ones find the compiled programs."""
 
 
 @dataclass(frozen=True, kw_only=True)

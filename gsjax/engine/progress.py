@@ -16,6 +16,7 @@ from rich.console import Console
 from rich.progress import BarColumn, TextColumn, TimeRemainingColumn
 from rich.progress import Progress as Bar
 
+from gsjax.engine.budget import Budget
 from gsjax.engine.drive import Drive, Tick
 from gsjax.engine.ending import ended
 from gsjax.engine.folder import RunFolder
@@ -58,12 +59,8 @@ class Progress:
 
     @property
     def used_seconds(self) -> float:
-        """Time used of --minutes: steps and compiling."""
+        """Time of steps and of compiling."""
         return self.seconds + self.compile_seconds
-
-    def is_over(self, minutes: float | None) -> bool:
-        """Whether these minutes are used up."""
-        return minutes is not None and self.used_seconds >= 60 * minutes
 
     def add(self, tick: Tick) -> None:
         """Record a step."""
@@ -142,7 +139,7 @@ def watch(
     folder: RunFolder,
     console: Console,
     *,
-    minutes: float | None = None,
+    budget: Budget | None = None,
     save_every: float | None = None,
     evaluate: Callable[[Tick], dict[str, Any] | None] | None = None,
     enough: Callable[[Tick, Mapping[str, Any]], bool] | None = None,
@@ -156,22 +153,23 @@ def watch(
         schedule: what is shown and logged.
         folder: of the run.
         console: shows the progress.
-        minutes: time of steps, compiling included, after which to stop.
+        budget: the time that is given; its steps begin now.
         save_every: seconds of work that may be lost when the run is killed.
         evaluate: tick -> additions to its row, or None; a tick with additions gets a row.
         enough: (tick, its row) -> whether to stop there; called after each new row.
         listeners: called with each new row.
     """
-    saver = Saver(schedule.doing, save_every)
+    saver, budget = Saver(schedule.doing, save_every), budget or Budget(None, perf_counter())
+    budget.begin_steps(progress.used_seconds, console)
 
     def save(last: bool) -> None:
         saver(lambda: save_run(folder.resume, ticks.run, progress), last=last)
 
-    with _Display(console, schedule, progress, ticks, minutes) as display:
+    with _Display(console, schedule, progress, ticks, budget) as display:
         try:
-            while not progress.is_over(minutes) and (now := _next(ticks, progress)) is not None:
+            while not budget.is_over and (now := _next(ticks, progress)) is not None:
                 more = None if evaluate is None else evaluate(now)
-                last = now.step == schedule.total or progress.is_over(minutes)
+                last = now.step == schedule.total or budget.is_over
                 row = None
                 if now.step % schedule.every == 0 or last or more is not None:
                     row = shielded(_add_row, now, progress, schedule, folder, more or {})
@@ -278,10 +276,10 @@ class _Display:
     """A progress bar in a terminal; about ten lines in a log."""
 
     def __init__(
-        self, console: Console, schedule: Schedule, progress: Progress, ticks: Drive, minutes: float | None
+        self, console: Console, schedule: Schedule, progress: Progress, ticks: Drive, budget: Budget
     ):
         self._console, self._schedule, self._progress = console, schedule, progress
-        self._ticks, self._minutes, self._at = ticks, minutes, 0.0
+        self._ticks, self._budget, self._at = ticks, budget, 0.0
         self._line = int(_LINES * self._share())
         columns = (
             TextColumn(schedule.doing),
@@ -318,12 +316,11 @@ class _Display:
             self._console.print(f"{self._reached()}: {words(rows[-1])}", soft_wrap=True)
 
     def _share(self) -> float:
-        """The fraction done, of steps or of minutes, whichever is larger."""
-        used = 0.0 if self._minutes is None else self._progress.used_seconds / 60 / self._minutes
-        return min(1.0, max(self._ticks.run.step / max(1, self._schedule.total), used))
+        """The fraction done, of steps or of their time, whichever is larger."""
+        return min(1.0, max(self._ticks.run.step / max(1, self._schedule.total), self._budget.share))
 
     def _reached(self) -> str:
         step = self._ticks.run.step
-        if self._minutes is None:
+        if self._budget.minutes is None:
             return f"{step:,} of {self._schedule.total:,} steps"
-        return f"{self._progress.used_seconds / 60:.1f} of {self._minutes:g} min, {step:,} steps"
+        return f"{self._budget.used / 60:.1f} of {self._budget.minutes:g} min, {step:,} steps"

@@ -15,6 +15,7 @@ from rich.console import Console
 from gsjax.data import Photographs, Sequence
 from gsjax.data.open import is_photographs, is_recording, open_photographs
 from gsjax.data.ordered import open_as_sequence
+from gsjax.engine.budget import Budget, note_if_few
 from gsjax.engine.deform.data import Tools, deform_data
 from gsjax.engine.deform.depth import Depth, DepthSource, with_depth
 from gsjax.engine.deform.file import NAME, write_deformation
@@ -66,6 +67,7 @@ def run(options: Options) -> int:
     options = checked(options)
     choice = _teacher(options)
     console, begun = Console(stderr=True, highlight=False), perf_counter()
+    budget = Budget(options.minutes, begun)
     with Notes(console) as notes:
         expect_dataset(options.dataset)
         folder = RunFolder(options.out, overwrite=options.overwrite, resume=options.resume)
@@ -93,17 +95,18 @@ def run(options: Options) -> int:
         folder.write_config(settings)  # from here on an earlier run is gone
         row, ticks = means_of("psnr", *LOSSES), drive(method, problem, run)
         schedule = Schedule("reconstructing", method.total(problem), row, _in_words)
-        watch(ticks, progress, schedule, folder, console, minutes=options.minutes)
+        watch(ticks, progress, schedule, folder, console, budget=budget)
         run, result = ticks.run, ticks.result
         data, refined = as_refined(folder, problem, run.params, data, notes)
         write_deformation(folder.path / NAME, result)
         write_ply(folder.scene, jax.device_get(result.at(0.0)))
         with stage(console, "scoring held-out frames"):
-            judged = judge(folder, result, run.plans[PLAN], data, options.tools)
+            judged = judge(folder, result, run.plans[PLAN], data, options.tools, budget)
         note_if_cut_short(progress, schedule, run.step, notes)
         _warn_of_oddities(progress, judged, notes)
         if not data.test:
             notes.add("No frame is held out: all scores are of training frames.")
+        note_if_few(judged["scores"], data.test, "held-out frames", notes)
         found = {
             "kind": "deform",
             "dataset": data.sequence.name,

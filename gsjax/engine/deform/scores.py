@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from gsjax.engine.budget import Budget
 from gsjax.engine.deform.data import DeformData, Tools
 from gsjax.engine.folder import RunFolder
 from gsjax.engine.machine import peak_memory_mb
@@ -53,7 +54,12 @@ _LEAST_LONGER_SIDE = 12  # of DIS's patches
 
 
 def judge(
-    folder: RunFolder, result: DeformResult, plan: Plan, data: DeformData, tools: Tools
+    folder: RunFolder,
+    result: DeformResult,
+    plan: Plan,
+    data: DeformData,
+    tools: Tools,
+    budget: Budget | None = None,
 ) -> dict[str, Any]:
     """Scores of held-out frames, or of some that were learned from where none is, and pictures of them.
 
@@ -63,13 +69,14 @@ def judge(
         plan: that frames were drawn with.
         data: what it was learned from, with poses as they were refined.
         tools: whether tools count.
+        budget: the time that is left; of more frames than it allows, some are scored.
     """
     memory = peak_memory_mb()  # of learning, before anything is scored
     scene, moving = result.scene, result.moving
     which = data.test or data.train[:: max(1, len(data.train) // _SHOWN)][:_SHOWN]
     rows: list[dict[str, Any]] = []
     overlap = LabelOverlap()
-    for t in which:
+    for t in which if budget is None else budget.affordable(which):
         frame = data.frame(t, 0, tools)
         drawn = draw(scene, moving, frame, plan)
         number = data.sequence.frame_ids[t]

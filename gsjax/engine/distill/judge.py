@@ -1,11 +1,13 @@
 """Scores of a distilled field: agreement with the teacher, and classes found in held-out views."""
 
+from itertools import tee
 from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, UInt8
 
+from gsjax.engine.budget import Budget
 from gsjax.engine.distill.scene import FieldScene
 from gsjax.engine.distill.scores import ClassScores, Frozen, angle_error, class_maps, classes_of, one_by_one
 from gsjax.engine.folder import RunFolder
@@ -37,6 +39,7 @@ def judge(
     result: DistillResult,
     config: DistillConfig,
     notes: Notes,
+    budget: Budget | None = None,
 ) -> dict[str, Any]:
     """Compares held-out views, or some of those that taught where none is held out, with the teacher, and
     draws some. A photograph that cannot be read is noted and not compared.
@@ -48,11 +51,11 @@ def judge(
         result: the field.
         config: its settings.
         notes: receives warnings.
+        budget: the time that is left; of more views than it allows, some are scored.
     """
     held_out, photographs = len(scene.held_out) > 0, scene.photographs
     which = scene.held_out if held_out else scene.taught[:: max(1, len(scene.taught) // _SHOWN)][:_SHOWN]
     field, located = result.placed
-    views = one_by_one(scene.gaussians, (photographs.camera(i) for i in which), scene.rasterize_mode)
     names = {label - 1: name for label, name in teaching.source.names.items()}
     codes = of_gaussians = None
     if teaching.source.kind == "classes":
@@ -61,7 +64,9 @@ def judge(
         of_gaussians, order = classes_of(field, located, codes), np.array(list(names))
     scores, rows, error_of = ClassScores(names), [], angle_error(config)
     colors, pca = feature_colors(field, located)
-    for view, i in zip(views, which, strict=True):
+    judged, placed = tee(which if budget is None else budget.affordable(which))
+    views = one_by_one(scene.gaussians, map(photographs.camera, placed), scene.rasterize_mode)
+    for view, i in zip(views, judged, strict=True):
         row: dict[str, Any] = {"view": photographs.names[i], "cosine": None}
         panels, true, shown = {}, None, len(rows) < _SHOWN
         try:

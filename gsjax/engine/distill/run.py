@@ -10,6 +10,7 @@ from typing import Any
 import jax
 from rich.console import Console
 
+from gsjax.engine.budget import Budget, note_if_few
 from gsjax.engine.distill.file import FOLDER, NAME
 from gsjax.engine.distill.judge import judge
 from gsjax.engine.distill.results import summarize
@@ -48,6 +49,7 @@ def run(options: Options) -> int:
     """
     options = checked(options)
     console, begun = Console(stderr=True, highlight=False), perf_counter()
+    budget = Budget(options.minutes, begun)
     with Notes(console) as notes:
         options.check()
         scene = open_scene(options)
@@ -87,13 +89,14 @@ def run(options: Options) -> int:
         ticks = drive(method, problem, run)
         total, losses = method.total(problem), means_of("rec", "cos", "contrast", "tv")
         schedule = Schedule("distilling", total, losses, _words)
-        watch(ticks, progress, schedule, folder, console, minutes=options.minutes)
+        watch(ticks, progress, schedule, folder, console, budget=budget)
         steps, result = ticks.run.step, ticks.result
         with atomic_write(folder.path / NAME) as temporary:
             result.write(temporary)
         with stage(console, "scoring views"):
-            judged = judge(folder, scene, teaching, result, options.distill, notes)
+            judged = judge(folder, scene, teaching, result, options.distill, notes, budget)
         note_if_cut_short(progress, schedule, steps, notes)
+        note_if_few(judged["scores"], scene.held_out, "held-out views", notes)
         _note_oddities(scene, progress, notes)
         found = {
             "kind": "distill",

@@ -1,8 +1,9 @@
 """Scores of the views of a fitted scene: each is rendered and compared with its photograph."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
+from time import perf_counter
 from typing import Any
 
 import jax.numpy as jnp
@@ -44,18 +45,21 @@ class Judge:
         config: the settings of the fit.
         background: RGB behind the scene; None is black.
         plans: a large enough plan for each size of photograph.
+        view_s: seconds that the last view took; infinite before the second, as the first compiles.
     """
 
     config: FitConfig
     background: tuple[float, float, float] | None
     plans: dict[tuple[int, ...], Plan] = field(default_factory=dict)
+    view_s: float = field(default=float("inf"), init=False)
 
     def __call__(
-        self, gaussians: Gaussians, frames: Sequence[tuple[str, Frame]], folder: RunFolder | None = None
+        self, gaussians: Gaussians, frames: Iterable[tuple[str, Frame]], folder: RunFolder | None = None
     ) -> Scores:
         """Score named views; with a folder, pictures are written side by side there."""
         rows = []
         for name, frame in frames:
+            begun, is_known = perf_counter(), frame.images.shape in self.plans
             seen = self.compare(gaussians, frame)
             row: dict[str, Any] = {"view": name, "psnr": seen.psnr(), "ssim": None, "depth_mm": None}
             if folder is not None:
@@ -65,6 +69,8 @@ class Judge:
                 path = folder.render("held_out", len(rows))
                 write_panel(path, seen)
                 row["picture"] = str(path.relative_to(folder.path))
+            if is_known:
+                self.view_s = perf_counter() - begun
             rows.append(row)
         return Scores(rows)
 

@@ -12,7 +12,7 @@ from gsjax.scene.frame import Frame
 from gsjax.scene.gaussians import Gaussians
 
 NAME = "orbit"
-_FRAMES, _FPS, _LONGEST = 90, 30, 480
+FRAMES, _FPS, _LONGEST = 90, 30, 480
 
 
 def write_orbit(
@@ -31,7 +31,7 @@ def write_orbit(
     scale = min(1.0, _LONGEST / max(camera.height, camera.width))
     width, height = max(1, round(scale * camera.width)), max(1, round(scale * camera.height))
     K = np.diag([scale, scale, 1.0]) @ camera.K
-    viewmats = orbit(np.concatenate([frame.cameras.viewmat for frame in frames]), focus, _FRAMES)
+    viewmats = orbit(np.concatenate([frame.cameras.viewmat for frame in frames]), focus, FRAMES)
     plan = None
     with VideoWriter(folder.video(NAME), _FPS) as video:
         for viewmat in viewmats:

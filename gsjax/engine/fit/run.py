@@ -1,9 +1,6 @@
 """A run of `gsjax fit`: photographs in, a folder with a scene, its scores and a report out."""
 
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
-from functools import partial
 from time import perf_counter
 from typing import Literal
 
@@ -11,31 +8,29 @@ import jax
 import numpy as np
 from rich.console import Console
 
+from gsjax.engine.budget import Budget
 from gsjax.engine.drive import Drive, drive
 from gsjax.engine.ending import ended, exit_code, finish
-from gsjax.engine.fit.ablation import ablate
-from gsjax.engine.fit.judge import Judge, Scores
-from gsjax.engine.fit.orbit import write_orbit
+from gsjax.engine.fit.ending import Ending, some_of
+from gsjax.engine.fit.judge import Judge
 from gsjax.engine.fit.results import summarize
-from gsjax.engine.fit.schedule import Budget, Evaluation, evaluated, schedule_of
+from gsjax.engine.fit.schedule import Evaluation, evaluated, schedule_of
 from gsjax.engine.fit.start import start_from
 from gsjax.engine.fit.tensorboard import TensorBoard
 from gsjax.engine.folder import RunFolder
 from gsjax.engine.machine import describe as describe_machine
-from gsjax.engine.messages import Notes, reason, stage
+from gsjax.engine.messages import Notes
 from gsjax.engine.options import RESUME_MAY_CHANGE, OfDataset, checked, expect_positive
 from gsjax.engine.photographs import choose_photographs, read_frames, split, warn_if_large
 from gsjax.engine.progress import Progress, load_run, watch
 from gsjax.engine.recording import located
 from gsjax.io.atomic import write_npz
 from gsjax.io.ply import write_ply
-from gsjax.methods.fit import Fit, FitConfig, Model, Problem, prune, refined_frames
+from gsjax.methods.fit import Fit, FitConfig, Model, Problem, refined_frames
 from gsjax.optim.method import Run
 from gsjax.scene.frame import Frame
 from gsjax.scene.gaussians import Gaussians
 
-JUDGED_AT_MOST = 4
-"""Most held-out views that are evaluated during the fit."""
 _MAY_CHANGE = (*RESUME_MAY_CHANGE, "tensorboard", "save_every")
 
 
@@ -67,6 +62,7 @@ def run(options: Options) -> int:
     options = checked(options)
     expect_positive(options, "until_psnr", "judge_every", "save_every")
     console, begun = Console(stderr=True, highlight=False), perf_counter()
+    budget = Budget(options.minutes, begun)
     with Notes(console) as notes:
         photographs = choose_photographs(
             options.dataset,
@@ -97,36 +93,22 @@ def run(options: Options) -> int:
         board = TensorBoard(folder.path, progress.rows) if options.tensorboard else None
         judged = [(photographs.names[i], frames[i]) for i in held_out]
         judge = Judge(config, problem.background)
-        ticks = _fitted(options, method, problem, run, progress, judged, judge, folder, console, board)
-        stopped, run = progress.stopped, ticks.run
+        ending = Ending(judge, fitted, judged, progress, budget, console, notes)
+        budget.rest_s = ending.rest_s
+        ticks = _fitted(options, method, problem, run, folder, ending, board)
+        stopped, run, gaussians = progress.stopped, ticks.run, ticks.result
         if isinstance(stopped, KeyboardInterrupt):
             console.print("stopping: the scene is scored and written; Ctrl-C again leaves out the scores")
-        seconds = {"fit": progress.seconds, "compile": progress.compile_seconds}
-        gaussians, finished, ablation = ticks.result, stopped is None, []
-        _note_oddities(options, progress, gaussians, finished, notes)
+        budget.hurried = stopped is not None
+        _note_oddities(options, progress, gaussians, stopped is None, notes)
         found_frames = refined_frames(problem, run.params)
         write_cameras(folder, [photographs.names[i] for i in chosen], found_frames, run.params)
-        optional = partial(_optional, seconds, console, notes)
-        light, scores = None, Scores([])
-        if finished:  # after Ctrl-C, nobody waits for this
-            with optional("pruning", "removing Gaussians that no photograph needs"):
-                before = gaussians.num
-                gaussians, light = prune(gaussians, found_frames, config)
-                if gaussians.num < before:
-                    notes.add(
-                        f"{before - gaussians.num:,} of {before:,} Gaussians were removed at the end: "
-                        f"together they gave at most {config.prune:.2%} of the light of any photograph."
-                    )
+        gaussians, light = ending.pruned(gaussians, found_frames, config)
         write_ply(folder.scene, gaussians)
-        with optional("scores", "scoring held-out photographs"):
-            shown = judged or [(photographs.names[i], frames[i]) for i in chosen[:1]]
-            scores = judge(gaussians, shown, folder)
-        if finished and judged and light is not None and gaussians.num:
-            with optional("parts", "ablating parts of the scene"):
-                ablation = ablate(gaussians, light, some_of(judged), progress.rows, judge)
-        if finished:
-            with optional("video", "drawing a video of the scene"):
-                write_orbit(folder, found_frames, problem.extent.focus, gaussians, judge)
+        scores = ending.scored(gaussians, (photographs.names[chosen[0]], fitted[0]), folder)
+        ablation = ending.ablated(gaussians, light)
+        ending.filmed(gaussians, found_frames, problem.extent.focus, folder)
+        seconds = {"fit": progress.seconds, "compile": progress.compile_seconds, **ending.seconds}
         found = {
             "kind": "fit",
             "dataset": photographs.name,
@@ -156,26 +138,18 @@ def run(options: Options) -> int:
     return exit_code(stopped)
 
 
-def some_of(judged: Sequence[tuple[str, Frame]]) -> Sequence[tuple[str, Frame]]:
-    """The held-out views that are evaluated during the fit; at its end, all of them are."""
-    return judged[:: max(1, len(judged) // JUDGED_AT_MOST)][:JUDGED_AT_MOST]
-
-
 def _fitted(
     options: Options,
     method: Fit,
     problem: Problem,
     run: Run,
-    progress: Progress,
-    judged: Sequence[tuple[str, Frame]],
-    judge: Judge,
     folder: RunFolder,
-    console: Console,
+    ending: Ending,
     board: TensorBoard | None,
 ) -> Drive:
     """The fit until its steps, its minutes or the wanted PSNR are reached, or it is stopped."""
-    budget, goal = Budget(method.config.steps, options.minutes, progress), options.until_psnr
-    schedule = schedule_of(method.config, progress)
+    budget, progress, judge, judged = ending.budget, ending.progress, ending.judge, ending.judged
+    goal, steps = options.until_psnr, method.config.steps
 
     def is_met(run: Run) -> bool:
         """Whether the wanted PSNR is reached: by some views, and then by all of them."""
@@ -184,34 +158,24 @@ def _fitted(
         found = judge(run.params.gaussians, judged).mean()["psnr"]
         return found is not None and found >= goal
 
-    ticks = drive(method, problem, run, progress=(lambda step: 1.0) if is_met(run) else budget)
+    def share(step: int) -> float:
+        """The share of the fit that is done: of its steps or of their time, whichever is larger."""
+        return max(step / steps, budget.share)
+
+    ticks = drive(method, problem, run, progress=(lambda step: 1.0) if is_met(run) else share)
     watch(
         ticks,
         progress,
-        schedule,
+        schedule_of(method.config, progress),
         folder,
-        console,
-        minutes=options.minutes,
+        ending.console,
+        budget=budget,
         save_every=options.save_every,
-        evaluate=Evaluation(judge, some_of(judged), options.judge_every, budget).begin(run.step),
+        evaluate=Evaluation(judge, some_of(judged), options.judge_every, steps, budget),
         enough=lambda now, row: row["test_psnr"] is not None and is_met(now.run),
         listeners=() if board is None else (board.add,),
     )
     return ticks
-
-
-@contextmanager
-def _optional(
-    seconds: dict[str, float], console: Console, notes: Notes, name: str, words: str
-) -> Iterator[None]:
-    """A timed stage after the last step. Ctrl-C and errors end it, and the run still gets its report."""
-    begun = perf_counter()
-    try:
-        with stage(console, words):
-            yield
-    except (KeyboardInterrupt, OSError, ValueError) as error:
-        notes.warn(f"{words} was left out: {reason(error)}")
-    seconds[name] = perf_counter() - begun
 
 
 def _note_oddities(

@@ -1,11 +1,13 @@
-"""The progress of a fit, its logged rows, and when held-out photographs are evaluated."""
+"""The logged rows of a fit, and when held-out photographs are evaluated."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from time import perf_counter
 from typing import Any
 
 import numpy as np
 
+from gsjax.engine.budget import Budget
 from gsjax.engine.drive import Tick
 from gsjax.engine.fit.judge import Judge
 from gsjax.engine.progress import Progress, Schedule
@@ -14,25 +16,7 @@ from gsjax.methods.fit.method import shrink_at
 
 _LOGGED_EVERY = 100  # steps
 _EXTRA = 10  # evaluations under --minutes, besides those of --judge-every
-
-
-@dataclass(frozen=True)
-class Budget:
-    """step -> the fraction of a fit done before it: of its steps, or of its minutes, whichever is larger.
-
-    Attributes:
-        steps: number of steps.
-        minutes: time of steps, compiling included; None for no limit.
-        progress: the time used.
-    """
-
-    steps: int
-    minutes: float | None
-    progress: Progress
-
-    def __call__(self, step: int) -> float:
-        used = 0.0 if self.minutes is None else self.progress.used_seconds / 60 / self.minutes
-        return max(step / self.steps, used)
+_JUDGING = 0.05  # of the time, at most, goes into evaluations under --minutes
 
 
 def schedule_of(config: FitConfig, progress: Progress) -> Schedule:
@@ -73,26 +57,26 @@ class Evaluation:
         judge: scores photographs.
         some: the held-out photographs to evaluate meanwhile.
         every: steps between evaluations.
-        budget: of the fit; with minutes there are ten evaluations besides.
+        steps: steps of the fit.
+        budget: of the fit; with minutes there are ten evaluations besides, as long as they take little time.
     """
 
     judge: Judge
     some: Sequence[Any]
     every: int
+    steps: int
     budget: Budget
     _tenths: int = field(default=0, init=False)
-
-    def begin(self, step: int) -> "Evaluation":
-        """Skip the tenths of the time before this step."""
-        self._tenths = int(_EXTRA * self.budget(step))
-        return self
+    _seconds: float = field(default=0.0, init=False)
 
     def __call__(self, now: Tick) -> dict[str, Any] | None:
         """The scores for the row of a step; None if there is no evaluation after it."""
-        share = self.budget(now.step)
-        due = now.step % self.every == 0 or share >= 1
-        if self.budget.minutes is not None and int(_EXTRA * share) > self._tenths:
-            due, self._tenths = True, int(_EXTRA * share)
-        if not due:
+        begun, tenths = perf_counter(), int(_EXTRA * self.budget.share)
+        due = now.step % self.every == 0 or tenths > self._tenths
+        spent = self.budget.minutes is not None and self._seconds > _JUDGING * self.budget.used
+        self._tenths = tenths
+        if (not due or spent) and not self.budget.is_over and now.step < self.steps:
             return None
-        return {"test_psnr": self.judge(now.run.params.gaussians, self.some).mean()["psnr"]}
+        found = self.judge(now.run.params.gaussians, self.some).mean()["psnr"]
+        self._seconds += perf_counter() - begun
+        return {"test_psnr": found}

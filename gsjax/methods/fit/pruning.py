@@ -1,5 +1,6 @@
 """Removal of Gaussians that no photograph needs, by the light that each contributes to each view."""
 
+from collections.abc import Iterable
 from functools import partial
 
 import jax
@@ -31,7 +32,7 @@ def needed(light: Float[np.ndarray, "n"], share: float) -> Bool[np.ndarray, "n"]
 
 
 def prune(
-    gaussians: Gaussians, frames: list[Frame], config: FitConfig
+    gaussians: Gaussians, frames: Iterable[Frame], config: FitConfig
 ) -> tuple[Gaussians, Float[np.ndarray, "n"]]:
     """The Gaussians that some photograph needs, and the light that each contributes.
 
@@ -48,7 +49,7 @@ def prune(
 
 
 def light_of(
-    gaussians: Gaussians, frames: list[Frame], rasterize_mode: str = "classic"
+    gaussians: Gaussians, frames: Iterable[Frame], rasterize_mode: str = "classic"
 ) -> Float[np.ndarray, "n"]:
     """The share of each Gaussian in the light of a view, in the view where it is largest: the sum over pixels
     of its compositing weight, w_i = alpha_i T_i, divided by that of all Gaussians; the maximum over views.

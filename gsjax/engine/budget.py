@@ -1,0 +1,123 @@
+"""The time that a command was given by --minutes: for its steps, then for scores, pictures and the report."""
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from time import perf_counter
+from typing import Any, TypeVar
+
+import numpy as np
+from rich.console import Console
+
+from gsjax.engine.messages import Notes
+
+Item = TypeVar("Item")
+REPORT_S = 4.0
+"""Seconds for the last files and the report."""
+_REST = 0.15  # of the time, at most, that is kept for what follows the steps
+
+
+class Budget:
+    """The minutes of a command, from its beginning to its end.
+
+    Attributes:
+        minutes: for all of it; None for no limit.
+        rest_s: the seconds that what follows the steps will take, as far as is known; infinite before it is.
+            At most 15 % of all are kept for it.
+        hurried: whether only what is necessary is still to be done, as after Ctrl-C.
+    """
+
+    def __init__(self, minutes: float | None, begun: float):
+        """
+        Args:
+            minutes: for all of the command; None for no limit.
+            begun: its beginning, by `time.perf_counter`.
+        """
+        self.minutes, self.hurried = minutes, False
+        self.rest_s: Callable[[], float] = lambda: float("inf")
+        self._begun, self._steps, self._most = begun, begun, 0.0
+
+    def begin_steps(self, earlier: float, console: Console) -> None:
+        """The steps begin now, and what they may take is said.
+
+        Args:
+            earlier: seconds of steps in the run that is resumed; they count.
+            console: to say it on.
+        """
+        self._begun -= earlier
+        self._steps = perf_counter() - earlier
+        if self.minutes is not None:
+            total, used, kept = map(_clock, (60 * self.minutes, self.used, _REST * 60 * self.minutes))
+            console.print(
+                f"[bold]time[/]  {total} in all; {used} are used, and at most {kept} are kept for scores, "
+                "pictures and the report",
+                soft_wrap=True,
+            )
+
+    @property
+    def used(self) -> float:
+        """Seconds since the beginning."""
+        return perf_counter() - self._begun
+
+    @property
+    def left(self) -> float:
+        """Seconds until the command is to end."""
+        return float("inf") if self.minutes is None else 60 * self.minutes - self.used
+
+    @property
+    def share(self) -> float:
+        """The share of the time for steps that is used, which never falls; 0 without a limit."""
+        if self.minutes is not None:
+            total = 60 * self.minutes
+            given = total - min(_REST * total, self.rest_s()) - (self._steps - self._begun)
+            self._most = max(self._most, (perf_counter() - self._steps) / given if given > 0 else 1.0)
+        return self._most
+
+    @property
+    def is_over(self) -> bool:
+        """Whether the time for steps is used up."""
+        return self.share >= 1
+
+    def allows(self, seconds: float, keep: float = REPORT_S) -> bool:
+        """Whether there is time for something that is not necessary, with `keep` seconds left after it."""
+        return not self.hurried and self.left >= seconds + keep
+
+    def guarded(self, items: Iterable[Item], keep: float) -> Iterator[Item]:
+        """The items, all of which are needed.
+
+        Args:
+            items: what is worked on, one after another.
+            keep: seconds to be left after them.
+
+        Raises:
+            TimeoutError: they take longer than there is time.
+        """
+        for item in items:
+            if self.left < keep:
+                raise TimeoutError("no time was left for it")
+            yield item
+
+    def affordable(self, items: Sequence[Item]) -> Iterator[Item]:
+        """The items in their order: all, or as many of them, evenly spread, as there is time for before the
+        report, and at least one. The first may take longer than others, as it compiles."""
+        took = 0.0
+        for item in items[:2]:
+            begun = perf_counter()
+            yield item
+            took = perf_counter() - begun
+            if self.left < REPORT_S + took:
+                return
+        rest = items[2:]
+        count = min(float(len(rest)), (self.left - REPORT_S) / max(took, 1e-9))
+        for i in np.unique(np.linspace(0, len(rest) - 1, int(count)).round().astype(int)):
+            if self.left < REPORT_S:
+                return
+            yield rest[i]
+
+
+def note_if_few(scored: Sequence[Any], held_out: Sequence[Any], what: str, notes: Notes) -> None:
+    """Note if there was time to score only some of what is held out."""
+    if len(scored) < len(held_out):
+        notes.add(f"{len(scored)} of {len(held_out)} {what} were scored: --minutes left no time for more.")
+
+
+def _clock(seconds: float) -> str:
+    return f"{seconds / 60:.3g} min" if seconds >= 100 else f"{seconds:.0f} s"
