@@ -13,6 +13,8 @@ Item = TypeVar("Item")
 REPORT_S = 4.0
 """Seconds for the last files and the report."""
 _REST = 0.15  # of the time, at most, that is kept for what follows the steps
+_LEAST = 0.25  # of the time, at least, that steps are given
+_LOADING_S = 2.5  # in which a program starts, before it knows its arguments
 
 
 class Budget:
@@ -33,7 +35,7 @@ class Budget:
         """
         self.minutes, self.hurried = minutes, False
         self.rest_s: Callable[[], float] = lambda: float("inf")
-        self._begun, self._steps, self._most = begun, begun, 0.0
+        self._begun, self._steps, self._most = begun - _LOADING_S, begun, 0.0
 
     def begin_steps(self, earlier: float, console: Console) -> None:
         """The steps begin now, and what they may take is said.
@@ -68,7 +70,7 @@ class Budget:
         if self.minutes is not None:
             total = 60 * self.minutes
             given = total - min(_REST * total, self.rest_s()) - (self._steps - self._begun)
-            self._most = max(self._most, (perf_counter() - self._steps) / given if given > 0 else 1.0)
+            self._most = max(self._most, (perf_counter() - self._steps) / max(given, _LEAST * total))
         return self._most
 
     @property

@@ -30,7 +30,7 @@ def ablate(
     better.
 
     Args:
-        gaussians: the scene.
+        gaussians: the scene, perhaps with empty slots after it.
         light: from `light_of`; Gaussians with the least light are removed first.
         frames: the held-out views of the curve.
         rows: the curve of the fit.
@@ -41,7 +41,7 @@ def ablate(
         psnr = judge(scene, frames).mean()["psnr"]
         return {"part": part, "gaussians": count, "sh_degree": degree, "psnr": psnr}
 
-    count, degree = gaussians.num, gaussians.sh_degree
+    count, degree = len(light), gaussians.sh_degree
     found = [row("all", gaussians, count, degree)]
     order = np.argsort(-light, kind="stable")
     for name, divisor in _SHARES.items():

@@ -24,7 +24,7 @@ from gsjax.scene.gaussians import Gaussians
 T = TypeVar("T")
 JUDGED_AT_MOST = 4
 """Most held-out views that are evaluated during the fit."""
-_COMPILING_S = 6.0
+_COMPILING_S, _SCORING_S = 6.0, 1.5  # before the first view
 _A_PRUNING = 3.0  # of the time of a view, as it is differentiated
 _PARTS = 8  # of a scene, at most
 
@@ -60,7 +60,7 @@ class Ending:
             view = 0.5 / pace
         return {
             "pruning": _COMPILING_S + _A_PRUNING * view * len(self.fitted),
-            "scores": 1.5 * view * max(1, len(self.judged)),
+            "scores": _SCORING_S + 1.5 * view * max(1, len(self.judged)),
             "parts": _PARTS * view * len(some_of(self.judged)),
             "video": _COMPILING_S + view * FRAMES,
         }
@@ -97,16 +97,18 @@ class Ending:
 
     def ablated(self, gaussians: Gaussians, light: Float[np.ndarray, "n"] | None) -> list[dict[str, Any]]:
         """The scores of parts of the scene, as `ablate` gives them."""
-        if not self.judged or light is None or not gaussians.num:
+        if not self.judged or light is None or not len(light):
             return []
         work = partial(ablate, gaussians, light, some_of(self.judged), self.progress.rows, self.judge)
         return self._if_time("parts", "ablating parts of the scene", work, [])
 
     def filmed(
-        self, gaussians: Gaussians, frames: list[Frame], focus: Float[np.ndarray, "3"], folder: RunFolder
+        self, gaussians: Gaussians, frames: Sequence[Frame], focus: Float[np.ndarray, "3"], folder: RunFolder
     ) -> None:
         """Write the video of a path about the scene, and note what was left out."""
-        work = partial(write_orbit, folder, frames, focus, gaussians, self.judge)
+        camera = self.fitted[len(self.fitted) // 2].cameras
+        viewmats = np.concatenate([frame.cameras.viewmat for frame in frames])
+        work = partial(write_orbit, folder, camera, viewmats, focus, gaussians, self.judge)
         self._if_time("video", "drawing a video of the scene", work, None)
         if self._left_out:
             self.notes.add(f"Left out, as --minutes left no time for it: {', '.join(self._left_out)}.")

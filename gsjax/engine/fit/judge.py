@@ -1,6 +1,6 @@
 """Scores of the views of a fitted scene: each is rendered and compared with its photograph."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from time import perf_counter
@@ -44,13 +44,15 @@ class Judge:
     Attributes:
         config: the settings of the fit.
         background: RGB behind the scene; None is black.
+        sizes: common sizes of photographs; a smaller one is rendered at one of these, whose program is there.
         plans: a large enough plan for each size of photograph.
         view_s: seconds that the last view took; infinite before the second, as the first compiles.
     """
 
     config: FitConfig
     background: tuple[float, float, float] | None
-    plans: dict[tuple[int, ...], Plan] = field(default_factory=dict)
+    sizes: Sequence[tuple[int, int]] = ()
+    plans: dict[tuple[int, int], Plan] = field(default_factory=dict)
     view_s: float = field(default=float("inf"), init=False)
 
     def __call__(
@@ -59,7 +61,7 @@ class Judge:
         """Score named views; with a folder, pictures are written side by side there."""
         rows = []
         for name, frame in frames:
-            begun, is_known = perf_counter(), frame.images.shape in self.plans
+            begun, is_known = perf_counter(), self._size(frame.cameras) in self.plans
             seen = self.compare(gaussians, frame)
             row: dict[str, Any] = {"view": name, "psnr": seen.psnr(), "ssim": None, "depth_mm": None}
             if folder is not None:
@@ -93,13 +95,23 @@ class Judge:
     def compare(self, gaussians: Gaussians, frame: Frame) -> "Compared":
         """The Gaussians rendered from the camera of `frame`, beside its photograph. The frame is on the host
         and has one camera."""
-        size = frame.images.shape
-        drawn, self.plans[size] = self.draw(gaussians, frame.cameras, self.plans.get(size))
-        image, truth = np.clip(np.asarray(drawn.colors[0]), 0, 1), frame.images[0] / 255
+        camera, size = frame.cameras, self._size(frame.cameras)
+        at = Camera(camera.viewmat, camera.K, *size, camera.near)
+        drawn, self.plans[size] = self.draw(gaussians, at, self.plans.get(size))
+        colors, depths, alphas = (
+            np.asarray(a[0, : camera.height, : camera.width])
+            for a in (drawn.colors, drawn.depths, drawn.alphas)
+        )
+        image, truth = np.clip(colors, 0, 1), frame.images[0] / 255
         if frame.masks is not None:
             image = np.where(frame.masks[0][..., None], image, truth)
-        depth, covered = np.asarray(drawn.depths[0]), np.asarray(drawn.alphas[0]) > 0.5
-        return Compared(frame, image, truth, depth, covered)
+        return Compared(frame, image, truth, depths, alphas > 0.5)
+
+    def _size(self, camera: Camera) -> tuple[int, int]:
+        """Width and height at which a camera's view is rendered."""
+        width, height = camera.width, camera.height
+        larger = [size for size in self.sizes if size[0] >= width and size[1] >= height]
+        return min(larger, key=lambda size: size[0] * size[1], default=(width, height))
 
 
 @dataclass(frozen=True, eq=False)

@@ -27,6 +27,8 @@ from gsjax.engine.recording import located
 from gsjax.io.atomic import write_npz
 from gsjax.io.ply import write_ply
 from gsjax.methods.fit import Fit, FitConfig, Model, Problem, refined_frames
+from gsjax.methods.fit.model import in_slots
+from gsjax.methods.fit.padding import sizes_of
 from gsjax.optim.method import Run
 from gsjax.scene.frame import Frame
 from gsjax.scene.gaussians import Gaussians
@@ -92,7 +94,7 @@ def run(options: Options) -> int:
             notes.add(f"Resumed after {run.step} steps of an earlier run.")
         board = TensorBoard(folder.path, progress.rows) if options.tensorboard else None
         judged = [(photographs.names[i], frames[i]) for i in held_out]
-        judge = Judge(config, problem.background)
+        judge = Judge(config, problem.background, sizes_of(problem.frames))
         ending = Ending(judge, fitted, judged, progress, budget, console, notes)
         budget.rest_s = ending.rest_s
         ticks = _fitted(options, method, problem, run, folder, ending, board)
@@ -105,9 +107,11 @@ def run(options: Options) -> int:
         write_cameras(folder, [photographs.names[i] for i in chosen], found_frames, run.params)
         gaussians, light = ending.pruned(gaussians, found_frames, config)
         write_ply(folder.scene, gaussians)
-        scores = ending.scored(gaussians, (photographs.names[chosen[0]], fitted[0]), folder)
-        ablation = ending.ablated(gaussians, light)
-        ending.filmed(gaussians, found_frames, problem.extent.focus, folder)
+        # In the slots of the fit, so that its programs draw it.
+        shown = in_slots(gaussians, run.params.gaussians.num) if gaussians.num else gaussians
+        scores = ending.scored(shown, (photographs.names[chosen[0]], fitted[0]), folder)
+        ablation = ending.ablated(shown, light)
+        ending.filmed(shown, found_frames, problem.extent.focus, folder)
         seconds = {"fit": progress.seconds, "compile": progress.compile_seconds, **ending.seconds}
         found = {
             "kind": "fit",

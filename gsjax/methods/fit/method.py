@@ -16,6 +16,7 @@ from gsjax.geometry.cameras import Camera, on_device
 from gsjax.losses.extra import ExtraLosses, named_losses
 from gsjax.methods.fit.config import FitConfig
 from gsjax.methods.fit.model import Model, carried_over, model_of, refined, with_degree, with_slots
+from gsjax.methods.fit.padding import with_common_sizes
 from gsjax.methods.fit.start import Extent, extent_of, initial_gaussians, start_points
 from gsjax.methods.fit.update import Batch, fit_step, grow, slots_wanted, split
 from gsjax.methods.sampling import shuffled_index
@@ -35,7 +36,8 @@ class Problem(NamedTuple):
     """The constants of a fit, with a cache.
 
     Attributes:
-        frames: the photographs to fit, with one camera each, on the host.
+        frames: the photographs to fit, with one camera each, on the host, padded to common sizes.
+        shares: the share of each that is not padding; None if none is padded.
         extent: the extent of the scene.
         background: RGB behind the scene; None: random in each step.
         start: source of the initial Gaussians: cloud, depth, matches or random.
@@ -43,6 +45,7 @@ class Problem(NamedTuple):
     """
 
     frames: list[Frame]
+    shares: Float[np.ndarray, "n"] | None
     extent: Extent
     background: tuple[float, float, float] | None
     start: str
@@ -99,7 +102,8 @@ class Fit:
         behind = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0), "random": None}
         behind["data"] = background or behind["black"]
         model = model_of(gaussians, config, len(frames))
-        problem = Problem(frames, extent, behind[config.background], source, {})
+        shown, shares = with_common_sizes(frames)
+        problem = Problem(shown, shares, extent, behind[config.background], source, {})
         return problem, Run(model, self.step.init(model))
 
     @property
@@ -131,8 +135,10 @@ class Fit:
             background = jax.random.uniform(jax.random.fold_in(key, run.step), (1, 3))
         else:
             background = jnp.array([problem.background])
-        view = jnp.asarray(self._view(problem, run.step), jnp.int32)
-        batch = Batch(frame, view, background, progress, problem.extent.radius, run.plans[name])
+        view = self._view(problem, run.step)
+        share = None if problem.shares is None else jnp.asarray(problem.shares[view], jnp.float32)
+        view = jnp.asarray(view, jnp.int32)
+        batch = Batch(frame, view, background, progress, problem.extent.radius, run.plans[name], share)
         return batch, (name,)
 
     def result(self, problem: Problem | None, run: Run) -> Gaussians:

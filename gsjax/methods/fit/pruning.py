@@ -51,8 +51,9 @@ def prune(
 def light_of(
     gaussians: Gaussians, frames: Iterable[Frame], rasterize_mode: str = "classic"
 ) -> Float[np.ndarray, "n"]:
-    """The share of each Gaussian in the light of a view, in the view where it is largest: the sum over pixels
-    of its compositing weight, w_i = alpha_i T_i, divided by that of all Gaussians; the maximum over views.
+    """The share of each Gaussian in the light of a view, in the view where it is largest: the sum, over
+    pixels that count, of its compositing weight, w_i = alpha_i T_i, divided by that of all Gaussians; the
+    maximum over views.
 
     The sums are the gradient of the composited sum of a feature that is 1 everywhere.
 
@@ -67,17 +68,21 @@ def light_of(
         size = camera.width, camera.height
         if size not in plans:
             plans[size] = plan_render(gaussians, camera, headroom=HEADROOM, rasterize_mode=rasterize_mode)
-        weights, plans[size] = with_room(partial(_weights, gaussians, camera), plans[size])
+        mask = None if frame.masks is None else jnp.asarray(frame.masks)
+        weights, plans[size] = with_room(partial(_weights, gaussians, camera, mask), plans[size])
         total = float(weights.sum())
         most = np.maximum(most, np.asarray(weights) / max(total, 1e-12))
     return most
 
 
 @partial(jax.jit, static_argnames="plan", compiler_options=host_options())
-def _weights(gaussians: Gaussians, camera: Camera, plan: Plan) -> tuple[Float[Array, "n"], object]:
+def _weights(
+    gaussians: Gaussians, camera: Camera, mask: Bool[Array, "1 h w"] | None, plan: Plan
+) -> tuple[Float[Array, "n"], object]:
     def total(ones):
         drawn = render(gaussians, camera, plan, features=ones)
-        return jnp.sum(drawn.features), drawn.meta
+        seen = drawn.features if mask is None else jnp.where(mask[..., None], drawn.features, 0.0)
+        return jnp.sum(seen), drawn.meta
 
     gradient, meta = jax.grad(total, has_aux=True)(jnp.ones((gaussians.num, 1), gaussians.means.dtype))
     return gradient[:, 0], meta

@@ -35,6 +35,7 @@ class Batch(NamedTuple):
         progress: share of the fit that is done, 0 to 1, over which learning rates fall.
         radius: radius of the scene, the unit of learning rates and of the depth loss.
         plan: the render plan.
+        share: the share of the photograph that is not padding; None for all.
     """
 
     frame: Frame
@@ -43,6 +44,7 @@ class Batch(NamedTuple):
     progress: Float[Array, ""] | float
     radius: Float[Array, ""] | float
     plan: Plan
+    share: Float[Array, ""] | None = None
 
 
 def fit_loss(config: FitConfig, extra_losses: ExtraLosses = ()) -> Callable:
@@ -71,6 +73,8 @@ def fit_loss(config: FitConfig, extra_losses: ExtraLosses = ()) -> Callable:
         if frame.masks is not None:  # masked pixels are as photographed: no gradient, no edge
             image = jnp.where(frame.masks[..., None], image, target)
         value = photometric_loss(image, target, config.dssim_weight)
+        if batch.share is not None:
+            value /= batch.share
         counted = 1.0 if frame.masks is None else frame.masks.mean()
         mse = jnp.square(image - target).mean() / counted
         if config.depth_weight and frame.depths is not None:

@@ -9,7 +9,6 @@ import time
 from pathlib import Path
 
 import cv2
-import numpy as np
 import pytest
 import yaml
 
@@ -18,13 +17,11 @@ import gsjax.engine.fit.run
 import gsjax.engine.photographs
 from gsjax.cli import main
 from gsjax.data.video import describe_video
-from gsjax.engine.drive import Tick
 from gsjax.engine.fit.ablation import ablate_time
-from gsjax.engine.fit.schedule import Budget, Evaluation
+from gsjax.engine.fit.schedule import Evaluation
 from gsjax.engine.progress import Progress
 from gsjax.io.ply import read_ply
-from gsjax.methods.fit import PRESETS, Fit
-from gsjax.optim.method import Run
+from gsjax.methods.fit import PRESETS
 
 QUICK = ("--fit.steps", "24", "--fit.cap", "150", "--fit.start.count", "120", "--fit.sh-every", "12")
 QUICK += ("--judge-every", "8", "--test-every", "4", "--fit.growth.begin", "4", "--fit.growth.every", "4")
@@ -281,24 +278,6 @@ def test_a_photograph_that_is_cut_off_is_named(photographs, gsjax_fit, tmp_path)
     assert code == 2
     assert "11.png" in said
     assert "cut off" in said
-
-
-def test_the_share_that_is_done_is_of_steps_or_of_minutes_and_never_jumps():
-    progress = Progress()
-    budget, shares = Budget(7_000, 1.0, progress), []
-    for step in range(7_000):
-        shares.append(budget(step))
-        if shares[-1] >= 1:
-            break
-        seconds = 0.01 if shares[-1] < 0.25 else 0.05  # small photographs first
-        progress.add(Tick(Fit(), None, Run(None, None), {}, seconds, 5.0 if step == 0 else 0.0))
-    assert shares[0] == 0.0
-    assert shares[1] == pytest.approx(5.01 / 60)
-    assert max(np.diff(shares[1:])) < 0.001
-    assert step == pytest.approx(1000 + 900, abs=5)  # 10 s of 0.01, 45 of 0.05, 5 of compiling
-    resumed = Budget(7_000, 1.0, Progress(**progress.metadata()))
-    assert resumed(step) == shares[-1]
-    assert Budget(10_000, None, progress)(5_000) == 0.5
 
 
 def test_photographs_that_do_not_fit_into_memory_are_refused_before_anything_is_cleared(
