@@ -10,7 +10,7 @@ from rich.console import Console
 from gsjax.engine.messages import Notes
 
 Item = TypeVar("Item")
-REPORT_S = 4.0
+REPORT_S = 3.0
 """Seconds for the last files and the report."""
 _REST = 0.15  # of the time, at most, that is kept for what follows the steps
 _LEAST = 0.25  # of the time, at least, that steps are given
@@ -22,8 +22,8 @@ class Budget:
 
     Attributes:
         minutes: for all of it; None for no limit.
-        rest_s: the seconds that what follows the steps will take, as far as is known; infinite before it is.
-            At most 15 % of all are kept for it.
+        rest_s: the most seconds there are for what follows the steps (15 % of all) -> those that it will
+            take, as far as is known.
         hurried: whether only what is necessary is still to be done, as after Ctrl-C.
     """
 
@@ -34,7 +34,7 @@ class Budget:
             begun: its beginning, by `time.perf_counter`.
         """
         self.minutes, self.hurried = minutes, False
-        self.rest_s: Callable[[], float] = lambda: float("inf")
+        self.rest_s: Callable[[float], float] = lambda most: most
         self._begun, self._steps, self._most = begun - _LOADING_S, begun, 0.0
 
     def begin_steps(self, earlier: float, console: Console) -> None:
@@ -68,10 +68,19 @@ class Budget:
     def share(self) -> float:
         """The share of the time for steps that is used, which never falls; 0 without a limit."""
         if self.minutes is not None:
-            total = 60 * self.minutes
-            given = total - min(_REST * total, self.rest_s()) - (self._steps - self._begun)
-            self._most = max(self._most, (perf_counter() - self._steps) / max(given, _LEAST * total))
+            self._most = max(self._most, (perf_counter() - self._steps) / self._given_s())
         return self._most
+
+    @property
+    def steps_s(self) -> float:
+        """Seconds that are left for steps."""
+        return float("inf") if self.minutes is None else self._given_s() * (1 - self.share)
+
+    def _given_s(self) -> float:
+        """Seconds for steps."""
+        total = 60 * (self.minutes or 0.0)
+        given = total - self.rest_s(_REST * total) - (self._steps - self._begun)
+        return max(given, _LEAST * total)
 
     @property
     def is_over(self) -> bool:

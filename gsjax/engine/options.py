@@ -174,7 +174,7 @@ def checked(options: AnyOptions) -> AnyOptions:
     expect_positive(options, "minutes")
     test_every = getattr(options, "test_every", 0)
     scale = getattr(options, "scale", 1.0)
-    if not 0 < scale <= 1:
+    if scale is not None and not 0 < scale <= 1:
         raise ValueError(f"--scale: expected above 0 and at most 1, found {scale}")
     if test_every < 0 or test_every == 1:
         raise ValueError(f"--test-every: expected 0 (none), or 2 or more, found {test_every}")

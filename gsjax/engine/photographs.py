@@ -1,6 +1,5 @@
 """The photographs that a static scene is fitted to and evaluated on: selected, split, and read."""
 
-import warnings
 from collections.abc import Mapping
 from collections.abc import Sequence as Indices
 from dataclasses import replace
@@ -10,7 +9,7 @@ import numpy as np
 from jaxtyping import Int
 from rich.console import Console
 
-from gsjax.data.errors import DataError, DataWarning
+from gsjax.data.errors import DataError
 from gsjax.data.open import ReadOptions, is_photographs, is_recording, open_photographs
 from gsjax.data.photographs import Photographs, photographs_of
 from gsjax.engine.files import read_options
@@ -19,7 +18,7 @@ from gsjax.engine.machine import available_mb
 from gsjax.engine.recording import expect_enough_left, in_threads, open_recording, parse_frames
 from gsjax.scene.frame import Frame
 
-_LARGE = 1600  # pixels, a side
+_LARGE = 1600  # pixels, a side, as in 3DGS
 _BYTES_A_PIXEL = 8  # a photograph, as it is and on the device, and a mask
 
 
@@ -144,10 +143,7 @@ def read_frames(photographs: Photographs, console: Console) -> list[Frame]:
     return in_threads(photographs.frame, range(photographs.num), "reading photographs", console)
 
 
-def warn_if_large(photographs: Photographs) -> None:
-    """Give a DataWarning if photographs are too large for a fit on a CPU to be fast."""
-    width, height = photographs.sizes.max(0)
-    if max(width, height) > _LARGE:
-        scale = 2.0 ** np.floor(np.log2(_LARGE / max(width, height)))
-        message = f"photographs of {width}x{height} take long and need much memory; try --scale {scale:g}"
-        warnings.warn(message, DataWarning, stacklevel=2)
+def moderate_scale(photographs: Photographs) -> float:
+    """The scale at which no photograph has more than 1,600 pixels a side, which is what a fit of larger ones
+    uses unless told otherwise, as those of 3DGS do."""
+    return min(1.0, _LARGE / float(photographs.sizes.max()))

@@ -51,13 +51,13 @@ def test_the_end_keeps_no_more_than_it_needs_and_the_share_never_falls(clock):
     budget = begun(clock, 10.0)
     clock.now += 60
     first = budget.share
-    budget.rest_s = lambda: 20.0
+    budget.rest_s = lambda most: min(most, 20.0)
     assert budget.share == first > 60 / 580
     clock.now += 519
     assert not budget.is_over
     clock.now += 1
     assert budget.is_over
-    budget.rest_s = lambda: 0.0
+    budget.rest_s = lambda most: 0.0
     assert budget.is_over
 
 

@@ -25,6 +25,7 @@ T = TypeVar("T")
 JUDGED_AT_MOST = 4
 """Most held-out views that are evaluated during the fit."""
 _COMPILING_S, _SCORING_S = 6.0, 1.5  # before the first view
+_SLACK = 1.1
 _A_PRUNING = 3.0  # of the time of a view, as it is differentiated
 _PARTS = 8  # of a scene, at most
 
@@ -65,9 +66,14 @@ class Ending:
             "video": _COMPILING_S + view * FRAMES,
         }
 
-    def rest_s(self) -> float:
-        """Seconds that all stages and the report will take."""
-        return sum(self.expected_s().values()) + REPORT_S
+    def rest_s(self, most: float) -> float:
+        """Seconds of the stages, in the order of their worth, and of the report that there is time for."""
+        kept, expected = REPORT_S, self.expected_s()
+        for name in ("scores", "pruning", "parts", "video"):
+            if _SLACK * (kept + expected[name]) > most:
+                break
+            kept += expected[name]
+        return min(most, _SLACK * kept) if kept > REPORT_S else most
 
     def pruned(
         self, gaussians: Gaussians, frames: Sequence[Frame], config: FitConfig

@@ -8,6 +8,7 @@ import jax
 import numpy as np
 from rich.console import Console
 
+from gsjax.data.photographs import Photographs
 from gsjax.engine.budget import Budget
 from gsjax.engine.drive import Drive, drive
 from gsjax.engine.ending import ended, exit_code, finish
@@ -15,13 +16,14 @@ from gsjax.engine.fit.ending import Ending, some_of
 from gsjax.engine.fit.judge import Judge
 from gsjax.engine.fit.results import summarize
 from gsjax.engine.fit.schedule import Evaluation, evaluated, schedule_of
+from gsjax.engine.fit.sizes import Sizes
 from gsjax.engine.fit.start import start_from
 from gsjax.engine.fit.tensorboard import TensorBoard
 from gsjax.engine.folder import RunFolder
 from gsjax.engine.machine import describe as describe_machine
 from gsjax.engine.messages import Notes
 from gsjax.engine.options import RESUME_MAY_CHANGE, OfDataset, checked, expect_positive
-from gsjax.engine.photographs import choose_photographs, read_frames, split, warn_if_large
+from gsjax.engine.photographs import choose_photographs, moderate_scale, read_frames, smaller, split
 from gsjax.engine.progress import Progress, load_run, watch
 from gsjax.engine.recording import located
 from gsjax.io.atomic import write_npz
@@ -33,6 +35,7 @@ from gsjax.optim.method import Run
 from gsjax.scene.frame import Frame
 from gsjax.scene.gaussians import Gaussians
 
+_UNLIMITED = 1_000_000  # steps
 _MAY_CHANGE = (*RESUME_MAY_CHANGE, "tensorboard", "save_every")
 
 
@@ -51,8 +54,12 @@ class Options(OfDataset):
     """Seconds of fitting that a run may lose when it is killed."""
     tensorboard: bool = False
     """Also log loss, PSNR and number of Gaussians for TensorBoard, in RUN/tensorboard."""
+    scale: float | None = None
+    """Size of the pictures (width and height) relative to the original, for example 0.5. Default: the
+    original, but at most 1,600 pixels a side. With --minutes, they are downscaled further if that pays."""
     fit: FitConfig = field(default_factory=FitConfig)
-    """Settings of the fit."""
+    """Settings of the fit. With --minutes and no other setting, there are as many steps as there is time
+    for."""
 
 
 def run(options: Options) -> int:
@@ -69,11 +76,12 @@ def run(options: Options) -> int:
         photographs = choose_photographs(
             options.dataset,
             options.read,
-            scale=options.scale,
             frames=options.frames,
             cameras=options.cameras,
             eval_cameras=options.eval_cameras,
         )
+        options = _with_scale(options, photographs, notes, console)
+        photographs = smaller(photographs, options.scale or 1.0)
         chosen, held_out = split(photographs, options.test_every)
         if options.until_psnr is not None and not len(held_out):
             raise ValueError("--until-psnr: nothing is held out to judge by; see --test-every")
@@ -81,17 +89,21 @@ def run(options: Options) -> int:
         settings = replace(options, dataset=located(options.dataset))
         if options.resume:
             folder.check_config(settings, but=_MAY_CHANGE)
-        warn_if_large(photographs)
-        frames = read_frames(photographs, console)
+        frames, progress = read_frames(photographs, console), Progress()
         fitted = [frames[i] for i in chosen]
         config, cloud = start_from(photographs, fitted, options.fit, console)
+        if options.minutes is not None and options.fit == FitConfig(seed=options.fit.seed):
+            config = replace(config, steps=_UNLIMITED)
         method = Fit(config)
         problem, run = method.start(fitted, cloud, photographs.background)
         folder.write_config(settings)  # from here on an earlier run is gone
-        progress = Progress()
         if options.resume:
             run, progress = load_run(folder.resume, run, progress)
             notes.add(f"Resumed after {run.step} steps of an earlier run.")
+        if options.minutes is not None:
+            width, height = photographs.sizes.max(0)
+            sizes = Sizes(config, (int(width), int(height)), budget, progress, notes, console)
+            problem = problem._replace(shrink=sizes)
         board = TensorBoard(folder.path, progress.rows) if options.tensorboard else None
         judged = [(photographs.names[i], frames[i]) for i in held_out]
         judge = Judge(config, problem.background, sizes_of(problem.frames))
@@ -142,6 +154,20 @@ def run(options: Options) -> int:
     return exit_code(stopped)
 
 
+def _with_scale(options: Options, photographs: Photographs, notes: Notes, console: Console) -> Options:
+    """The options with the size of photographs, if they leave it open."""
+    if options.scale is None:
+        scale = moderate_scale(photographs)
+        options = replace(options, scale=scale)
+        if scale < 1:
+            width, height = photographs.sizes.max(0)
+            smaller_size = f"{round(scale * width)}x{round(scale * height)}"
+            words = f"photographs of {width}x{height} are fitted at {smaller_size}; for more, give --scale"
+            console.print(words, soft_wrap=True)
+            notes.add(f"P{words[1:]}.")
+    return options
+
+
 def _fitted(
     options: Options,
     method: Fit,
@@ -170,7 +196,7 @@ def _fitted(
     watch(
         ticks,
         progress,
-        schedule_of(method.config, progress),
+        schedule_of(steps, problem.shrink, progress),
         folder,
         ending.console,
         budget=budget,

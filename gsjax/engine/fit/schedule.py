@@ -1,6 +1,6 @@
 """The logged rows of a fit, and when held-out photographs are evaluated."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from time import perf_counter
 from typing import Any
@@ -11,15 +11,13 @@ from gsjax.engine.budget import Budget
 from gsjax.engine.drive import Tick
 from gsjax.engine.fit.judge import Judge
 from gsjax.engine.progress import Progress, Schedule
-from gsjax.methods.fit import FitConfig
-from gsjax.methods.fit.method import shrink_at
 
 _LOGGED_EVERY = 100  # steps
 _EXTRA = 10  # evaluations under --minutes, besides those of --judge-every
 _JUDGING = 0.05  # of the time, at most, goes into evaluations under --minutes
 
 
-def schedule_of(config: FitConfig, progress: Progress) -> Schedule:
+def schedule_of(steps: int, shrink: Callable[[float], int], progress: Progress) -> Schedule:
     """Rows of a fit: loss and psnr (of the photograph of that step), the number of Gaussians (alive), the
     factor by which the photograph was downscaled (shrink), and test_psnr of held-out photographs, or None."""
 
@@ -27,7 +25,7 @@ def schedule_of(config: FitConfig, progress: Progress) -> Schedule:
         last = infos[-1] if infos else {}
         shown = {name: _finite(last.get(name)) for name in ("loss", "psnr")}
         alive = int(now.info["alive"])
-        return shown | {"alive": alive, "shrink": shrink_at(config, now.progress), "test_psnr": None}
+        return shown | {"alive": alive, "shrink": shrink(now.progress), "test_psnr": None}
 
     def words(row: Mapping[str, Any]) -> str:
         tested = evaluated(progress.rows)
@@ -36,7 +34,7 @@ def schedule_of(config: FitConfig, progress: Progress) -> Schedule:
         loss = "–" if row["loss"] is None else f"{row['loss']:.2f}"
         return f"loss {loss}{test}, {row['alive']:,} Gaussians{pace}"
 
-    return Schedule("fitting", config.steps, row, words, _LOGGED_EVERY)
+    return Schedule("fitting", steps, row, words, _LOGGED_EVERY)
 
 
 def _finite(value: Any) -> float | None:

@@ -41,6 +41,7 @@ class Problem(NamedTuple):
         extent: the extent of the scene.
         background: RGB behind the scene; None: random in each step.
         start: source of the initial Gaussians: cloud, depth, matches or random.
+        shrink: progress -> the factor by which photographs are downscaled.
         held: photographs at the current size, on the device; filled on demand.
     """
 
@@ -49,6 +50,7 @@ class Problem(NamedTuple):
     extent: Extent
     background: tuple[float, float, float] | None
     start: str
+    shrink: Callable[[float], int]
     held: dict[tuple[int, int], Frame]
 
 
@@ -103,7 +105,9 @@ class Fit:
         behind["data"] = background or behind["black"]
         model = model_of(gaussians, config, len(frames))
         shown, shares = with_common_sizes(frames)
-        problem = Problem(shown, shares, extent, behind[config.background], source, {})
+        problem = Problem(
+            shown, shares, extent, behind[config.background], source, partial(shrink_at, config), {}
+        )
         return problem, Run(model, self.step.init(model))
 
     @property
@@ -151,7 +155,7 @@ class Fit:
 
     def _turn(self, problem: Problem, step: int, progress: float) -> tuple[str, Frame]:
         """The photograph of a step on the device, and the name of the plan for its size."""
-        view, shrink = self._view(problem, step), shrink_at(self.config, progress)
+        view, shrink = self._view(problem, step), problem.shrink(progress)
         if (view, shrink) not in problem.held:
             if any(held != shrink for _, held in problem.held):
                 problem.held.clear()  # of an earlier size

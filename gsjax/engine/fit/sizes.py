@@ -1,0 +1,82 @@
+"""The size of photographs in a fit of given minutes, by what steps cost on this machine."""
+
+from rich.console import Console
+
+from gsjax.engine.budget import Budget
+from gsjax.engine.messages import Notes
+from gsjax.engine.progress import Progress
+from gsjax.methods.fit import FitConfig
+
+_LEAST_STEPS = 150  # on photographs of a size, without which smaller ones give more
+_COMPILING_S = 5.0
+_LEAST_SIDE = 32  # pixels
+_DEARER = 3.5  # a step on photographs of twice the width and height; docs/choosing.md
+_STEP_S = (0.02, 6e-7, 2e-6)  # a step, and more for a pixel and for a Gaussian, on two cores of an AMD EPYC
+
+
+class Sizes:
+    """progress -> the factor by which photographs are downscaled.
+
+    As in a fit without minutes, a sixth of the time goes to photographs of a quarter of the last size, a
+    third to those of half of it, and a half to the last size. That size is the largest for which there will
+    be 150 steps; it is guessed from what steps cost elsewhere, then found from what they cost here.
+    """
+
+    def __init__(
+        self,
+        config: FitConfig,
+        size: tuple[int, int],
+        budget: Budget,
+        progress: Progress,
+        notes: Notes,
+        console: Console,
+    ):
+        """
+        Args:
+            config: of the fit.
+            size: width and height of the largest photograph, pixels.
+            budget: the time that is left.
+            progress: of the fit, with its pace.
+            notes, console: to say what was chosen.
+        """
+        self._config, self._size, self._budget, self._progress = config, size, budget, progress
+        self._notes, self._console = notes, console
+        self._now = progress.rows[-1]["shrink"] if progress.rows else 0
+        coarse = config.coarse_until
+        self._times = [t for t in (coarse / 3, coarse, (1 + coarse) / 2) if coarse]
+
+    def __call__(self, progress: float) -> int:
+        if not self._now:
+            self._now = self._first()
+        if self._now > 1 and self._times and progress >= self._times[0] and (pace := self._progress.pace):
+            self._times.pop(0)
+            last = not self._times
+            left = int((self._budget.steps_s - _COMPILING_S) * pace / _DEARER)
+            if left >= _LEAST_STEPS:
+                self._now //= 2
+                self._progress.pace = 0.0  # which is not known at the new size
+            elif last:
+                self._say(max(0, left))
+        return self._now
+
+    def _first(self) -> int:
+        """The factor at the beginning: four times that of the largest size for which there should be time."""
+        if not self._times:
+            return 1
+        constant, a_pixel, a_gaussian = _STEP_S
+        width, height = self._size
+        last, least = 1, constant + a_gaussian * self._config.start.count
+        while (least + a_pixel * width * height / last**2) * _LEAST_STEPS > self._budget.steps_s / 2 and min(
+            self._size
+        ) >= 8 * last * _LEAST_SIDE:
+            last *= 2
+        return 4 * last
+
+    def _say(self, left: int) -> None:
+        width, height = self._size
+        words = (
+            f"photographs stay at {width // self._now}x{height // self._now}: of {2 * width // self._now}x"
+            f"{2 * height // self._now} there would be time for {left} steps"
+        )
+        self._console.print(words, soft_wrap=True)
+        self._notes.add(f"P{words[1:]}, and {_LEAST_STEPS} are needed to gain by it (--minutes).")
