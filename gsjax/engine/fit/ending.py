@@ -25,6 +25,7 @@ T = TypeVar("T")
 JUDGED_AT_MOST = 4
 """Most held-out views that are evaluated during the fit."""
 _COMPILING_S, _SCORING_S = 6.0, 1.5  # before the first view
+_A_PIXEL_S = 1e-6  # for SSIM and a picture, beside rendering
 _SLACK = 1.1
 _A_PRUNING = 3.0  # of the time of a view, as it is differentiated
 _PARTS = 8  # of a scene, at most
@@ -59,9 +60,10 @@ class Ending:
         view, pace = self.judge.view_s, self.progress.pace
         if not np.isfinite(view) and pace:
             view = 0.5 / pace
+        pixels = np.mean([frame.cameras.width * frame.cameras.height for _, frame in self.judged] or [0])
         return {
             "pruning": _COMPILING_S + _A_PRUNING * view * len(self.fitted),
-            "scores": _SCORING_S + 1.5 * view * max(1, len(self.judged)),
+            "scores": _SCORING_S + (view + _A_PIXEL_S * pixels) * max(1, len(self.judged)),
             "parts": _PARTS * view * len(some_of(self.judged)),
             "video": _COMPILING_S + view * FRAMES,
         }
