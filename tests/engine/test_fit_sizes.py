@@ -67,8 +67,8 @@ def test_where_larger_photographs_are_slow_they_stay_small_and_it_is_said():
         found.append(factor(percent / 100))
     assert sorted(set(found)) == [2, 4]
     assert notes.all == [
-        "Photographs stay at 240x135: of 480x270 there would be time for 28 steps, and 150 are needed to gain "
-        "by it (--minutes)."
+        "Photographs stay at 240x135: of 480x270 there would be time for 28 steps, and 150 are needed to "
+        "gain by it (--minutes)."
     ]
 
 
