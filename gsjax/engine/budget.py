@@ -89,7 +89,7 @@ class Budget:
 
     def allows(self, seconds: float, keep: float = REPORT_S) -> bool:
         """Whether there is time for something that is not necessary, with `keep` seconds left after it."""
-        return not self.hurried and self.left >= seconds + keep
+        return not self.hurried and bool(self.left >= seconds + keep)
 
     def guarded(self, items: Iterable[Item], keep: float) -> Iterator[Item]:
         """The items, all of which are needed.

@@ -28,6 +28,7 @@ SHARED += ("dataset", "mask_camera", "masks", "sam", "weights", "encoder", "min_
 SHARED += ("resume", "overwrite", "cores", "debug")
 OWN = {
     ("query", "frames"),  # those of which pictures are made; a run has chosen its own
+    ("fit", "scale"),  # of which None is moderate
     ("live", "minutes"),  # of a stream, which has no other end
     ("parts", "masks"),  # of the anchor, in all cameras
     ("distill", "masks"),  # of every photograph

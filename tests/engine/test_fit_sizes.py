@@ -38,7 +38,7 @@ def sizes(seconds, size, config=None, progress=None):
         (600.0, (480, 270), 4),
         (100.0, (480, 270), 4),
         (100.0, (960, 540), 8),
-        (100.0, (1600, 900), 16),
+        (60.0, (1600, 900), 16),
         (1.0, (1600, 900), 16),  # smaller ones would have fewer than 32 pixels a side
         (0.5, (100, 80), 4),
     ],

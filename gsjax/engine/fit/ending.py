@@ -60,10 +60,10 @@ class Ending:
         view, pace = self.judge.view_s, self.progress.pace
         if not np.isfinite(view) and pace:
             view = 0.5 / pace
-        pixels = np.mean([frame.cameras.width * frame.cameras.height for _, frame in self.judged] or [0])
+        pixels = sum(frame.cameras.width * frame.cameras.height for _, frame in self.judged)
         return {
             "pruning": _COMPILING_S + _A_PRUNING * view * len(self.fitted),
-            "scores": _SCORING_S + (view + _A_PIXEL_S * pixels) * max(1, len(self.judged)),
+            "scores": _SCORING_S + view * max(1, len(self.judged)) + _A_PIXEL_S * pixels,
             "parts": _PARTS * view * len(some_of(self.judged)),
             "video": _COMPILING_S + view * FRAMES,
         }
