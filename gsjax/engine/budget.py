@@ -125,7 +125,7 @@ class Budget:
 
 
 def note_if_few(scored: Sequence[Any], held_out: Sequence[Any], what: str, notes: Notes) -> None:
-    """Note if there was time to score only some of what is held out."""
+    """Note if fewer rows were `scored` than `held_out`, for want of time; `what` names them in `notes`."""
     if len(scored) < len(held_out):
         notes.add(f"{len(scored)} of {len(held_out)} {what} were scored: --minutes left no time for more.")
 

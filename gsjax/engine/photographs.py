@@ -92,13 +92,13 @@ def photographs_of_run(settings: Mapping[str, Any], dataset: str | None = None) 
         KeyError, TypeError, ValueError: the settings are not those of a fit.
     """
     more = {name: settings[name] for name in ("frames", "cameras", "eval_cameras") if name in settings}
+    given = settings.get("scale", 1.0)
+    scale = None if given is None else float(given)
     try:
-        return choose_photographs(
-            dataset or str(settings["dataset"]),
-            read_options(settings.get("read") or {}),
-            scale=float(settings.get("scale", 1.0)),
-            **more,
+        photographs = choose_photographs(
+            dataset or str(settings["dataset"]), read_options(settings.get("read") or {}), **more
         )
+        return smaller(photographs, moderate_scale(photographs) if scale is None else scale)
     except DataError as error:
         raise ValueError(
             f"{error} The fit read its photographs from there; if they were moved, pass their new folder as "

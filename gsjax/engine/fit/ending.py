@@ -80,7 +80,8 @@ class Ending:
     def pruned(
         self, gaussians: Gaussians, frames: Sequence[Frame], config: FitConfig
     ) -> tuple[Gaussians, Float[np.ndarray, "n"] | None]:
-        """The Gaussians that some photograph needs, and the light of each; None if that was left out."""
+        """The `gaussians` that some of the `frames` need, and the light of each, which is None if that was
+        left out; `config` has the share of light that is not needed."""
         keep = self.expected_s()["scores"] + REPORT_S
 
         def work() -> tuple[Gaussians, Float[np.ndarray, "n"]]:
@@ -96,7 +97,8 @@ class Ending:
         return self._if_time("pruning", words, work, (gaussians, None), keep)
 
     def scored(self, gaussians: Gaussians, otherwise: tuple[str, Frame], folder: RunFolder) -> Scores:
-        """The scores of held-out photographs, or of `otherwise` if there are none."""
+        """The scores of `gaussians` in held-out photographs, or in `otherwise` if there are none; pictures go
+        into `folder`."""
         which = self.budget.affordable(self.judged or [otherwise])
         work = partial(self.judge, gaussians, which, folder)
         scores = self._stage("scores", "scoring held-out photographs", work, Scores([]))
@@ -113,7 +115,8 @@ class Ending:
     def filmed(
         self, gaussians: Gaussians, frames: Sequence[Frame], focus: Float[np.ndarray, "3"], folder: RunFolder
     ) -> None:
-        """Write the video of a path about the scene, and note what was left out."""
+        """Write the video of a path about the `focus` of `gaussians` into `folder`, between the cameras of
+        `frames`, and note what was left out."""
         camera = self.fitted[len(self.fitted) // 2].cameras
         viewmats = np.concatenate([frame.cameras.viewmat for frame in frames])
         work = partial(write_orbit, folder, camera, viewmats, focus, gaussians, self.judge)
