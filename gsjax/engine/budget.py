@@ -126,7 +126,7 @@ class Budget:
 
 def note_if_few(scored: Sequence[Any], held_out: Sequence[Any], what: str, notes: Notes) -> None:
     """Note if fewer rows were `scored` than `held_out`, for want of time; `what` names them in `notes`."""
-    if len(scored) < len(held_out):
+    if 0 < len(scored) < len(held_out):  # none, if Ctrl-C or an error ended it
         notes.add(f"{len(scored)} of {len(held_out)} {what} were scored: --minutes left no time for more.")
 
 

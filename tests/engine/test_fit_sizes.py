@@ -94,6 +94,13 @@ def test_a_resumed_fit_goes_on_at_its_size():
     assert sizes(1000.0, (480, 270), progress=progress)[0](0.6) == 2
 
 
+def test_what_an_interrupted_fit_decided_is_not_decided_again():
+    progress = Progress(rows=[{"shrink": 2}])
+    progress.pace = 20.0
+    factor = sizes(1000.0, (480, 270), progress=progress)[0]
+    assert [factor(0.2), factor(0.4), factor(0.51)] == [2, 2, 1]
+
+
 def test_a_fit_that_is_never_coarse_is_not_under_minutes_either():
     factor, progress, _ = sizes(1.0, (4000, 3000), replace(FitConfig(), coarse_until=0.0))
     progress.pace = 0.1

@@ -42,12 +42,14 @@ class Sizes:
         self._config, self._size, self._budget, self._progress = config, size, budget, progress
         self._notes, self._console = notes, console
         self._now = progress.rows[-1]["shrink"] if progress.rows else 0
-        coarse = config.coarse_until
+        self._resumed, coarse = bool(progress.rows), config.coarse_until
         self._times = [t for t in (coarse / 3, coarse, (1 + coarse) / 2) if coarse]
 
     def __call__(self, progress: float) -> int:
         if not self._now:
             self._now = self._first()
+        if self._resumed:  # what was decided then is not decided again
+            self._times, self._resumed = [t for t in self._times if t > progress], False
         if self._now > 1 and self._times and progress >= self._times[0] and (pace := self._progress.pace):
             self._times.pop(0)
             last = not self._times

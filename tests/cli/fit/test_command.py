@@ -12,8 +12,8 @@ import cv2
 import pytest
 import yaml
 
+import gsjax.engine.fit.ending
 import gsjax.engine.fit.judge
-import gsjax.engine.fit.run
 import gsjax.engine.photographs
 from gsjax.cli import main
 from gsjax.data.video import describe_video
@@ -183,8 +183,8 @@ def test_minutes_of_which_compiling_took_most(gsjax_fit, tmp_path):
     ("module", "what", "lacks"),
     [
         (gsjax.engine.fit.judge, "write_panel", "scoring"),
-        (gsjax.engine.fit.run, "ablate", "ablating"),
-        (gsjax.engine.fit.run, "write_orbit", "drawing a video"),
+        (gsjax.engine.fit.ending, "ablate", "ablating"),
+        (gsjax.engine.fit.ending, "write_orbit", "drawing a video"),
     ],
 )
 def test_ctrl_c_after_the_last_step_leaves_out_what_a_run_can_go_without(
