@@ -26,7 +26,7 @@ from gsjax.engine.terminal import print_summary
 from gsjax.io.atomic import write_json
 from gsjax.io.ply import read_ply
 from gsjax.methods.fit import FitConfig
-from gsjax.methods.fit.padding import sizes_of, with_common_sizes
+from gsjax.methods.fit.padding import sizes_of
 from gsjax.metrics.image import MS_SSIM_LEAST_SIDE, ms_ssim
 from gsjax.metrics.perceptual import LpipsWeights, fingerprint, load_lpips, lpips
 from gsjax.scene.frame import Frame
@@ -198,7 +198,7 @@ def _compared(
     fit = record.config["fit"]
     background = {"data": behind, "white": (1.0, 1.0, 1.0)}.get(fit.get("background", "data"))
     config = FitConfig(antialiased=bool(fit.get("antialiased", False)))
-    judge = Judge(config, background, sizes_of(with_common_sizes(frames)[0]))
+    judge = Judge(config, background, sizes_of(frames))
     for frame in frames:
         yield judge.compare(gaussians, frame)
 

@@ -106,7 +106,7 @@ def run(options: Options) -> int:
             problem = problem._replace(shrink=sizes)
         board = TensorBoard(folder.path, progress.rows) if options.tensorboard else None
         judged = [(photographs.names[i], frames[i]) for i in held_out]
-        judge = Judge(config, problem.background, sizes_of(problem.frames))
+        judge = Judge(config, problem.background, sizes_of(fitted))
         ending = Ending(judge, fitted, judged, progress, budget, console, notes)
         budget.rest_s = ending.rest_s
         ticks = _fitted(options, method, problem, run, folder, ending, board)

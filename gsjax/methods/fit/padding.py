@@ -43,7 +43,7 @@ def with_common_sizes(frames: list[Frame]) -> tuple[list[Frame], Float[np.ndarra
     Args:
         frames: of one camera each, on the host.
     """
-    sizes = np.array([(frame.cameras.width, frame.cameras.height) for frame in frames])
+    sizes = _own_sizes(frames)
     common = common_sizes(sizes)
     if (common == sizes).all():
         return frames, None
@@ -52,8 +52,13 @@ def with_common_sizes(frames: list[Frame]) -> tuple[list[Frame], Float[np.ndarra
 
 
 def sizes_of(frames: list[Frame]) -> list[tuple[int, int]]:
-    """The different widths and heights of photographs."""
-    return sorted({(frame.cameras.width, frame.cameras.height) for frame in frames})
+    """The common sizes, width and height, of photographs."""
+    common = np.unique(common_sizes(_own_sizes(frames)), axis=0)
+    return [(int(width), int(height)) for width, height in common]
+
+
+def _own_sizes(frames: list[Frame]) -> Int[np.ndarray, "n 2"]:
+    return np.array([(frame.cameras.width, frame.cameras.height) for frame in frames])
 
 
 def padded(frame: Frame, size: Int[np.ndarray, "2"]) -> Frame:
