@@ -23,6 +23,7 @@ BESIDE = {
 }
 ALLOWED = {layer: set(STACK[:i]) for i, layer in enumerate(STACK)} | BESIDE
 ANYWHERE = {"extras"}  # the one module that stands in no layer
+ALLOWED["optim"] |= {"io"}  # keeps traces on disk
 ALLOWED["engine"] = {*STACK, *BESIDE}
 ALLOWED["cli"] = {*STACK, *BESIDE, "engine"}
 

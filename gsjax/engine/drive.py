@@ -9,7 +9,7 @@ random keys, headroom, and when Ctrl-C may interrupt.
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from functools import cached_property, lru_cache, partial
+from functools import cached_property, lru_cache
 from time import perf_counter
 from typing import Any
 
@@ -19,6 +19,7 @@ import jax.numpy as jnp
 from gsjax.engine.interrupts import raise_if_interrupted, shielded
 from gsjax.optim.compiler import compile_seconds, host_options
 from gsjax.optim.method import Method, Run
+from gsjax.optim.traces import jit_once
 from gsjax.rasterize.plan import HEADROOM
 
 
@@ -157,8 +158,7 @@ def _compiled(method: Method) -> Callable:
     """The jitted update of a method, cached so that a second problem like the first starts at once."""
     update = method.step.update
 
-    @partial(jax.jit, compiler_options=host_options(), donate_argnums=(0, 1))
     def advance(params, state, batch, step, key):
         return update(params, state, batch, step=step, key=jax.random.fold_in(key, step))
 
-    return advance
+    return jit_once(advance, method, compiler_options=host_options(), donate_argnums=(0, 1))

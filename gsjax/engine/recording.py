@@ -1,10 +1,12 @@
 """The part of a recording that is used, what is held out of it, and the objects that its masks name."""
 
+import itertools
 import os
 import warnings
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from collections.abc import Sequence as Indices
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from time import perf_counter
 from typing import Any, Generic, NamedTuple, TypeVar
@@ -179,10 +181,28 @@ def remembered(sequence: Sequence) -> Sequence:
 
 def draw_ahead(recording: Recording, console: Console) -> None:
     """Draw the tracked pictures of a simulated recording, so that updates need not share the processor."""
+    if views := _views_to_draw(recording):
+        draw = recording.tracked.image
+        in_threads(lambda view: draw(*view), views, "drawing the simulated scene", console)
+
+
+@contextmanager
+def drawing_ahead(recording: Recording) -> Iterator[None]:
+    """While this context lasts, another thread draws for `draw_ahead`."""
+    executor = ThreadPoolExecutor(1, thread_name_prefix="drawing")
+    for view in _views_to_draw(recording):
+        executor.submit(recording.tracked.image, *view)
+    try:
+        yield
+    finally:
+        executor.shutdown(cancel_futures=True)
+
+
+def _views_to_draw(recording: Recording) -> list[tuple[int, int]]:
+    """Frame and camera of each tracked picture of a simulated recording; nothing for others."""
     sequence = recording.tracked
-    if recording.simulated:
-        views = [(t, c) for t in range(sequence.num_frames) for c in range(sequence.num_cameras)]
-        in_threads(lambda view: sequence.image(*view), views, "drawing the simulated scene", console)
+    pairs = itertools.product(range(sequence.num_frames), range(sequence.num_cameras))
+    return list(pairs) if recording.simulated else []
 
 
 def in_threads(

@@ -11,6 +11,7 @@ from jaxtyping import Float, Int
 
 from gsjax.engine.recording import Prefetched, Recording
 from gsjax.optim.compiler import host_options
+from gsjax.optim.traces import jit_once
 from gsjax.rasterize.plan import Plan, with_room
 from gsjax.scene.frame import Frame
 from gsjax.scene.render import plan_render
@@ -97,4 +98,4 @@ def _compiled(draw: Callable) -> Callable:
         groups = jnp.where(covered, jnp.argmax(rendered.features, axis=-1), 0)
         return (rendered.colors, depths, groups, covered), rendered.meta._replace(features=None)
 
-    return jax.jit(drawn, compiler_options=host_options())
+    return jit_once(drawn, f"{draw.__module__}.{draw.__qualname__}", compiler_options=host_options())

@@ -8,6 +8,7 @@ import threading
 from functools import cache
 from pathlib import Path
 from tempfile import TemporaryFile
+from time import perf_counter
 from typing import Any
 
 import jax
@@ -63,7 +64,13 @@ def compile_seconds() -> float:
 def _listen() -> None:
     def add(event: str, seconds: float, **_: Any) -> None:
         if event.startswith("/jax/core/compile/"):
-            _compiling.seconds = getattr(_compiling, "seconds", 0.0) + seconds
+            end = perf_counter()
+            spans = _compiling.__dict__.setdefault("spans", [])
+            inner = 0.0
+            while spans and spans[-1][0] >= end - seconds:  # one program traced within another counts once
+                inner += spans.pop()[1]
+            spans.append((end - seconds, seconds))
+            _compiling.seconds = getattr(_compiling, "seconds", 0.0) + seconds - inner
 
     jax.monitoring.register_event_duration_secs_listener(add)
 
@@ -115,6 +122,8 @@ def keep_freed_memory() -> bool:
     return bool(mallopt(_TRIM_THRESHOLD, _KEPT))
 
 
+TRACES = "traces"
+"""Folder beside the compiled programs for what `gsjax.optim.traces` keeps."""
 _MOST_BYTES, _WORTH_S = 2**30, 0.0  # size of the cache on disk; the seconds from which a program is kept
 
 
@@ -141,7 +150,7 @@ def keep_programs(folder: str | Path | None = None) -> Path | None:
     try:
         root = Path(folder) if folder is not None else Path(user_cache_dir("gsjax", appauthor=False))
         place = root / f"programs-jax-{jax.__version__}-{kind}"
-        place.mkdir(parents=True, exist_ok=True)
+        (place / TRACES).mkdir(parents=True, exist_ok=True)
         with TemporaryFile(dir=place):
             pass
         for program in place.glob("*-cache"):  # JAX writes the access time afterwards, and needs both files

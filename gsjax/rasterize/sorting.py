@@ -51,6 +51,8 @@ _WORK = {
     "gsjax_repeat": _repeat_into,
 }
 _AVAILABLE = all([register(name, work) for name, work in _WORK.items()])
+CUSTOM_CALLS = tuple(_WORK)
+"""Names of the custom calls, for those who export programs."""
 
 
 def _either(name: str, where: str, on_device: Callable, result, *arguments: Array) -> Array:

@@ -62,8 +62,8 @@ def recording(pristine, tmp_path) -> Path:
     return Path(shutil.copytree(pristine, tmp_path / "table"))
 
 
-def unfitted(frame, mask, mask_camera, config):
-    """`start_scene` without the optimisation."""
+def unfitted(frame, mask, mask_camera, config, before_fit):
+    """`start_scene` without the optimisation, and without a rehearsal before it."""
     start = replace(config.start, iterations=0)
     return start_scene(frame, mask, mask_camera, replace(config, start=start))
 

@@ -24,6 +24,7 @@ from gsjax.engine.messages import FITTING, MEASURING, Notes, stage
 from gsjax.engine.options import Common, FirstMasks, Overwriting, Selection, checked, expect_positive
 from gsjax.engine.recording import draw_ahead, first_mask, label_names, open_recording
 from gsjax.engine.terminal import print_facts
+from gsjax.engine.track.rehearsal import Rehearsal
 from gsjax.engine.track.scoring import budget_metrics
 from gsjax.engine.track.tracking import track
 from gsjax.methods.track import PLAN, PRESETS, TrackedScene, start_scene
@@ -67,12 +68,14 @@ class Source(NamedTuple):
         first: the frame from which the scene starts.
         scene: the scene at that frame.
         names: name of each mask value.
+        rehearsal: compiles the first settings that are measured.
         snapshots: the stream, which begins when it is first iterated over.
     """
 
     first: Frame
     scene: TrackedScene
     names: dict[int, str]
+    rehearsal: Rehearsal
     snapshots: Iterator[Snapshot]
 
 
@@ -144,9 +147,10 @@ def _open(options: Options, console: Console) -> Source:
         frames = [recording.tracked.frame(t) for t in range(recording.tracked.num_frames)]
         first, labels, index = frames[0], mask.labels, recording.tracked.camera_ids.index(mask.camera)
         names, stream = label_names(recording, mask.source), replay(frames, options.hz, 60 * options.minutes)
+    rehearsal = Rehearsal(first, CONFIG, budgeted=True)
     with stage(console, FITTING):
-        scene = start_scene(first, labels, index, CONFIG)
-    return Source(first, scene, names, stream)
+        scene = start_scene(first, labels, index, CONFIG, before_fit=rehearsal.begin)
+    return Source(first, scene, names, rehearsal, stream)
 
 
 class Log:
@@ -282,7 +286,8 @@ def follow(options: Options, source: Source, log: Log, console: Console) -> Base
         # Drawn between updates: a thread of its own would make some of them late.
         with Live(console=console, auto_refresh=False, transient=True) as shown:
             worst = 0.0
-            for now in track(source.scene, source.first, frames(), CONFIG, budget_ms=budget_ms):
+            how = {"budget_ms": budget_ms, "like": source.rehearsal.tick}
+            for now in track(source.scene, source.first, frames(), CONFIG, **how):
                 if not arrived:
                     continue
                 log.add(now, arrived[0], budget_ms / 1e3)

@@ -156,6 +156,7 @@ def follow(
     console: Console,
     *,
     budget_ms: float | None = None,
+    like: Callable[[], Tick | None] = lambda: None,
     saved: Callable[..., None] = lambda tracking, *, last: None,
 ) -> Tracking:
     """Track the remaining frames. Ctrl-C or an error ends the loop; what was tracked until then is kept.
@@ -167,6 +168,7 @@ def follow(
         config: the settings of the tracker.
         console: for the progress bar.
         budget_ms: time that an update may take, or None.
+        like: as for `track`.
         saved: called after each update, and once more, with `last` on, at the end of the loop.
     """
     shared = usable_cores() == 1 and jax.default_backend() == "cpu"  # with a thread that reads meanwhile
@@ -188,7 +190,9 @@ def follow(
             "tracking", total=tracked.num_frames, completed=tracking.num_frames, rate="compiling"
         )
         try:
-            for now in track(tracking.scene, first, frames, config, budget_ms=budget_ms, after=after):
+            for now in track(
+                tracking.scene, first, frames, config, budget_ms=budget_ms, after=after, like=like
+            ):
                 if not plans:
                     known = now.seconds + now.compile_seconds + frames.waited
                     tracking.planning_s = max(0.0, perf_counter() - begun - known)

@@ -26,6 +26,7 @@ from gsjax.engine.recording import (
     Recording,
     chosen_recording,
     draw_ahead,
+    drawing_ahead,
     first_mask,
     located,
     warn_of_missing,
@@ -34,6 +35,7 @@ from gsjax.engine.scores import Scores
 from gsjax.engine.summary import Media, format_number
 from gsjax.engine.track.loop import Tracking, begin, follow
 from gsjax.engine.track.outputs import write_first_mask, write_plots, write_tracking
+from gsjax.engine.track.rehearsal import Rehearsal
 from gsjax.engine.track.results import summarize
 from gsjax.engine.track.resume import Saver, load
 from gsjax.engine.track.scoring import (
@@ -48,7 +50,6 @@ from gsjax.engine.track.scoring import (
 )
 from gsjax.engine.track.views import views
 from gsjax.methods.track import PRESETS, TrackConfig, TrackedScene, scene_from_shapes, start_scene
-from gsjax.scene.frame import Frame
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -88,17 +89,20 @@ def run(options: Options) -> int:
             folder.check_config(settings, but=RESUME_MAY_CHANGE)
         mask = first_mask(recording.tracked, options.mask_camera, options.masks)
         folder.write_config(settings)  # from here on an earlier run is gone
-        draw_ahead(recording, console)
         seconds = {"preparing": perf_counter() - begun}
         first = recording.tracked.frame(0)
+        rehearsal = Rehearsal(first, options.track, options.budget_ms is not None)
         if options.resume:
             tracking = load(folder.resume, options.track)
             notes.add(f"Resumed after {tracking.resumed} frames of an earlier run.")
         else:
-            scene, seconds["start"] = _start(recording, first, mask, options.track, console, notes)
+            with drawing_ahead(recording):
+                scene, seconds["start"] = _start(recording, mask, rehearsal, console, notes)
             tracking = begin(scene)
-        saver, budget_ms = Saver(folder.resume, tracking.resumed), options.budget_ms
-        follow(tracking, first, recording.tracked, options.track, console, budget_ms=budget_ms, saved=saver)
+        saver = Saver(folder.resume, tracking.resumed)
+        draw_ahead(recording, console)
+        loop = {"budget_ms": options.budget_ms, "like": rehearsal.tick, "saved": saver}
+        follow(tracking, first, recording.tracked, options.track, console, **loop)
         seconds |= tracking.seconds()
         write_tracking(folder, tracking, recording.tracked.times)
         _note_if_stopped(tracking, recording, notes)
@@ -112,18 +116,14 @@ def run(options: Options) -> int:
 
 
 def _start(
-    recording: Recording,
-    frame: Frame,
-    mask: FirstMask,
-    config: TrackConfig,
-    console: Console,
-    notes: Notes,
+    recording: Recording, mask: FirstMask, rehearsal: Rehearsal, console: Console, notes: Notes
 ) -> tuple[TrackedScene, float]:
-    """The scene at the first frame, and the seconds that it took."""
-    begun = perf_counter()
+    """The scene at the first frame, and the seconds that it took; its updates are rehearsed meanwhile."""
+    begun, frame, config = perf_counter(), rehearsal.first, rehearsal.config
     with stage(console, FITTING):
         if mask.labels is not None:
-            scene = start_scene(frame, mask.labels, recording.tracked.camera_ids.index(mask.camera), config)
+            camera = recording.tracked.camera_ids.index(mask.camera)
+            scene = start_scene(frame, mask.labels, camera, config, before_fit=rehearsal.begin)
         else:
             scene = scene_from_shapes(recording.tracked.models, frame, config)
     warn_of_missing(recording, mask, scene.label_ids, notes)

@@ -21,6 +21,7 @@ from gsjax.methods.track.scene import TrackedScene
 from gsjax.methods.track.state import TrackBatch
 from gsjax.optim.compiler import host_options
 from gsjax.optim.method import Run
+from gsjax.optim.traces import jit_once
 from gsjax.scene.frame import Frame
 
 _TRIALS = 5  # updates, whose median is the cost of one
@@ -34,6 +35,7 @@ def track(
     *,
     budget_ms: float | None = None,
     after: Tick | None = None,
+    like: Callable[[], Tick | None] = lambda: None,
     extra_losses: ExtraLosses = (),
 ) -> Iterator[Tick]:
     """Track the objects of `scene` through `frames` (those after the first one), one tick per frame.
@@ -49,6 +51,8 @@ def track(
         budget_ms: time that an update may take, milliseconds. The richest settings that keep to it are then
             chosen by measured cost, and of `config` only the start of a scene is used (see `budget`).
         after: a tick to continue from, with its scene, state and chosen settings.
+        like: returns a tick of another scene of the same shapes, or None. Its plan is used again, so that
+            nothing is compiled for settings that it has too; see `gsjax.engine.track.rehearsal`.
         extra_losses: custom losses `loss(scene, rendered, frame)` added to the loss of the refinement; see
             `track_step`.
 
@@ -72,11 +76,11 @@ def track(
     frames = iter(frames)
     if budget_ms is None:
         method = Track(config, extra_losses)
-        yield from _ticks(method, *_begun(method, scene, first, after), first, frames, None)
+        yield from _ticks(method, *_begun(method, scene, first, after, like()), first, frames, None)
         return
     count = (scene if after is None else after.run.params.scene).num_objects
     chosen = None if after is None else after.run.kept.chosen
-    start = partial(_begun, scene=scene, first=first, after=after, anew=chosen is None)
+    start = partial(_begun, scene=scene, first=first, after=after, like=like(), anew=chosen is None)
     if chosen is None:
         ahead = list(itertools.islice(frames, 1))
         frames = itertools.chain(ahead, frames)
@@ -113,13 +117,26 @@ def _ticks(
         yield announced(Tick(method, shape, run, info, seconds, compile_seconds))
 
 
+def first_update(scene: TrackedScene, first: Frame, config: TrackConfig) -> Tick:
+    """The tick of an update to the first frame itself, whose programs are then at hand."""
+    method = Track(config)
+    shape, run = method.start(scene, first)
+    run, info, *seconds = _Updates(method, shape, run)(run, first, 0)
+    return Tick(method, shape, run, info, *seconds)
+
+
 def _begun(
-    method: Track, scene: TrackedScene, first: Frame, after: Tick | None, anew: bool = False
+    method: Track,
+    scene: TrackedScene,
+    first: Frame,
+    after: Tick | None,
+    like: Tick | None,
+    anew: bool = False,
 ) -> tuple[FrameShape, Run]:
     """A run before its next frame; `anew` keeps only the scene of `after`, because its state belongs to other
     settings."""
     if after is None:
-        return method.start(scene, first)
+        return method.start(scene, first, like.run if like and like.method == method else None)
     if anew:
         shape, run = method.start_at(after.run.params, first)
         return shape, run.having(step=after.run.step)
@@ -157,11 +174,10 @@ def _compiled(method: Track, shape: FrameShape, reduction: int) -> Callable:
     so ticks stay valid."""
     update = method.step(shape, reduction).update
 
-    @partial(jax.jit, compiler_options=host_options())
     def advance(params, state, batch, step, key):
         return update(params, state, batch, step=step, key=jax.random.fold_in(key, step))
 
-    return advance
+    return jit_once(advance, (method, shape, reduction), compiler_options=host_options())
 
 
 def _measured(start: Callable[[Track], tuple[FrameShape, Run]], second: Frame, config: TrackConfig) -> Costs:

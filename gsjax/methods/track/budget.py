@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 from gsjax.methods.track.config import PRESETS, TrackConfig
 
+_FIRST = "fast"  # the rung that is measured first
 _USED = 0.9  # fraction of the budget that is planned; the rest is a reserve
 _MAX_DEBT = 5.0  # largest delay to be compensated, in budgets, in case the machine was suspended
 _NEW_WEIGHT = 0.1  # weight of an update in the running estimate of the cost
@@ -50,13 +51,18 @@ def ladder(config: TrackConfig, num_cameras: int) -> dict[str, TrackConfig]:
     return rungs
 
 
+def first_rung(config: TrackConfig, num_cameras: int) -> TrackConfig:
+    """The settings that `choose` measures first."""
+    return ladder(config, num_cameras)[_FIRST]
+
+
 def choose(
     rungs: dict[str, TrackConfig], measure: Callable[[TrackConfig], Costs], budget: float, num_groups: int
 ) -> Chosen:
     """The richest rung that leaves time to search for one group everywhere.
 
     Args:
-        rungs: from `ladder`. Each measurement compiles an update, so the choice starts at "fast", and a
+        rungs: from `ladder`. Each measurement compiles an update, so the choice starts at `first_rung`, and a
             richer rung is tried only if the one below leaves time to search for all groups.
         measure: settings -> measured costs.
         budget: seconds per update.
@@ -69,7 +75,7 @@ def choose(
             tried[name] = measure(rungs[name])
         return tried[name].base + groups * tried[name].search
 
-    at = names.index("fast")
+    at = names.index(_FIRST)
     while at > 0 and cost(names[at], num_groups) <= _USED * budget:
         at -= 1
     while cost(names[at], 1) > _USED * budget and at + 1 < len(names):

@@ -15,6 +15,7 @@ from gsjax.methods.track.config import TrackConfig
 from gsjax.methods.track.scene import TrackedScene, labelled_cloud, scene_from_cloud
 from gsjax.optim.compiler import host_options
 from gsjax.optim.step import gradient_step, per_field_adam
+from gsjax.optim.traces import jit_once
 from gsjax.rasterize.plan import with_room
 from gsjax.scene.frame import Frame, without_broken
 from gsjax.scene.render import plan_render, render
@@ -25,7 +26,12 @@ _DEPTH_WEIGHT, _DEPTH_LIMIT = 1.0, 0.05
 
 
 def start_scene(
-    frame: Frame, mask: np.ndarray, mask_camera: int = 0, config: TrackConfig | None = None
+    frame: Frame,
+    mask: np.ndarray,
+    mask_camera: int = 0,
+    config: TrackConfig | None = None,
+    *,
+    before_fit: Callable[[TrackedScene], None] | None = None,
 ) -> TrackedScene:
     """A labelled, photometrically optimised scene from the first RGB-D frame and the mask of one camera.
 
@@ -34,6 +40,8 @@ def start_scene(
         mask: labels [H, W] of one camera's image; 0 is background.
         mask_camera: index of that camera.
         config: configuration of the tracker (default: `TrackConfig()`).
+        before_fit: called with the scene before its optimisation, which changes no shape of it: what depends
+            on shapes, such as a program, can then be made meanwhile.
 
     Raises:
         ValueError: there is no depth, or the mask does not fit the images.
@@ -43,6 +51,8 @@ def start_scene(
     if broken:
         warnings.warn(f"the first frame has {broken} pixels that are not finite; ignored", stacklevel=2)
     scene = scene_from_cloud(labelled_cloud(frame, mask, mask_camera, config.start), config.start)
+    if before_fit is not None:
+        before_fit(scene)
     return fit_scene(scene, frame, config.start.iterations, config.headroom)[0]
 
 
@@ -105,4 +115,4 @@ def _advance() -> Callable:
     def fit_first_frame(params, state, batch, i):
         return _STEP.update(params, state, batch, step=i, key=None)
 
-    return jax.jit(fit_first_frame, compiler_options=host_options())
+    return jit_once(fit_first_frame, RATES, compiler_options=host_options())

@@ -1,10 +1,11 @@
 """The tracker as one value. Its frames are not steps of descent, so it is run not by `drive` but by the
 generator of `gsjax.engine.track.tracking`, on the same runs and ticks."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import lru_cache
 from typing import NamedTuple
 
-import jax
 import numpy as np
 
 from gsjax.losses.extra import ExtraLosses, named_losses
@@ -19,6 +20,7 @@ from gsjax.methods.track.state import TrackBatch, Tracked
 from gsjax.methods.track.update import first_look, track_step
 from gsjax.optim.method import Run
 from gsjax.optim.step import Step
+from gsjax.optim.traces import jit_once
 from gsjax.scene.frame import Frame
 
 PLAN = "track"
@@ -52,22 +54,27 @@ class Track:
     def __post_init__(self):
         named_losses(self.extra_losses)
 
-    def start(self, scene: TrackedScene, first: Frame) -> tuple[FrameShape, Run]:
+    def start(self, scene: TrackedScene, first: Frame, like: Run | None = None) -> tuple[FrameShape, Run]:
         """The shape of the frames and the run at the first frame, with slots if there is depth.
 
         Args:
             scene: from `start_scene` or `scene_from_shapes`.
             first: the frame that it shows, of all cameras.
+            like: an earlier run of a scene of the same shapes, whose plans are used again. A plan that is too
+                small grows at the first update.
         """
         if self.config.grow.slots and first.depths is not None:
             scene = with_slots(scene, self.config.grow.slots)
-        return self.start_at(Tracked(scene, first_pose(scene)), first)
+        return self.start_at(Tracked(scene, first_pose(scene)), first, like)
 
-    def start_at(self, params: Tracked, frame: Frame) -> tuple[FrameShape, Run]:
+    def start_at(self, params: Tracked, frame: Frame, like: Run | None = None) -> tuple[FrameShape, Run]:
         """The shape of the frames and the run at a frame of all cameras that shows the scene, with its slots
-        as they are, at the pose of `params`."""
-        plan = plan_tracker(params.scene, params.pose, frame, self.config)
-        state = _first_look(params, TrackBatch(frame, plan), self.config)
+        as they are, at the pose of `params`; `like` as for `start`."""
+        if like is None:
+            plan = plan_tracker(params.scene, params.pose, frame, self.config)
+        else:
+            plan = like.plans[PLAN]
+        state = _first_look(self.config)(params, TrackBatch(frame, plan))
         kept = Kept(matching_reduction(params.scene, frame, self.config))
         return shape_of(frame), Run(params, state, 0, {PLAN: plan}, kept)
 
@@ -80,7 +87,14 @@ class Track:
         return run.params
 
 
-_first_look = jax.jit(first_look, static_argnames="config")
+@lru_cache(maxsize=8)
+def _first_look(config: TrackConfig) -> Callable:
+    """The jitted first look."""
+
+    def look(params, batch):
+        return first_look(params, batch, config)
+
+    return jit_once(look, config)
 
 
 def matching_reduction(scene: TrackedScene, frame: Frame, config: TrackConfig) -> int:

@@ -1,4 +1,4 @@
-"""What is compiled once is found by the next process."""
+"""What is compiled or traced once is found by the next process."""
 
 import json
 import os
@@ -15,14 +15,23 @@ def start(tmp_path, name):
     record, out = tmp_path / f"{name}.json", str(tmp_path / name)
     watched = [sys.executable, "-m", "benchmarks.starts", "--watch", str(record), str(time())]
     command = [*watched, "fit", SCENE, "--out", out, *FIT, "--fit.growth.every", "2"]
-    environment = os.environ | {"JAX_COMPILATION_CACHE_DIR": str(tmp_path / "xla")}
+    environment = {k: v for k, v in os.environ.items() if k != "JAX_COMPILATION_CACHE_DIR"}
+    environment["XDG_CACHE_HOME"] = str(tmp_path / "cache")
     done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     return json.loads(record.read_text())
 
 
-def test_a_second_process_compiles_nothing(tmp_path):
-    first, second = start(tmp_path, "first"), start(tmp_path, "second")
+def traces(tmp_path):
+    """The traces that are kept, with the times at which they were written."""
+    return {path.name: path.stat().st_mtime_ns for path in tmp_path.glob("cache/gsjax/*/traces/*.npz")}
+
+
+def test_a_second_process_compiles_nothing_and_traces_no_step(tmp_path):
+    first, kept = start(tmp_path, "first"), traces(tmp_path)
+    second = start(tmp_path, "second")
     assert first["programs"] - first["cache_hits"] > 10  # there was something to compile
     assert second["programs"] == second["cache_hits"] > 10
     assert second["updates"] == 6
+    assert kept
+    assert traces(tmp_path) == kept

@@ -26,9 +26,10 @@ def standing_still(scene, first, frames, config, *, budget_ms):
         yield still_tick(scene, count + 1, info | {"skipped": count == 2}, 0.001)
 
 
-def unfitted(frame, mask, camera, config):
-    """`start_scene` without the optimisation."""
-    return start_scene(frame, mask, camera, replace(config, start=replace(config.start, iterations=0)))
+def unfitted(frame, mask, camera, config, before_fit):
+    """`start_scene` without the optimisation, and without a rehearsal before it."""
+    config = replace(config, start=replace(config.start, iterations=0))
+    return start_scene(frame, mask, camera, config)
 
 
 @pytest.fixture

@@ -1,0 +1,127 @@
+"""Traces kept on disk beside the compiled programs, so that the next process need not trace again."""
+
+import hashlib
+import re
+from collections.abc import Callable, Sequence
+from functools import cache
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.export
+import numpy as np
+
+from gsjax.io.checkpoints import load_checkpoint, save_checkpoint
+from gsjax.optim.compiler import TRACES
+from gsjax.rasterize.sorting import CUSTOM_CALLS
+
+_MOST_FILES = 200  # half a megabyte each
+_TRACED_THROUGH = ("jax", "jaxlib", "equinox", "jaxlie", "lineax", "optax", "optimistix", "jaxopt")
+_VAGUE = re.compile(r" at 0x|\.\.\.|<lambda>|<locals>")  # reprs with addresses, omissions, no names
+
+
+def jit_once(fun: Callable, closed_over: Any, **options: Any) -> Callable:
+    """`jax.jit(fun, **options)`, traced once for all processes if `keep_programs` keeps compiled programs.
+
+    JAX caches what XLA compiles, but every process traces and lowers again to find it: 5 s for an update of
+    the tracker, of which reading the trace leaves 0.2 s. A trace belongs to the trees, shapes and types of
+    the arguments, to `closed_over`, and to the sources of gsjax, its libraries and JAX's configuration.
+
+    Use it only for an outermost `jax.jit`: what is read can be neither differentiated nor mapped. Anywhere
+    but on a single CPU device, and wherever a trace cannot be kept, `fun` is simply traced.
+
+    Args:
+        fun: a pure function of pytrees of arrays, without keyword arguments.
+        closed_over: all static values that `fun` closes over. They are told apart by their repr; a function
+            among them, which has no name in another process, means that nothing is kept.
+        options: those of `jax.jit`.
+    """
+    folder = jax.config.jax_compilation_cache_dir
+    traces = None if folder is None else Path(folder) / TRACES
+    if traces is None or not traces.is_dir() or jax.default_backend() != "cpu" or jax.device_count() > 1:
+        return jax.jit(fun, **options)
+
+    def traced(*args):
+        leaves, tree = jax.tree.flatten(args)
+        types = [jax.typeof(leaf) for leaf in leaves]
+        specs = [jax.ShapeDtypeStruct(t.shape, t.dtype, weak_type=t.weak_type) for t in types]
+        name = _name(fun, f"{closed_over!r} {tree} {specs}")
+        if name is None:
+            return fun(*args)
+        found = _read(traces / name) or _traced_and_kept(traces / name, fun, tree, specs)
+        if found is None:
+            return fun(*args)
+        program, out_tree = found
+        return jax.tree.unflatten(out_tree, program.call(*leaves))
+
+    traced.__name__ = fun.__name__
+    # What such a program returns is committed to its device, and the next call takes it: without shardings
+    # the program would be compiled once more for that.
+    here = jax.sharding.SingleDeviceSharding(jax.devices()[0])
+    return jax.jit(traced, in_shardings=here, out_shardings=here, **options)
+
+
+def _name(fun: Callable, inputs: str) -> str | None:
+    """The file name of a trace, or None if the text of its inputs does not identify them."""
+    if _VAGUE.search(inputs):
+        return None
+    settings = sorted(f"{name}={value!r}" for name, value in jax.config.values.items())
+    about = "\n".join((fun.__module__, fun.__qualname__, inputs, _sources(), *settings))
+    return f"{hashlib.sha256(about.encode()).hexdigest()[:32]}.npz"
+
+
+@cache
+def _sources() -> str:
+    """What identifies the code that is traced: the sources of gsjax, and the versions of its libraries."""
+    digest, package = hashlib.sha256(), Path(__file__).resolve().parents[1]
+    for file in sorted(package.rglob("*.py")):
+        digest.update(file.read_bytes())
+    return " ".join((digest.hexdigest(), *map(_version, _TRACED_THROUGH)))
+
+
+def _version(library: str) -> str:
+    try:
+        return version(library)
+    except PackageNotFoundError:
+        return "none"
+
+
+def _read(path: Path) -> tuple[jax.export.Exported, Any] | None:
+    """A trace and the tree of its results; None if there is none, or it is damaged."""
+    if not path.exists():
+        return None
+    try:
+        kept, _ = load_checkpoint(path)
+        program = jax.export.deserialize(bytearray(kept["program"].tobytes()))
+    except (OSError, ValueError, KeyError, TypeError, ImportError):
+        return None
+    return program, jax.tree.structure(kept["results"])
+
+
+def _traced_and_kept(
+    path: Path, fun: Callable, tree: Any, specs: Sequence[jax.ShapeDtypeStruct]
+) -> tuple[jax.export.Exported, Any] | None:
+    """The trace that is written to `path`, as another process will read it; None if that is not possible."""
+    results: list[Any] = []
+
+    def flat(*leaves):
+        results[:] = [fun(*jax.tree.unflatten(tree, leaves))]
+        return jax.tree.leaves(results[0])
+
+    checks = [jax.export.DisabledSafetyCheck.custom_call(name) for name in CUSTOM_CALLS]
+    try:
+        exported = jax.export.export(jax.jit(flat), disabled_checks=checks)(*specs)
+        out_tree = jax.tree.structure(results.pop())
+        numbered = jax.tree.unflatten(out_tree, [np.int32(i) for i in range(out_tree.num_leaves)])
+        program = np.frombuffer(exported.serialize(), np.uint8)
+        save_checkpoint(path, {"program": program, "results": numbered})
+        for old in sorted(path.parent.glob("*.npz"), key=lambda file: -file.stat().st_mtime)[_MOST_FILES:]:
+            old.unlink(missing_ok=True)
+    except (OSError, ValueError, TypeError, ImportError, NotImplementedError):
+        return None
+    found = _read(path)
+    if found is None or found[1] != out_tree:  # a static value that a file does not keep as it was
+        path.unlink(missing_ok=True)
+        return None
+    return found
