@@ -15,7 +15,7 @@ from gsjax.methods.track import start_scene
 from tests.cli.conftest import still_tick
 
 
-def standing_still(scene, first, frames, config, *, budget_ms):
+def standing_still(scene, first, frames, config, *, budget_ms, like):
     """`track` for objects that never move."""
     groups = scene.num_objects
     info = {"motion": SimpleNamespace(twists=jnp.zeros((groups, 6))), "centers": jnp.ones((groups, 3))}
