@@ -1,7 +1,9 @@
 """A run of `gsjax live`: objects tracked while frames arrive, and what was measured meanwhile."""
 
 from collections.abc import Iterator
+from contextlib import nullcontext
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from time import perf_counter
 from typing import Annotated, Any, NamedTuple
@@ -22,7 +24,14 @@ from gsjax.engine.machine import describe as describe_machine
 from gsjax.engine.machine import resident_mb
 from gsjax.engine.messages import FITTING, MEASURING, Notes, stage
 from gsjax.engine.options import Common, FirstMasks, Overwriting, Selection, checked, expect_positive
-from gsjax.engine.recording import draw_ahead, first_mask, label_names, open_recording
+from gsjax.engine.recording import (
+    Recording,
+    draw_ahead,
+    drawing_ahead,
+    first_mask,
+    label_names,
+    open_recording,
+)
 from gsjax.engine.terminal import print_facts
 from gsjax.engine.track.rehearsal import Rehearsal
 from gsjax.engine.track.scoring import budget_metrics
@@ -129,8 +138,8 @@ def _open(options: Options, console: Console) -> Source:
                 f"SOURCE: expected {CAMERA_PREFIX}NUMBER, as in camera:0, found {options.source}"
             )
         camera = open_camera(int(number))
-        stream = snapshots([camera])
-        first = next(stream).frame
+        arriving = snapshots([camera])
+        first, drawing, stream = next(arriving).frame, nullcontext(), lambda: arriving
         image, depth = np.asarray(first.images[0]), np.asarray(first.depths)[0]
         labels = PlaneOrRegionSegmenter()((255 * image).astype(np.uint8), depth, camera.K).astype(np.int32)
         index, names = 0, {}
@@ -143,14 +152,21 @@ def _open(options: Options, console: Console) -> Source:
             raise ValueError(
                 f"SOURCE: {options.source} has no depth; gsjax live starts from depth. Use gsjax track."
             )
-        draw_ahead(recording, console)
-        frames = [recording.tracked.frame(t) for t in range(recording.tracked.num_frames)]
-        first, labels, index = frames[0], mask.labels, recording.tracked.camera_ids.index(mask.camera)
-        names, stream = label_names(recording, mask.source), replay(frames, options.hz, 60 * options.minutes)
+        tracked = recording.tracked
+        first, labels, index = tracked.frame(0), mask.labels, tracked.camera_ids.index(mask.camera)
+        names, drawing = label_names(recording, mask.source), drawing_ahead(recording)
+        stream = partial(_replayed, recording, options, console)
     rehearsal = Rehearsal(first, CONFIG, budgeted=True)
-    with stage(console, FITTING):
+    with drawing, stage(console, FITTING):
         scene = start_scene(first, labels, index, CONFIG, before_fit=rehearsal.begin)
-    return Source(first, scene, names, rehearsal, stream)
+    return Source(first, scene, names, rehearsal, stream())
+
+
+def _replayed(recording: Recording, options: Options, console: Console) -> Iterator[Snapshot]:
+    """The frames of a recording, which are all in memory now, as they would arrive."""
+    draw_ahead(recording, console)
+    frames = [recording.tracked.frame(t) for t in range(recording.tracked.num_frames)]
+    return replay(frames, options.hz, 60 * options.minutes)
 
 
 class Log:
