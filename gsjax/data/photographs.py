@@ -181,17 +181,22 @@ class Photographs:
             locate=locate and (lambda kind, i: locate(kind, chosen[i])),
         )
 
-    def scaled(self, scale: float) -> "Photographs":
+    def scaled(self, scale: float | Float[np.ndarray, "views"]) -> "Photographs":
         """The same views downscaled: colours are averaged over the area of each new pixel; masks, depths and
         labels are sampled at its centre.
 
+        Args:
+            scale: of all, or of each.
+
         Raises:
-            ValueError: `scale` is not above 0 and at most 1.
+            ValueError: a scale is not above 0 and at most 1.
         """
-        check_scale(scale)
-        if scale == 1:
+        scales = np.broadcast_to(scale, self.num)
+        for one in np.unique(scales):
+            check_scale(float(one))
+        if (scales == 1).all():
             return self
-        sizes = np.maximum(1, np.round(self.sizes * scale).astype(int))
+        sizes = np.maximum(1, np.round(self.sizes * scales[:, None]).astype(int))
         factors = np.concatenate([sizes / self.sizes, np.ones((self.num, 1))], axis=1)
 
         def size(i: int) -> tuple[int, int]:

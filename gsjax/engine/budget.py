@@ -43,7 +43,15 @@ class Budget:
         Args:
             earlier: seconds of steps in the run that is resumed; they count.
             console: to say it on.
+
+        Raises:
+            ValueError: there was no more time than those take.
         """
+        if self.minutes is not None and earlier >= 60 * self.minutes:
+            raise ValueError(
+                f"--minutes {self.minutes:g}: the steps of the run to resume took {_clock(earlier)} already; "
+                "give more minutes, of which they count as a part"
+            )
         self._begun -= earlier
         self._steps = perf_counter() - earlier
         if self.minutes is not None:

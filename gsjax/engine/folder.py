@@ -218,6 +218,8 @@ class RunFolder:
         given = _flat(plain(dataclasses.asdict(config)))
         names = [n for n in dict.fromkeys([*given, *stored]) if n.split(".")[0] not in but]
         others = [name for name in names if stored.get(name) != given.get(name)]
+        if (stored.get("minutes") is None) != (given.get("minutes") is None):
+            others.append("minutes")  # more or fewer may follow; but steps are counted otherwise without any
         if others:
             words = [f"{n} {stored.get(n)!r}, now it is {given.get(n)!r}" for n in others]
             raise ValueError(

@@ -54,7 +54,7 @@ class Timed:
 
     minutes: float | None = None
     """Time for the whole command, reading, compiling, scores and report included. The first run on a machine
-    compiles for a minute or so; later ones find the compiled programs."""
+    compiles for a minute or so; later ones find the compiled programs. With --resume, earlier steps count."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -71,12 +71,18 @@ def choose_photographs(
     return smaller(photographs, scale)
 
 
-def smaller(photographs: Photographs, scale: float) -> Photographs:
+def smaller(photographs: Photographs, scale: float | None) -> Photographs:
     """The same views in smaller photographs.
+
+    Args:
+        photographs: of any sizes.
+        scale: of all photographs; None for 1,600 pixels a side at most, as other trainers of 3DGS have it.
 
     Raises:
         ValueError: `scale` is not above 0 and at most 1, or makes one too small.
     """
+    if scale is None:
+        return photographs.scaled(np.minimum(1.0, _LARGE / photographs.sizes.max(1)))
     scaled = photographs.scaled(scale)
     least = scaled.sizes.min(1).argmin()
     sizes = (tuple(of.sizes[least].tolist()) for of in (photographs, scaled))
@@ -98,7 +104,7 @@ def photographs_of_run(settings: Mapping[str, Any], dataset: str | None = None) 
         photographs = choose_photographs(
             dataset or str(settings["dataset"]), read_options(settings.get("read") or {}), **more
         )
-        return smaller(photographs, moderate_scale(photographs) if scale is None else scale)
+        return smaller(photographs, scale)
     except DataError as error:
         raise ValueError(
             f"{error} The fit read its photographs from there; if they were moved, pass their new folder as "
@@ -141,9 +147,3 @@ def read_frames(photographs: Photographs, console: Console) -> list[Frame]:
             f"{free / 1e3:.1f} GB are free; try --scale, or fewer --frames"
         )
     return in_threads(photographs.frame, range(photographs.num), "reading photographs", console)
-
-
-def moderate_scale(photographs: Photographs) -> float:
-    """The scale at which no photograph has more than 1,600 pixels a side, which is what a fit of larger ones
-    uses unless told otherwise, as those of 3DGS do."""
-    return min(1.0, _LARGE / float(photographs.sizes.max()))

@@ -168,8 +168,8 @@ def watch(
     with _Display(console, schedule, progress, ticks, budget) as display:
         try:
             while not budget.is_over and (now := _next(ticks, progress)) is not None:
+                last = now.step == schedule.total or budget.is_over  # before what takes time
                 more = None if evaluate is None else evaluate(now)
-                last = now.step == schedule.total or budget.is_over
                 row = None
                 if now.step % schedule.every == 0 or last or more is not None:
                     row = shielded(_add_row, now, progress, schedule, folder, more or {})

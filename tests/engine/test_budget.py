@@ -74,6 +74,11 @@ def test_earlier_steps_of_a_resumed_run_count(clock):
     assert budget.left == pytest.approx(69)
 
 
+def test_a_run_that_used_all_its_minutes_needs_more_to_be_resumed(clock):
+    with pytest.raises(ValueError, match=r"--minutes 2: the steps of the run to resume took 2.5 min already"):
+        begun(clock, 2.0, earlier=150.0)
+
+
 def test_what_is_not_necessary_is_done_if_it_can_end_in_time(clock):
     budget = begun(clock, 1.0, used=50.0)
     assert budget.allows(10 - REPORT_S)

@@ -12,6 +12,7 @@ from gsjax.engine.drive import drive
 from gsjax.geometry.cameras import Camera
 from gsjax.methods.fit import Fit, FitConfig, GrowthConfig, StartConfig, light_of
 from gsjax.methods.fit.padding import common_sizes, padded, sizes_of, with_common_sizes
+from gsjax.methods.fit.update import _pull_of
 from gsjax.scene.frame import Frame
 
 CONFIG = FitConfig(
@@ -61,7 +62,7 @@ def test_what_is_padded_does_not_count():
     assert (wide.cameras.width, wide.cameras.height, wide.images.shape) == (20, 15, (1, 15, 20, 3))
     assert wide.masks[0, :12, :16].all()
     assert wide.masks.sum() == 16 * 12
-    assert padded(frame, np.array([16, 12])) is frame
+    assert padded(frame, np.array([16, 12])).masks.all()  # in the form of the others
     same, none = with_common_sizes([frame, frame])
     assert (same, none) == ([frame, frame], None)
 
@@ -73,7 +74,7 @@ def test_a_padded_photograph_gives_the_steps_of_the_photograph():
     problem, run = method.start([frame])
     assert problem.shares is None
     other, second = method.start([frame])
-    other = other._replace(frames=[wide], shares=np.array([32 * 24 / (48 * 40)]))
+    other = other._replace(frames=[wide], shares=np.array([[32 / 48, 24 / 40]]))
     for a, b in zip(drive(method, problem, run), drive(method, other, second), strict=True):
         assert float(a.info["psnr"]) == pytest.approx(float(b.info["psnr"]), abs=2e-3)
     ours, theirs = a.run.params.gaussians.means, b.run.params.gaussians.means
@@ -82,11 +83,26 @@ def test_a_padded_photograph_gives_the_steps_of_the_photograph():
     assert float(a.info["loss"]) == pytest.approx(float(b.info["loss"]), rel=5e-2)
 
 
+def test_padding_does_not_pull_gaussians_apart():
+    """The pull by which `split` divides Gaussians is per half a photograph, without what was padded."""
+    frame, method = photograph(32, 24), Fit(replace(CONFIG, strategy="split", dssim_weight=0.0, steps=1))
+    problem, run = method.start([frame])
+    other, second = method.start([frame])
+    wide = padded(frame, np.array([48, 40]))
+    other = other._replace(frames=[wide], shares=np.array([[32 / 48, 24 / 40]]))
+    (alone,), (there,) = (list(drive(method, *both)) for both in ((problem, run), (other, second)))
+    ours, theirs = (_pull_of(tick.run.state).total for tick in (alone, there))
+    assert float(ours.sum()) > 0
+    np.testing.assert_allclose(theirs, ours, rtol=1e-3, atol=1e-3 * float(ours.max()))
+
+
 def test_many_sizes_share_the_programs_of_one():
     frames = [photograph(32 - i % 2, 24 - i % 3 // 2, i) for i in range(6)]
     problem, run = Fit(CONFIG).start(frames)
     assert sizes_of(problem.frames) == [(32, 24)]
-    assert problem.shares == pytest.approx([(32 - i % 2) * (24 - i % 3 // 2) / (32 * 24) for i in range(6)])
+    own = np.array([(32 - i % 2, 24 - i % 3 // 2) for i in range(6)])
+    np.testing.assert_allclose(problem.shares, own / [32, 24])
+    assert all(frame.masks is not None for frame in problem.frames)
     compiled = [now.compile_seconds > 0.05 for now in drive(Fit(replace(CONFIG, steps=8)), problem, run)]
     assert sum(compiled[1:]) == 0
 

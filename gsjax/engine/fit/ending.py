@@ -28,6 +28,7 @@ _COMPILING_S, _SCORING_S = 6.0, 1.5  # before the first view
 _A_PIXEL_S = 1e-6  # for SSIM and a picture, beside rendering
 _SLACK = 1.1
 _A_PRUNING = 3.0  # of the time of a view, as it is differentiated
+_ABLATING = "ablating parts of the scene"
 _PARTS = 8  # of a scene, at most
 
 
@@ -71,11 +72,14 @@ class Ending:
     def rest_s(self, most: float) -> float:
         """Seconds of the stages, in the order of their worth, and of the report that there is time for."""
         kept, expected = REPORT_S, self.expected_s()
+        if np.isfinite(self.judge.view_s):  # the last steps are evaluated too
+            kept += self.judge.view_s * len(some_of(self.judged))
+        certain = kept
         for name in ("scores", "pruning", "parts", "video"):
             if _SLACK * (kept + expected[name]) > most:
                 break
             kept += expected[name]
-        return min(most, _SLACK * kept) if kept > REPORT_S else most
+        return min(most, _SLACK * kept) if kept > certain else most
 
     def pruned(
         self, gaussians: Gaussians, frames: Sequence[Frame], config: FitConfig
@@ -107,10 +111,12 @@ class Ending:
 
     def ablated(self, gaussians: Gaussians, light: Float[np.ndarray, "n"] | None) -> list[dict[str, Any]]:
         """The scores of parts of the scene, as `ablate` gives them."""
+        if light is None and self.judged and "pruning" not in self.seconds and not self.budget.hurried:
+            self._left_out.append(_ABLATING)
         if not self.judged or light is None or not len(light):
             return []
         work = partial(ablate, gaussians, light, some_of(self.judged), self.progress.rows, self.judge)
-        return self._if_time("parts", "ablating parts of the scene", work, [])
+        return self._if_time("parts", _ABLATING, work, [])
 
     def filmed(
         self, gaussians: Gaussians, frames: Sequence[Frame], focus: Float[np.ndarray, "3"], folder: RunFolder

@@ -23,7 +23,7 @@ from gsjax.engine.folder import RunFolder
 from gsjax.engine.machine import describe as describe_machine
 from gsjax.engine.messages import Notes
 from gsjax.engine.options import RESUME_MAY_CHANGE, OfDataset, checked, expect_positive
-from gsjax.engine.photographs import choose_photographs, moderate_scale, read_frames, smaller, split
+from gsjax.engine.photographs import choose_photographs, read_frames, smaller, split
 from gsjax.engine.progress import Progress, load_run, watch
 from gsjax.engine.recording import located
 from gsjax.io.atomic import write_npz
@@ -49,7 +49,8 @@ class Options(OfDataset):
     until_psnr: float | None = None
     """Stop when held-out photographs reach this PSNR, dB."""
     judge_every: int = 500
-    """Steps between evaluations of held-out photographs; with --minutes there are ten more."""
+    """Steps between evaluations of held-out photographs. With --minutes there are ten more, but those that
+    would take more than a twentieth of the time are left out, except with --until-psnr."""
     save_every: float = 30.0
     """Seconds of fitting that a run may lose when it is killed."""
     tensorboard: bool = False
@@ -80,8 +81,7 @@ def run(options: Options) -> int:
             cameras=options.cameras,
             eval_cameras=options.eval_cameras,
         )
-        options = _with_scale(options, photographs, notes, console)
-        photographs = smaller(photographs, options.scale or 1.0)
+        photographs = _at_scale(photographs, options.scale, notes, console)
         chosen, held_out = split(photographs, options.test_every)
         if options.until_psnr is not None and not len(held_out):
             raise ValueError("--until-psnr: nothing is held out to judge by; see --test-every")
@@ -101,8 +101,8 @@ def run(options: Options) -> int:
             run, progress = load_run(folder.resume, run, progress)
             notes.add(f"Resumed after {run.step} steps of an earlier run.")
         if options.minutes is not None:
-            width, height = photographs.sizes.max(0)
-            sizes = Sizes(config, (int(width), int(height)), budget, progress, notes, console)
+            width, height = photographs.sizes[photographs.sizes.prod(1).argmax()].tolist()
+            sizes = Sizes(config, (width, height), budget, progress, notes, console)
             problem = problem._replace(shrink=sizes)
         board = TensorBoard(folder.path, progress.rows) if options.tensorboard else None
         judged = [(photographs.names[i], frames[i]) for i in held_out]
@@ -154,18 +154,17 @@ def run(options: Options) -> int:
     return exit_code(stopped)
 
 
-def _with_scale(options: Options, photographs: Photographs, notes: Notes, console: Console) -> Options:
-    """The options with the size of photographs, if they leave it open."""
-    if options.scale is None:
-        scale = moderate_scale(photographs)
-        options = replace(options, scale=scale)
-        if scale < 1:
-            width, height = photographs.sizes.max(0)
-            smaller_size = f"{round(scale * width)}x{round(scale * height)}"
-            words = f"photographs of {width}x{height} are fitted at {smaller_size}; for more, give --scale"
-            console.print(words, soft_wrap=True)
-            notes.add(f"P{words[1:]}.")
-    return options
+def _at_scale(photographs: Photographs, scale: float | None, notes: Notes, console: Console) -> Photographs:
+    """The photographs at the size of the fit; it is said if that is smaller and nobody asked for it."""
+    scaled = smaller(photographs, scale)
+    if scale is None and (shrunk := (scaled.sizes < photographs.sizes).any(1)).any():
+        largest = int(photographs.sizes.prod(1).argmax())
+        before, after = ("{}x{}".format(*of.sizes[largest]) for of in (photographs, scaled))
+        of_all = "" if shrunk.all() else f" ({shrunk.sum()} of {len(shrunk)} are so large)"
+        words = f"photographs of {before} are fitted at {after}{of_all}; for more, give --scale"
+        console.print(words, soft_wrap=True)
+        notes.add(f"P{words[1:]}.")
+    return scaled
 
 
 def _fitted(
@@ -192,16 +191,18 @@ def _fitted(
         """The share of the fit that is done: of its steps or of their time, whichever is larger."""
         return max(step / steps, budget.share)
 
+    shrink = problem.shrink  # asked for a row, `Sizes` must not go on to the next size
+    shown = (lambda _: shrink.now) if isinstance(shrink, Sizes) else shrink
     ticks = drive(method, problem, run, progress=(lambda step: 1.0) if is_met(run) else share)
     watch(
         ticks,
         progress,
-        schedule_of(steps, problem.shrink, progress),
+        schedule_of(steps, shown, progress),
         folder,
         ending.console,
         budget=budget,
         save_every=options.save_every,
-        evaluate=Evaluation(judge, some_of(judged), options.judge_every, steps, budget),
+        evaluate=Evaluation(judge, some_of(judged), options.judge_every, steps, goal is not None, budget),
         enough=lambda now, row: row["test_psnr"] is not None and is_met(now.run),
         listeners=() if board is None else (board.add,),
     )

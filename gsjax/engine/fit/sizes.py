@@ -45,6 +45,11 @@ class Sizes:
         self._resumed, coarse = bool(progress.rows), config.coarse_until
         self._times = [t for t in (coarse / 3, coarse, (1 + coarse) / 2) if coarse]
 
+    @property
+    def now(self) -> int:
+        """The present factor; 0 before the first step."""
+        return self._now
+
     def __call__(self, progress: float) -> int:
         if not self._now:
             self._now = self._first()

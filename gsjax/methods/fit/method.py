@@ -46,7 +46,7 @@ class Problem(NamedTuple):
     """
 
     frames: list[Frame]
-    shares: Float[np.ndarray, "n"] | None
+    shares: Float[np.ndarray, "n 2"] | None
     extent: Extent
     background: tuple[float, float, float] | None
     start: str

@@ -8,7 +8,7 @@ from gsjax.scene.frame import Frame
 
 _MOST = 2  # sizes; upright and lying photographs stay apart
 _WASTE = 0.25  # of all pixels, that a second size must save
-_MANY = 64  # sizes, of which near ones are joined first
+_CELLS = 8  # along each axis of the grid on which near sizes are joined first, if there are more than cells
 
 
 def common_sizes(sizes: Int[np.ndarray, "n 2"]) -> Int[np.ndarray, "n 2"]:
@@ -21,8 +21,8 @@ def common_sizes(sizes: Int[np.ndarray, "n 2"]) -> Int[np.ndarray, "n 2"]:
         sizes: width and height of each photograph, pixels.
     """
     found = np.array(sizes)
-    if len(np.unique(found, axis=0)) > _MANY:
-        grid = -(-found.max(0) // _MANY)
+    if len(np.unique(found, axis=0)) > _CELLS**2:
+        grid = -(-found.max(0) // _CELLS)
         found = np.minimum(-(-found // grid) * grid, found.max(0))
     while True:
         groups, counts = np.unique(found, axis=0, return_counts=True)
@@ -37,8 +37,9 @@ def common_sizes(sizes: Int[np.ndarray, "n 2"]) -> Int[np.ndarray, "n 2"]:
         found[belongs] = joined[one, other]
 
 
-def with_common_sizes(frames: list[Frame]) -> tuple[list[Frame], Float[np.ndarray, "n"] | None]:
-    """Photographs padded to common sizes, and the share of each that is not padding; None if none is padded.
+def with_common_sizes(frames: list[Frame]) -> tuple[list[Frame], Float[np.ndarray, "n 2"] | None]:
+    """Photographs padded to common sizes, and the shares of each one's width and height that are not padding;
+    None if none is padded. If one is padded, all have masks, so that one program serves them all.
 
     Args:
         frames: of one camera each, on the host.
@@ -48,7 +49,7 @@ def with_common_sizes(frames: list[Frame]) -> tuple[list[Frame], Float[np.ndarra
     if (common == sizes).all():
         return frames, None
     shown = [padded(frame, size) for frame, size in zip(frames, common, strict=True)]
-    return shown, sizes.prod(1) / common.prod(1)
+    return shown, sizes / common
 
 
 def sizes_of(frames: list[Frame]) -> list[tuple[int, int]]:
@@ -62,7 +63,7 @@ def _own_sizes(frames: list[Frame]) -> Int[np.ndarray, "n 2"]:
 
 
 def padded(frame: Frame, size: Int[np.ndarray, "2"]) -> Frame:
-    """A photograph padded on the right and below, where nothing counts.
+    """A photograph padded on the right and below, with a mask of what counts.
 
     Args:
         frame: of one camera, on the host.
@@ -71,8 +72,6 @@ def padded(frame: Frame, size: Int[np.ndarray, "2"]) -> Frame:
     width, height = (int(side) for side in size)
     camera = frame.cameras
     right, below = width - camera.width, height - camera.height
-    if not right and not below:
-        return frame
     sides = ((0, 0), (0, below), (0, right))
     mask = np.ones(frame.images.shape[:3], bool) if frame.masks is None else frame.masks
     return Frame(

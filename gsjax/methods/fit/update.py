@@ -35,7 +35,7 @@ class Batch(NamedTuple):
         progress: share of the fit that is done, 0 to 1, over which learning rates fall.
         radius: radius of the scene, the unit of learning rates and of the depth loss.
         plan: the render plan.
-        share: the share of the photograph that is not padding; None for all.
+        share: the shares of the picture's width and height that are not padding; None for all.
     """
 
     frame: Frame
@@ -44,7 +44,7 @@ class Batch(NamedTuple):
     progress: Float[Array, ""] | float
     radius: Float[Array, ""] | float
     plan: Plan
-    share: Float[Array, ""] | None = None
+    share: Float[Array, "2"] | None = None
 
 
 def fit_loss(config: FitConfig, extra_losses: ExtraLosses = ()) -> Callable:
@@ -54,7 +54,8 @@ def fit_loss(config: FitConfig, extra_losses: ExtraLosses = ()) -> Callable:
     Args:
         config: the weights.
         extra_losses: custom losses of the `Model`, its rendering, and the photograph; masked pixels are
-            rendered as photographed.
+            rendered as photographed. Photographs of many sizes are padded, and padding is masked: a mean over
+            pixels belongs over `frame.masks`, if there are any.
     """
 
     def loss(model: Model, batch: Batch, *, step: Any, key: Any):
@@ -64,7 +65,8 @@ def fit_loss(config: FitConfig, extra_losses: ExtraLosses = ()) -> Callable:
             viewmat = refined(camera.viewmat, model.twists, batch.view, radius)
             camera = eqx.tree_at(lambda c: c.viewmat, camera, viewmat)
         # Relative to half the image, so that one threshold suits images of any size.
-        nudges = model.nudges * jnp.array([camera.width / 2, camera.height / 2], model.nudges.dtype)
+        half = jnp.array([camera.width / 2, camera.height / 2], model.nudges.dtype)
+        nudges = model.nudges * (half if batch.share is None else half * batch.share)
         drawn = render(gaussians, camera, batch.plan, backgrounds=batch.background, means2d_offset=nudges)
         image = drawn.colors
         if model.exposures is not None:
@@ -74,7 +76,7 @@ def fit_loss(config: FitConfig, extra_losses: ExtraLosses = ()) -> Callable:
             image = jnp.where(frame.masks[..., None], image, target)
         value = photometric_loss(image, target, config.dssim_weight)
         if batch.share is not None:
-            value /= batch.share
+            value /= batch.share.prod()
         counted = 1.0 if frame.masks is None else frame.masks.mean()
         mse = jnp.square(image - target).mean() / counted
         if config.depth_weight and frame.depths is not None:
