@@ -1,12 +1,11 @@
 """Waiting: how long each command takes until its first update and in all, cold and warm, and why.
 
-    python -m benchmarks.starts --out runs/starts --only track fit
+    gsjax bench --starts --only track fit
 
 Every command runs in a process of its own: first with an empty cache of compiled programs (cold), then again
 (warm). The process listens to JAX's own events, which name each program that is traced, lowered and compiled.
 """
 
-import argparse
 import json
 import os
 import runpy
@@ -22,6 +21,7 @@ from rich.console import Console
 from rich.table import Table
 
 from gsjax.engine import machine
+from gsjax.engine.bench import Options
 from gsjax.engine.drive import UPDATE
 from gsjax.io.atomic import write_json
 
@@ -33,6 +33,7 @@ _STAGES = {
     "/jax/core/compile/backend_compile_duration": "compiling",
 }
 _HIT = "/jax/compilation_cache/cache_hits"
+PART = Path("runs/starts")
 _LISTED = 12  # programs in a record
 
 COMMANDS: dict[str, tuple[str, ...]] = {
@@ -119,7 +120,7 @@ def measure(name: str, out: Path, cache: Path, label: str) -> dict[str, Any]:
     words = [*arguments, "--out", str(run), "--overwrite"]
     environment = {k: v for k, v in os.environ.items() if k != "JAX_COMPILATION_CACHE_DIR"}
     environment["XDG_CACHE_HOME"] = str(cache)
-    command = [sys.executable, "-m", "benchmarks.starts", "--watch", str(record), str(time()), *words]
+    command = [sys.executable, "-m", "benchmarks.starts", str(record), str(time()), *words]
     log = out / f"{name}-{label}.log"
     begun = perf_counter()
     with log.open("w", encoding="utf-8") as file:
@@ -140,29 +141,33 @@ def print_table(records: dict[str, dict[str, dict[str, Any]]], console: Console)
     console.print(table)
 
 
-def main(arguments: Sequence[str]) -> int:
-    """Measure the starts of the chosen commands, and write starts.json."""
-    if arguments[:1] == ["--watch"]:
-        return watch(Path(arguments[1]), float(arguments[2]), arguments[3:])
-    parser = argparse.ArgumentParser(
-        prog="python -m benchmarks.starts", description=(__doc__ or "").split("\n")[0]
-    )
-    parser.add_argument("--only", nargs="+", choices=list(COMMANDS), default=list(COMMANDS))
-    parser.add_argument("--out", type=Path, default=Path("runs/starts"))
-    options = parser.parse_args(arguments)
-    out, console = options.out.absolute(), Console(width=None if sys.stdout.isatty() else 120)
+def run(options: Options) -> int:
+    """Measure the starts of the chosen commands, and write starts.json after each.
+
+    Raises:
+        ValueError: an option does not apply, or there is no such command.
+    """
+    given = [name for name in ("quick", "check", "update_baseline") if getattr(options, name)]
+    given += ["repeats"] if options.repeats is not None else []
+    if given:
+        raise ValueError(f"--{given[0].replace('_', '-')}: does not apply to --starts; leave it out")
+    if unknown := [name for name in options.only if name not in COMMANDS]:
+        raise ValueError(f"--only: expected commands of {', '.join(COMMANDS)}, found {unknown[0]}")
+    names = [name for name in COMMANDS if name in (options.only or COMMANDS)]
+    if "distill" in names and "fit" not in names:
+        names.insert(names.index("distill"), "fit")  # whose scene it learns on
+    out, console = (options.out or PART).absolute(), Console(width=None if sys.stdout.isatty() else 120)
     out.mkdir(parents=True, exist_ok=True)
     records: dict[str, dict[str, dict[str, Any]]] = {}
     with tempfile.TemporaryDirectory() as cache:
-        for name in options.only:
+        for name in names:
             records[name] = {}
             for label in ("cold", "warm"):
                 records[name][label] = measure(name, out, Path(cache), label)
             print_table({name: records[name]}, console)
-            about = machine.describe()
-            write_json(out / "starts.json", {"machine": about, "starts": records})
+            write_json(out / "starts.json", {"machine": machine.describe(), "starts": records})
     return 0
 
 
-if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+if __name__ == "__main__":  # `measure` starts it in a new process
+    sys.exit(watch(Path(sys.argv[1]), float(sys.argv[2]), sys.argv[3:]))

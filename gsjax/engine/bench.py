@@ -18,7 +18,11 @@ class Options(Common):
     """Options of `gsjax bench`."""
 
     only: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME [NAME ...]")] = ()
-    """Only these workloads: a name, its part before the first hyphen (garden), or a pattern (ball-1e6*)."""
+    """Only these workloads: a name, its part before the first hyphen (garden), or a pattern (ball-1e6*). With
+    --starts, only these commands."""
+    starts: bool = False
+    """Measure instead how long each command takes until its first update and in all: without and with
+    compiled programs from before. It takes ten minutes or so."""
     quick: bool = False
     """Use small scenes and few calls of each: under two minutes."""
     repeats: int | None = None
@@ -29,7 +33,7 @@ class Options(Common):
     """Save the measured figures as the baseline."""
     out: Path | None = None
     """Folder for bench.json, results.md and growth.png; default: benchmarks/results, which is committed, for
-    the whole suite, and runs/bench for a part of it."""
+    the whole suite, and runs/bench for a part of it. With --starts, for starts.json; default: runs/starts."""
 
 
 def run(options: Options) -> int:
@@ -46,4 +50,4 @@ def run(options: Options) -> int:
     folder = str(Path.cwd())
     if folder not in sys.path:  # a console script does not search the working directory
         sys.path.insert(0, folder)
-    return import_module("benchmarks.suite").run(options)
+    return import_module("benchmarks.starts" if options.starts else "benchmarks.suite").run(options)

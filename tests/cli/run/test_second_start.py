@@ -13,7 +13,7 @@ FIT = ("--fit.steps", "6", "--fit.cap", "60", "--fit.start.count", "50", "--fit.
 def start(tmp_path, name):
     """The record of a fit in a new process."""
     record, out = tmp_path / f"{name}.json", str(tmp_path / name)
-    watched = [sys.executable, "-m", "benchmarks.starts", "--watch", str(record), str(time())]
+    watched = [sys.executable, "-m", "benchmarks.starts", str(record), str(time())]
     command = [*watched, "fit", SCENE, "--out", out, *FIT, "--fit.growth.every", "2"]
     environment = {k: v for k, v in os.environ.items() if k != "JAX_COMPILATION_CACHE_DIR"}
     environment["XDG_CACHE_HOME"] = str(tmp_path / "cache")
