@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from functools import partial
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import equinox as eqx
 import jax
@@ -147,12 +147,17 @@ def gaussians_from_activated(
     count = np.shape(means)[0] if np.ndim(means) else None
     wanted = {"means": 3, "quats": 4, "scales": 3, "opacities": None, "colors": 3}
     arrays = dict(zip(wanted, (means, quats, scales, opacities, colors), strict=True))
-    arrays = {name: jnp.asarray(value, dtype) for name, value in arrays.items()}
+    arrays = {name: _on_device(value, dtype) for name, value in arrays.items()}
     for name, columns in wanted.items():
         _check_array(name, arrays[name], (count,) if columns is None else (count, columns))
     extra = {"shN": shN, "features": features}
-    extra = {name: None if value is None else jnp.asarray(value, dtype) for name, value in extra.items()}
+    extra = {name: None if value is None else _on_device(value, dtype) for name, value in extra.items()}
     return Gaussians(arrays["means"], arrays["quats"], *_raw(arrays), **extra)
+
+
+def _on_device(value: Any, dtype: Any) -> Array:
+    """An array of this type; what is on the host is converted there, without a program for each shape."""
+    return jnp.asarray(value if isinstance(value, jax.Array) else np.asarray(value, dtype), dtype)
 
 
 @jax.jit

@@ -25,14 +25,16 @@ _LOGIT = 2.0  # opacity logit of a new Gaussian
 
 
 def with_slots(scene: TrackedScene, slots: int) -> TrackedScene:
-    """The scene with empty slots after its moving Gaussians. Their label, K+1, is that of no object."""
+    """The scene with empty slots after its moving Gaussians. Their label, K+1, is that of no object. On the
+    host."""
     count, moving = scene.gaussians.num, scene.num_moving
-    rows = jnp.concatenate([jnp.arange(moving), jnp.zeros(slots, int), jnp.arange(moving, count)])
-    empty = (jnp.arange(count + slots) >= moving) & (jnp.arange(count + slots) < moving + slots)
+    rows = np.concatenate([np.arange(moving), np.zeros(slots, int), np.arange(moving, count)])
+    empty = (np.arange(count + slots) >= moving) & (np.arange(count + slots) < moving + slots)
+    labels = np.where(empty, scene.num_objects + 1, np.asarray(scene.labels)[rows])
     return TrackedScene(
-        gaussians=emptied(take(scene.gaussians, rows), empty),
-        normals=jnp.concatenate([scene.normals, jnp.zeros((slots, 3), scene.normals.dtype)]),
-        labels=jnp.where(empty, scene.num_objects + 1, scene.labels[rows]),
+        gaussians=emptied(take(scene.gaussians, rows), jnp.asarray(empty)),
+        normals=jnp.asarray(np.pad(scene.normals, ((0, slots), (0, 0)))),
+        labels=jnp.asarray(labels, scene.labels.dtype),
         label_ids=scene.label_ids,
         num_moving=moving + slots,
     )
