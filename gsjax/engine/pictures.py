@@ -2,6 +2,7 @@
 
 import contextlib
 from collections.abc import Iterable
+from concurrent.futures import Future, ThreadPoolExecutor
 
 import numpy as np
 from jaxtyping import Float
@@ -58,7 +59,7 @@ class Film:
             write_png(path, to_uint8(view.render))
 
     def score(self, views: Iterable[list[View]], scores: Scores, num_frames: int, console: Console) -> None:
-        """Score the views of all frames while they are filmed, and close the videos.
+        """Score and film the views of all frames, while the next frame is rendered, and close the videos.
 
         Args:
             views: those of all cameras, a list per frame.
@@ -66,12 +67,20 @@ class Film:
             num_frames: number of frames.
             console: shows the progress.
         """
-        with self, console.status("") as status:
+        judged: Future[None] | None = None
+        with self, console.status("") as status, ThreadPoolExecutor(1, "scoring") as worker:
             for frame in views:
                 status.update(f"rendering and scoring frame {frame[0].t + 1} of {num_frames}")
-                for view in frame:
-                    scores.add(view)
-                    self.add(view)
+                if judged is not None:
+                    judged.result()
+                judged = worker.submit(self._score, frame, scores)
+            if judged is not None:
+                judged.result()
+
+    def _score(self, frame: list[View], scores: Scores) -> None:
+        for view in frame:
+            scores.add(view)
+            self.add(view)
 
     def __enter__(self) -> "Film":
         return self
