@@ -47,9 +47,9 @@ options, if defaults depend on the arguments, and the arguments to parse."""
 
 
 def entry() -> None:
-    """The program. After Ctrl-C it exits without waiting for XLA, which may still be compiling in a thread
-    and would crash as Python shuts down. If its output is closed (`gsjax track --help | head`), it ends
-    quietly, with the code of a program that SIGPIPE ended."""
+    """The program. After Ctrl-C or an error it exits without waiting for XLA, which may still be compiling in
+    a thread and would crash as Python shuts down. If its output is closed (`gsjax track --help | head`), it
+    ends quietly, with the code of a program that SIGPIPE ended."""
     try:
         try:
             code = main()
@@ -58,7 +58,7 @@ def entry() -> None:
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # for the rest of the output
         code = 141
-    if code == 130:
+    if code not in (0, 3, 141):
         sys.stdout.flush()
         sys.stderr.flush()
         os._exit(code)

@@ -37,21 +37,21 @@ class Budget:
         self.rest_s: Callable[[float], float] = lambda most: most
         self._begun, self._steps, self._most = begun - _LOADING_S, begun, 0.0
 
+    def expect_more_than(self, earlier: float) -> None:
+        """Raises ValueError if the steps of the run to resume, in seconds, took all the time."""
+        if self.minutes is not None and earlier >= 60 * self.minutes:
+            raise ValueError(
+                f"--minutes {self.minutes:g}: the steps of the run to resume took {_clock(earlier)} already; "
+                "give more minutes, of which they count as a part"
+            )
+
     def begin_steps(self, earlier: float, console: Console) -> None:
         """The steps begin now, and what they may take is said.
 
         Args:
             earlier: seconds of steps in the run that is resumed; they count.
             console: to say it on.
-
-        Raises:
-            ValueError: there was no more time than those take.
         """
-        if self.minutes is not None and earlier >= 60 * self.minutes:
-            raise ValueError(
-                f"--minutes {self.minutes:g}: the steps of the run to resume took {_clock(earlier)} already; "
-                "give more minutes, of which they count as a part"
-            )
         self._begun -= earlier
         self._steps = perf_counter() - earlier
         if self.minutes is not None:

@@ -212,14 +212,16 @@ class RunFolder:
         with atomic_write(self.config) as temporary:
             temporary.write_text(f"{SIGNATURE}\n{text}", encoding="utf-8")
 
+    def setting(self, name: str) -> Any:
+        """A setting of config.yml."""
+        return _flat(yaml.safe_load(self.config.read_text(encoding="utf-8"))).get(name)
+
     def check_config(self, config: Any, *, but: tuple[str, ...]) -> None:
         """Raises ValueError if config.yml differs from `config` in settings other than `but`."""
         stored = _flat(yaml.safe_load(self.config.read_text(encoding="utf-8")))
         given = _flat(plain(dataclasses.asdict(config)))
         names = [n for n in dict.fromkeys([*given, *stored]) if n.split(".")[0] not in but]
         others = [name for name in names if stored.get(name) != given.get(name)]
-        if (stored.get("minutes") is None) != (given.get("minutes") is None):
-            others.append("minutes")  # more or fewer may follow; but steps are counted otherwise without any
         if others:
             words = [f"{n} {stored.get(n)!r}, now it is {given.get(n)!r}" for n in others]
             raise ValueError(

@@ -98,4 +98,4 @@ def _compiled(draw: Callable) -> Callable:
         groups = jnp.where(covered, jnp.argmax(rendered.features, axis=-1), 0)
         return (rendered.colors, depths, groups, covered), rendered.meta._replace(features=None)
 
-    return jit_once(drawn, f"{draw.__module__}.{draw.__qualname__}", compiler_options=host_options())
+    return jit_once(drawn, draw, compiler_options=host_options())

@@ -1,11 +1,16 @@
 """Traces kept on disk beside the compiled programs, so that the next process need not trace again."""
 
 import hashlib
+import os
 import re
 from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import fields, is_dataclass
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
+from time import time
+from types import FunctionType
 from typing import Any
 
 import jax
@@ -18,23 +23,25 @@ from gsjax.rasterize.sorting import CUSTOM_CALLS
 
 _MOST_FILES = 200  # half a megabyte each
 _TRACED_THROUGH = ("jax", "jaxlib", "equinox", "jaxlie", "lineax", "optax", "optimistix", "jaxopt")
-_VAGUE = re.compile(r" at 0x|\.\.\.|<lambda>|<locals>")  # reprs with addresses, omissions, no names
+_OURS = "gsjax"  # whose sources are known: what others define is never kept
+_VAGUE = re.compile(r" at 0x|\.\.\.")  # in the text of a tree: an address, or an omission
+_BEGUN = time()
 
 
 def jit_once(fun: Callable, closed_over: Any, **options: Any) -> Callable:
     """`jax.jit(fun, **options)`, traced once for all processes if `keep_programs` keeps compiled programs.
 
-    JAX caches what XLA compiles, but every process traces and lowers again to find it: 5 s for an update of
-    the tracker, of which reading the trace leaves 0.2 s. A trace belongs to the trees, shapes and types of
-    the arguments, to `closed_over`, and to the sources of gsjax, its libraries and JAX's configuration.
+    JAX caches what XLA compiles, but every process traces again to find it: an update of the tracker takes
+    5 s to trace, and 0.2 s to read. A trace belongs to the trees, shapes and types of the arguments, to
+    `closed_over`, and to the sources of gsjax, its libraries and JAX's configuration.
 
     Use it only for an outermost `jax.jit`: what is read can be neither differentiated nor mapped. Anywhere
     but on a single CPU device, and wherever a trace cannot be kept, `fun` is simply traced.
 
     Args:
         fun: a pure function of pytrees of arrays, without keyword arguments.
-        closed_over: all static values that `fun` closes over. They are told apart by their repr; a function
-            among them, which has no name in another process, means that nothing is kept.
+        closed_over: all static values that `fun` closes over: numbers, text, None, tuples, dicts, and
+            dataclasses and module-level functions of gsjax. With anything else, nothing is kept.
         options: those of `jax.jit`.
     """
     folder = jax.config.jax_compilation_cache_dir
@@ -46,7 +53,7 @@ def jit_once(fun: Callable, closed_over: Any, **options: Any) -> Callable:
         leaves, tree = jax.tree.flatten(args)
         types = [jax.typeof(leaf) for leaf in leaves]
         specs = [jax.ShapeDtypeStruct(t.shape, t.dtype, weak_type=t.weak_type) for t in types]
-        name = _name(fun, f"{closed_over!r} {tree} {specs}")
+        name = _name(fun, closed_over, f"{tree} {specs}")
         if name is None:
             return fun(*args)
         found = _read(traces / name) or _traced_and_kept(traces / name, fun, tree, specs)
@@ -62,20 +69,47 @@ def jit_once(fun: Callable, closed_over: Any, **options: Any) -> Callable:
     return jax.jit(traced, in_shardings=here, out_shardings=here, **options)
 
 
-def _name(fun: Callable, inputs: str) -> str | None:
-    """The file name of a trace, or None if the text of its inputs does not identify them."""
-    if _VAGUE.search(inputs):
+def _name(fun: Callable, closed_over: Any, inputs: str) -> str | None:
+    """The file name of a trace, or None if something in it may be another in the next process."""
+    static, sources = _described(closed_over), _sources()
+    if static is None or sources is None or not _is_ours(fun) or _VAGUE.search(inputs):
         return None
     settings = sorted(f"{name}={value!r}" for name, value in jax.config.values.items())
-    about = "\n".join((fun.__module__, fun.__qualname__, inputs, _sources(), *settings))
+    about = "\n".join((fun.__module__, fun.__qualname__, static, inputs, sources, *settings))
     return f"{hashlib.sha256(about.encode()).hexdigest()[:32]}.npz"
 
 
+def _described(value: Any) -> str | None:
+    """A static value as text that is equal only for equal values; None for what has no such text."""
+    if value is None or type(value) in (bool, int, float, str):
+        return repr(value)
+    if isinstance(value, FunctionType):
+        name = f"{value.__module__}.{value.__qualname__}"
+        return name if _is_ours(value) and "<" not in name else None
+    if isinstance(value, (tuple, dict)):
+        items = value.items() if isinstance(value, dict) else value
+        parts = [_described(item) for item in items]
+    elif is_dataclass(value) and _is_ours(type(value)):
+        parts = [_described((field.name, getattr(value, field.name))) for field in fields(value)]
+    else:
+        return None
+    texts = [part for part in parts if part is not None]
+    name = f"{type(value).__module__}.{type(value).__qualname__}"
+    return f"{name}({', '.join(texts)})" if len(texts) == len(parts) else None
+
+
+def _is_ours(value: Any) -> bool:
+    return value.__module__.split(".")[0] == _OURS
+
+
 @cache
-def _sources() -> str:
-    """What identifies the code that is traced: the sources of gsjax, and the versions of its libraries."""
+def _sources() -> str | None:
+    """What identifies the code that is traced: the sources of gsjax, and the versions of its libraries; None
+    if a source was changed since this process began, which may run it as it was."""
     digest, package = hashlib.sha256(), Path(__file__).resolve().parents[1]
     for file in sorted(package.rglob("*.py")):
+        if file.stat().st_mtime > _BEGUN:
+            return None
         digest.update(file.read_bytes())
     return " ".join((digest.hexdigest(), *map(_version, _TRACED_THROUGH)))
 
@@ -94,6 +128,7 @@ def _read(path: Path) -> tuple[jax.export.Exported, Any] | None:
     try:
         kept, _ = load_checkpoint(path)
         program = jax.export.deserialize(bytearray(kept["program"].tobytes()))
+        os.utime(path)  # those that are read least recently go first
     except (OSError, ValueError, KeyError, TypeError, ImportError):
         return None
     return program, jax.tree.structure(kept["results"])
@@ -116,10 +151,13 @@ def _traced_and_kept(
         numbered = jax.tree.unflatten(out_tree, [np.int32(i) for i in range(out_tree.num_leaves)])
         program = np.frombuffer(exported.serialize(), np.uint8)
         save_checkpoint(path, {"program": program, "results": numbered})
-        for old in sorted(path.parent.glob("*.npz"), key=lambda file: -file.stat().st_mtime)[_MOST_FILES:]:
-            old.unlink(missing_ok=True)
     except (OSError, ValueError, TypeError, ImportError, NotImplementedError):
         return None
+    with suppress(OSError):  # another process may do the same
+        for old in sorted(path.parent.glob("[!.]*.npz"), key=lambda file: -file.stat().st_mtime)[
+            _MOST_FILES:
+        ]:
+            old.unlink(missing_ok=True)
     found = _read(path)
     if found is None or found[1] != out_tree:  # a static value that a file does not keep as it was
         path.unlink(missing_ok=True)

@@ -89,6 +89,7 @@ def run(options: Options) -> int:
         progress = Progress({"frames, depth, masks, poses and features": data.digest()})
         if options.resume:
             run, progress = load_run(folder.resume, run, progress)
+            budget.expect_more_than(progress.used_seconds)
             notes.add(f"Resumed after {run.step} steps of an earlier run.")
             if (folder.path / "query").exists():
                 notes.warn(f"{folder.path / 'query'} answers a query of the earlier scene; query again")

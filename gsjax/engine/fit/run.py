@@ -87,19 +87,22 @@ def run(options: Options) -> int:
             raise ValueError("--until-psnr: nothing is held out to judge by; see --test-every")
         folder = RunFolder(options.out, overwrite=options.overwrite, resume=options.resume)
         settings = replace(options, dataset=located(options.dataset))
+        timed = options.fit == FitConfig(seed=options.fit.seed)  # with --minutes, they decide the steps
         if options.resume:
-            folder.check_config(settings, but=_MAY_CHANGE)
+            other = timed and (folder.setting("minutes") is None) != (options.minutes is None)
+            folder.check_config(settings, but=tuple({*_MAY_CHANGE} - ({"minutes"} if other else set())))
         frames, progress = read_frames(photographs, console), Progress()
         fitted = [frames[i] for i in chosen]
         config, cloud = start_from(photographs, fitted, options.fit, console)
-        if options.minutes is not None and options.fit == FitConfig(seed=options.fit.seed):
+        if options.minutes is not None and timed:
             config = replace(config, steps=_UNLIMITED)
         method = Fit(config)
         problem, run = method.start(fitted, cloud, photographs.background)
-        folder.write_config(settings)  # from here on an earlier run is gone
         if options.resume:
             run, progress = load_run(folder.resume, run, progress)
+            budget.expect_more_than(progress.used_seconds)
             notes.add(f"Resumed after {run.step} steps of an earlier run.")
+        folder.write_config(settings)  # from here on an earlier run is gone
         if options.minutes is not None:
             width, height = photographs.sizes[photographs.sizes.prod(1).argmax()].tolist()
             sizes = Sizes(config, (width, height), budget, progress, notes, console)
@@ -160,8 +163,8 @@ def _at_scale(photographs: Photographs, scale: float | None, notes: Notes, conso
     if scale is None and (shrunk := (scaled.sizes < photographs.sizes).any(1)).any():
         largest = int(photographs.sizes.prod(1).argmax())
         before, after = ("{}x{}".format(*of.sizes[largest]) for of in (photographs, scaled))
-        of_all = "" if shrunk.all() else f" ({shrunk.sum()} of {len(shrunk)} are so large)"
-        words = f"photographs of {before} are fitted at {after}{of_all}; for more, give --scale"
+        some = "" if shrunk.all() else f" ({shrunk.sum()} of {len(shrunk)} are so large)"
+        words = f"photographs of {before} are fitted at {after}{some}; for more, give --scale"
         console.print(words, soft_wrap=True)
         notes.add(f"P{words[1:]}.")
     return scaled

@@ -18,15 +18,19 @@ class Rehearsal:
         first: the first frame, which also stands for the second.
         config: settings of the tracker.
         budgeted: whether the settings will be chosen for a budget.
+        needed: whether there will be an update at all.
     """
 
     first: Frame
     config: TrackConfig
     budgeted: bool = False
+    needed: bool = True
     _job: Future | None = field(default=None, init=False)
 
     def begin(self, scene: TrackedScene) -> None:
         """Begin on a thread of its own."""
+        if not self.needed:
+            return
         config = first_rung(self.config, len(self.first.images)) if self.budgeted else self.config
         executor = ThreadPoolExecutor(1, thread_name_prefix="rehearsal")
         self._job = executor.submit(first_update, scene, self.first, config)

@@ -91,7 +91,9 @@ def run(options: Options) -> int:
         folder.write_config(settings)  # from here on an earlier run is gone
         seconds = {"preparing": perf_counter() - begun}
         first = recording.tracked.frame(0)
-        rehearsal = Rehearsal(first, options.track, options.budget_ms is not None)
+        rehearsal = Rehearsal(
+            first, options.track, options.budget_ms is not None, needed=recording.tracked.num_frames > 1
+        )
         if options.resume:
             tracking = load(folder.resume, options.track)
             notes.add(f"Resumed after {tracking.resumed} frames of an earlier run.")
@@ -100,7 +102,9 @@ def run(options: Options) -> int:
                 scene, seconds["start"] = _start(recording, mask, rehearsal, console, notes)
             tracking = begin(scene)
         saver = Saver(folder.resume, tracking.resumed)
+        drawing = perf_counter()
         draw_ahead(recording, console)
+        seconds["preparing"] += perf_counter() - drawing
         loop = {"budget_ms": options.budget_ms, "like": rehearsal.tick, "saved": saver}
         follow(tracking, first, recording.tracked, options.track, console, **loop)
         seconds |= tracking.seconds()

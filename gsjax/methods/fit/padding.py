@@ -22,8 +22,10 @@ def common_sizes(sizes: Int[np.ndarray, "n 2"]) -> Int[np.ndarray, "n 2"]:
     """
     found = np.array(sizes)
     if len(np.unique(found, axis=0)) > _CELLS**2:
-        grid = -(-found.max(0) // _CELLS)
-        found = np.minimum(-(-found // grid) * grid, found.max(0))
+        cells = sizes // -(-sizes.max(0) // _CELLS)
+        for cell in np.unique(cells, axis=0):
+            there = (cells == cell).all(1)
+            found[there] = sizes[there].max(0)
     while True:
         groups, counts = np.unique(found, axis=0, return_counts=True)
         pixels = groups.prod(1) * counts

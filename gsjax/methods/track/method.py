@@ -60,8 +60,8 @@ class Track:
         Args:
             scene: from `start_scene` or `scene_from_shapes`.
             first: the frame that it shows, of all cameras.
-            like: an earlier run of a scene of the same shapes, whose plans are used again. A plan that is too
-                small grows at the first update.
+            like: an earlier run of a scene of the same shapes, whose plans are used again if they hold this
+                one.
         """
         if self.config.grow.slots and first.depths is not None:
             scene = with_slots(scene, self.config.grow.slots)
@@ -74,7 +74,10 @@ class Track:
             plan = plan_tracker(params.scene, params.pose, frame, self.config)
         else:
             plan = like.plans[PLAN]
-        state = _first_look(self.config)(params, TrackBatch(frame, plan))
+        state, overflow = _first_look(self.config)(params, TrackBatch(frame, plan))
+        if overflow:
+            plan = plan_tracker(params.scene, params.pose, frame, self.config)
+            state, _ = _first_look(self.config)(params, TrackBatch(frame, plan))
         kept = Kept(matching_reduction(params.scene, frame, self.config))
         return shape_of(frame), Run(params, state, 0, {PLAN: plan}, kept)
 

@@ -6,7 +6,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Key
+from jaxtyping import Array, Bool, Key
 
 from gsjax.losses.extra import ExtraLosses, named_losses
 from gsjax.methods.track.config import TrackConfig
@@ -131,8 +131,9 @@ def track_step(
     return Step(partial(blank_state, config=config, shape=shape), update)
 
 
-def first_look(params: Tracked, batch: TrackBatch, config: TrackConfig) -> TrackState:
-    """The state after the frame that `params` shows, from which the step continues.
+def first_look(params: Tracked, batch: TrackBatch, config: TrackConfig) -> tuple[TrackState, Bool[Array, ""]]:
+    """The state after the frame that `params` shows, from which the step continues, and whether the plan was
+    too small, so that parts are missing in it.
 
     Args:
         params: the scene and the pose of its objects in this frame.
@@ -142,15 +143,21 @@ def first_look(params: Tracked, batch: TrackBatch, config: TrackConfig) -> Track
     frame, _ = prepared(batch.frame, config)
     nowhere = Motion(jnp.zeros((scene.num_objects, 6), pose.means.dtype), jnp.zeros_like(pose.means))
     views = reduced(frame.cameras, config.coarseness)
-    backdrop = draw_backdrop(scene, views, plan.full)[0] if config.redraw == "moving" else None
-    shown, _ = show(scene, pose, frame, backdrop, plan, config)
+    if config.redraw == "moving":
+        backdrop, behind = draw_backdrop(scene, views, plan.full)
+        shown, moving = show(scene, pose, frame, backdrop, plan, config)
+        overflow = (behind > plan.full.capacity) | (moving > plan.near.capacity)
+    else:
+        backdrop = None
+        shown, needed = show(scene, pose, frame, backdrop, plan, config)
+        overflow = needed > plan.full.capacity
     images = tone_images(frame, config.align.shading)
     pixels, unexplained_pixels = pixels_shown(shown, images, scene.num_objects, config)
     reference = reference_points(scene, pose, config.align)
     centers = group_means(pose.means, scene.groups, scene.num_objects)
     facing = all_points_facing(reference, nowhere.twists, centers, images)
     coverage = group_confidence(facing, images, config.start.depth_gap).coverage
-    return TrackState(
+    state = TrackState(
         nowhere,
         pixels,
         first_keyframe(pixels),
@@ -160,3 +167,4 @@ def first_look(params: Tracked, batch: TrackBatch, config: TrackConfig) -> Track
         jnp.int32(0),
         *memory_of(shown, backdrop, frame, config),
     )
+    return state, overflow

@@ -98,9 +98,6 @@ def test_a_run_from_photographs_to_a_report_and_one_that_was_stopped(gsjax_fit, 
     code, said = gsjax_fit(*QUICK, "--resume", "--fit.seed", "5", name="stopped")
     assert code == 2
     assert "was started with fit.seed 0, now it is 5. Use the same" in " ".join(said.split())
-    code, said = gsjax_fit(*QUICK, "--resume", "--minutes", "3", name="stopped")
-    assert code == 2
-    assert "was started with minutes None, now it is 3.0. Use the same" in " ".join(said.split())
     code, said = gsjax_fit(*QUICK, name="stopped")
     assert code == 2
     assert "an unfinished run; continue it with --resume" in " ".join(said.split())

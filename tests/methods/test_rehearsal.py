@@ -1,0 +1,55 @@
+"""An update that is compiled while the first scene is fitted is the update of the fitted scene."""
+
+from dataclasses import replace
+
+import jax
+import numpy as np
+import pytest
+
+from gsjax.engine.track.rehearsal import Rehearsal
+from gsjax.engine.track.tracking import track
+from gsjax.methods.track import PLAN, Track, TrackConfig
+
+CONFIG = TrackConfig()
+
+
+@pytest.fixture(scope="module")
+def rehearsed(table, started):
+    """The first frames, and a rehearsal on the scene that they show."""
+    _, frames, _ = table()
+    rehearsal = Rehearsal(frames[0], CONFIG)
+    rehearsal.begin(started)
+    return frames, rehearsal
+
+
+def test_poses_are_those_without_a_rehearsal_and_nothing_is_compiled(rehearsed, started):
+    frames, rehearsal = rehearsed
+    assert rehearsal.tick() is not None
+    (with_one,) = track(started, frames[0], frames[1:2], CONFIG, like=rehearsal.tick)
+    assert with_one.compile_seconds == 0
+    (without,) = track(started, frames[0], frames[1:2], CONFIG)
+    for one, other in zip(*map(jax.tree.leaves, (with_one.result.pose, without.result.pose)), strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+def test_a_plan_that_does_not_hold_the_scene_is_made_anew(rehearsed, started):
+    frames, rehearsal = rehearsed
+    method, run = Track(CONFIG), rehearsal.tick().run
+    plan = run.plans[PLAN]
+    small = replace(plan, full=replace(plan.full, capacity=16), near=replace(plan.near, capacity=16))
+    _, begun = method.start(started, frames[0], run.having(plans={PLAN: small}))
+    _, alone = method.start(started, frames[0])
+    assert begun.plans == alone.plans
+    for one, other in zip(*map(jax.tree.leaves, (begun.state, alone.state)), strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+def test_one_that_fails_or_is_not_needed_is_done_without(started, rehearsed):
+    frames, _ = rehearsed
+    assert Rehearsal(frames[0], CONFIG).tick() is None
+    unneeded = Rehearsal(frames[0], CONFIG, needed=False)
+    unneeded.begin(started)
+    assert unneeded.tick() is None
+    failing = Rehearsal(frames[0]._replace(images=frames[0].images[:1]), CONFIG)
+    failing.begin(started)
+    assert failing.tick() is None
