@@ -15,7 +15,8 @@ help: ## list the targets
 
 demo: $(VENV)/installed ## track the built-in scene from nothing to a report
 	@rm -rf $(RUN)
-	$(BIN)/gsjax track $(DEMO) --out $(RUN) --frames 0:30 --cameras 0 1 --mask-camera 1 --eval-cameras 2
+	$(BIN)/gsjax track $(DEMO) --out $(RUN) --frames 0:30 --cameras 0 1 --mask-camera 1 --eval-cameras 2 \
+	  --track.start.iterations 60
 
 # Two workers at most: XLA compiles on several threads by itself. A file stays with one worker, so what one
 # of its tests compiled serves the next.

@@ -38,10 +38,10 @@ _LISTED = 12  # programs in a record
 
 COMMANDS: dict[str, tuple[str, ...]] = {
     "track": ("track", _TABLE, "--frames", "0:30", "--cameras", "0", "1", "--mask-camera", "1",
-              "--eval-cameras", "2"),
+              "--eval-cameras", "2", "--track.start.iterations", "60"),
     "live": ("live", _TABLE, "--cameras", "0", "1", "--mask-camera", "1", "--minutes", "0.05"),
     "fit": ("fit", _TABLE, "--frames", "0:1", "--test-every", "0", "--fit.steps", "20"),
-    "parts": ("parts", "simulated:articulated?width=160&height=120", "--frames", "0:3",
+    "parts": ("parts", "simulated:articulated?width=160&height=120", "--frames", "0:9:4",
               "--parts.refine.iterations", "0"),
     "distill": ("distill", "{fit}", "--distill.iterations", "10"),
     "deform": ("deform", _TISSUE, "--deform.iterations", "10"),

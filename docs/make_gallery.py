@@ -32,7 +32,7 @@ TISSUE = "simulated:tissue?width=160&height=128&frames=16"
 FURNITURE = "simulated:articulated?width=200&height=150&frames=10"
 COMMANDS = {
     "demo": f"track simulated:tabletop?width=240&height=180 --out {RUNS}/demo --frames 0:30 --cameras 0 1 "
-    "--mask-camera 1 --eval-cameras 2",
+    "--mask-camera 1 --eval-cameras 2 --track.start.iterations 60",
     "table": f"track {TABLE} --out {RUNS}/table",
     "table/field": f"distill {RUNS}/table --distill.iterations 150",
     "table/field/query": f"query {RUNS}/table/field can",

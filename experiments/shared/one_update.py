@@ -102,9 +102,8 @@ def update_of(
     centers = group_means(pose.means, jnp.asarray(groups), scene.num_objects)
     near_plan = plan_render(place(around, pose), last.cameras, headroom=CONFIG.headroom)
     batch = RefineBatch(around, frame, near_plan, pose, centers, tiles_to_pixels(tiles, last))
-    points = jax.jit(first_look, static_argnums=2)(
-        Tracked(scene, pose), TrackBatch(last, plan), CONFIG
-    ).pixels
+    look = jax.jit(first_look, static_argnums=2)
+    points = look(Tracked(scene, pose), TrackBatch(last, plan), CONFIG)[0].pixels
 
     truth = sequence.truth
     assert truth is not None

@@ -154,9 +154,8 @@ def _traced_and_kept(
     except (OSError, ValueError, TypeError, ImportError, NotImplementedError):
         return None
     with suppress(OSError):  # another process may do the same
-        for old in sorted(path.parent.glob("[!.]*.npz"), key=lambda file: -file.stat().st_mtime)[
-            _MOST_FILES:
-        ]:
+        newest = sorted(path.parent.glob("[!.]*.npz"), key=lambda file: -file.stat().st_mtime)
+        for old in newest[_MOST_FILES:]:
             old.unlink(missing_ok=True)
     found = _read(path)
     if found is None or found[1] != out_tree:  # a static value that a file does not keep as it was

@@ -56,6 +56,12 @@ def test_thirty_sizes_waste_little():
     assert common_sizes(sizes).prod(1).sum() < 1.45 * sizes.prod(1).sum()
 
 
+def test_a_hundred_sizes_and_a_large_one_waste_little():
+    near = np.random.default_rng(0).integers((1000, 700), (1080, 760), (100, 2))
+    sizes = np.concatenate([near, [[1600, 1200]]])
+    assert common_sizes(sizes).prod(1).sum() < 1.15 * sizes.prod(1).sum()
+
+
 def test_what_is_padded_does_not_count():
     frame = photograph(16, 12)
     wide = padded(frame, np.array([20, 15]))

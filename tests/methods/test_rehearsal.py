@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import equinox as eqx
 import jax
 import numpy as np
 import pytest
@@ -50,6 +51,6 @@ def test_one_that_fails_or_is_not_needed_is_done_without(started, rehearsed):
     unneeded = Rehearsal(frames[0], CONFIG, needed=False)
     unneeded.begin(started)
     assert unneeded.tick() is None
-    failing = Rehearsal(frames[0]._replace(images=frames[0].images[:1]), CONFIG)
+    failing = Rehearsal(eqx.tree_at(lambda f: f.images, frames[0], frames[0].images[:1]), CONFIG)
     failing.begin(started)
     assert failing.tick() is None

@@ -46,7 +46,7 @@ def test_a_blank_state_has_the_form_that_a_first_look_fills(table, started, conf
     tracker = Track(config)
     shape, run = tracker.start(started, frames[0])
     batch = TrackBatch(frames[0], run.plans[PLAN])
-    seen = jax.eval_shape(partial(first_look, config=config), run.params, batch)
+    seen, _ = jax.eval_shape(partial(first_look, config=config), run.params, batch)
     blank = jax.eval_shape(tracker.step(shape).init, run.params)
     assert jax.tree.structure(blank) == jax.tree.structure(seen)
     for one, other in zip(jax.tree.leaves(blank), jax.tree.leaves(seen), strict=True):

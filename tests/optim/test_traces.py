@@ -1,5 +1,6 @@
 """Traces on disk: read back as they were, told apart, and done without where they cannot be kept."""
 
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import equinox as eqx
@@ -9,6 +10,7 @@ import numpy as np
 import pytest
 
 from gsjax.io import checkpoints
+from gsjax.optim import traces
 from gsjax.optim.compiler import TRACES
 from gsjax.optim.traces import jit_once
 from gsjax.rasterize.plan import Plan
@@ -29,6 +31,7 @@ class Found(NamedTuple):
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
     """Where traces are kept during this test, also those with this module's types."""
+    monkeypatch.setattr(traces, "_OURS", __name__.split(".")[0])
     libraries = (*checkpoints._LIBRARIES, __name__.split(".")[0])
     monkeypatch.setattr(checkpoints, "_LIBRARIES", libraries)
     before = jax.config.jax_compilation_cache_dir
@@ -105,6 +108,48 @@ def test_plans_are_told_apart(folder):
     small, large = (Plan(width=16, height=16, capacity=capacity) for capacity in (1024, 2048))
     assert float(jitted(small, 1.0)) == 1025
     assert float(jit_once(slots, None)(large, 1.0)) == 2049
+
+
+@dataclass(frozen=True)
+class Weights:
+    """A configuration with a field that its repr leaves out."""
+
+    first: float = 1.0
+    second: float = field(default=1.0, repr=False)
+
+
+def test_configurations_are_told_apart_by_every_field(folder):
+    count = Counted()
+    for weights in (Weights(), Weights(second=2.0), Weights(2.0), Weights()):
+        weighted(count, weights)(1.0)
+    assert count.traced == 3
+
+
+def weighted(count, weights):
+    def product(x):
+        count.traced += 1
+        return x * weights.first * weights.second
+
+    return jit_once(product, weights)
+
+
+def test_what_others_define_is_not_kept_as_its_sources_are_unknown(folder, monkeypatch):
+    monkeypatch.setattr(traces, "_OURS", "gsjax")
+    count = Counted()
+    for _ in range(2):
+        weighted(count, Weights())(1.0)
+    assert count.traced == 2
+    assert not list(folder.iterdir())
+
+
+def test_nothing_is_kept_of_sources_that_change_meanwhile(folder, monkeypatch):
+    monkeypatch.setattr(traces, "_BEGUN", 0.0)  # as if all files were saved after the process began
+    traces._sources.cache_clear()
+    count = Counted()
+    for _ in range(2):
+        weighted(count, Weights())(1.0)
+    traces._sources.cache_clear()
+    assert count.traced == 2
 
 
 def test_functions_that_have_no_name_in_another_process_are_not_kept(folder):

@@ -27,9 +27,8 @@ class StartConfig:
     """Points further apart than this do not share a surface, metres."""
     depth_gap: float = 0.015
     """Tolerance between the depth of a point and the depth image that shows it, metres."""
-    iterations: int = 75
-    """Photometric optimisation steps on the first frame. Twice as many add 0.3 dB to the images, and nothing
-    to the tracking; `balanced` and above take them."""
+    iterations: int = 150
+    """Photometric optimisation steps on the first frame."""
 
     def __post_init__(self):
         sizes = ("object_pixels", "background_pixels", "max_extent", "part_size")
@@ -209,14 +208,13 @@ class TrackConfig:
 
 
 BALANCED = TrackConfig(
-    start=StartConfig(iterations=150),
     align=AlignConfig(iterations=6, pixels=128, centers=128, everywhere=None),
     grow=GrowConfig(candidates=64),
     coarseness=1,
 )
 ACCURATE = replace(
     BALANCED,
-    start=StartConfig(object_pixels=1.5, background_pixels=4.0, iterations=150),
+    start=StartConfig(object_pixels=1.5, background_pixels=4.0),
     align=replace(BALANCED.align, pixels=192, centers=256),
     grow=GrowConfig(candidates=256),
 )
