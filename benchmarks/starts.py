@@ -163,7 +163,7 @@ def run(options: Options) -> int:
         for name in names:
             records[name] = {}
             for label in ("cold", "warm"):
-                records[name][label] = measure(name, out, Path(cache), label)
+                records[name][label] = measure(name, out, Path(cache) / name, label)
             print_table({name: records[name]}, console)
             write_json(out / "starts.json", {"machine": machine.describe(), "starts": records})
     return 0

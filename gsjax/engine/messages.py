@@ -13,8 +13,8 @@ from rich.text import Text
 
 from gsjax.data.errors import DataWarning
 
-FITTING = "fitting the scene to the first frame, which takes half a minute to two"
-COMPILING = "compiling the update, which takes a minute or two the first time"
+FITTING = "fitting the scene to the first frame, and compiling meanwhile: a minute or two the first time"
+COMPILING = "compiling what is left of the update"
 MEASURING = "measuring what updates cost; each setting takes a minute or two to compile the first time"
 _PACKAGE = Path(__file__).parents[1]
 

@@ -61,7 +61,8 @@ class Options(Common, Overwriting, FirstMasks, Selection, SourceAndOut):
     """Options of `gsjax live`."""
 
     minutes: float = 1.0
-    """How long to follow, once the scene is fitted and updates are compiled, which takes some minutes."""
+    """How long to follow, once the scene is fitted and updates are compiled, which takes a minute or two the
+    first time."""
     hz: float = 30.0
     """Frames per second of the replay, from which the budget is derived."""
     budget_ms: float | None = None
