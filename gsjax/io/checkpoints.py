@@ -45,11 +45,11 @@ def save_checkpoint(path: str | os.PathLike, tree: Any, metadata: Mapping[str, A
     Raises:
         TypeError: `tree` holds something else, such as a function, or JSON cannot hold `metadata`.
     """
-    arrays: dict[str, np.ndarray] = {}
+    encoded, arrays = encode(tree)
     header = {
         "format": _FORMAT,
         "version": import_module("gsjax").__version__,
-        "tree": _encoded(tree, "", arrays),
+        "tree": encoded,
         "metadata": dict(metadata or {}),
         "sha256": _checksum(arrays),
     }
@@ -83,6 +83,15 @@ def load_metadata(path: str | os.PathLike) -> dict[str, Any]:
         CheckpointError: the file is damaged.
     """
     return _read(Path(path))[1]["metadata"]
+
+
+def encode(tree: Any) -> tuple[Any, dict[str, np.ndarray]]:
+    """A tree as JSON, equal for equal trees, and its arrays by their paths.
+
+    Args, raises: as `save_checkpoint`.
+    """
+    arrays: dict[str, np.ndarray] = {}
+    return _encoded(tree, "", arrays), arrays
 
 
 def _encoded(node: Any, path: str, arrays: dict[str, np.ndarray]) -> Any:

@@ -1,11 +1,11 @@
 """Traces kept on disk beside the compiled programs, so that the next process need not trace again."""
 
 import hashlib
+import json
 import os
 import re
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import fields, is_dataclass
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -17,7 +17,7 @@ import jax
 import jax.export
 import numpy as np
 
-from gsjax.io.checkpoints import load_checkpoint, save_checkpoint
+from gsjax.io.checkpoints import encode, load_checkpoint, save_checkpoint
 from gsjax.optim.compiler import TRACES
 from gsjax.rasterize.sorting import CUSTOM_CALLS
 
@@ -40,8 +40,8 @@ def jit_once(fun: Callable, closed_over: Any, **options: Any) -> Callable:
 
     Args:
         fun: a pure function of pytrees of arrays, without keyword arguments.
-        closed_over: all static values that `fun` closes over: numbers, text, None, tuples, dicts, and
-            dataclasses and module-level functions of gsjax. With anything else, nothing is kept.
+        closed_over: all static values that `fun` closes over: a module-level function of gsjax, or what
+            `save_checkpoint` takes, without arrays. With anything else, nothing is kept.
         options: those of `jax.jit`.
     """
     folder = jax.config.jax_compilation_cache_dir
@@ -81,21 +81,14 @@ def _name(fun: Callable, closed_over: Any, inputs: str) -> str | None:
 
 def _described(value: Any) -> str | None:
     """A static value as text that is equal only for equal values; None for what has no such text."""
-    if value is None or type(value) in (bool, int, float, str):
-        return repr(value)
     if isinstance(value, FunctionType):
         name = f"{value.__module__}.{value.__qualname__}"
         return name if _is_ours(value) and "<" not in name else None
-    if isinstance(value, (tuple, dict)):
-        items = value.items() if isinstance(value, dict) else value
-        parts = [_described(item) for item in items]
-    elif is_dataclass(value) and _is_ours(type(value)):
-        parts = [_described((field.name, getattr(value, field.name))) for field in fields(value)]
-    else:
+    try:
+        encoded, arrays = encode(value)
+    except TypeError:
         return None
-    texts = [part for part in parts if part is not None]
-    name = f"{type(value).__module__}.{type(value).__qualname__}"
-    return f"{name}({', '.join(texts)})" if len(texts) == len(parts) else None
+    return None if arrays else json.dumps(encoded)
 
 
 def _is_ours(value: Any) -> bool:

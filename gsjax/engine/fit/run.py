@@ -89,8 +89,9 @@ def run(options: Options) -> int:
         settings = replace(options, dataset=located(options.dataset))
         timed = options.fit == FitConfig(seed=options.fit.seed)  # with --minutes, they decide the steps
         if options.resume:
-            other = timed and (folder.setting("minutes") is None) != (options.minutes is None)
-            folder.check_config(settings, but=tuple({*_MAY_CHANGE} - ({"minutes"} if other else set())))
+            differ = timed and (folder.setting("minutes") is None) != (options.minutes is None)
+            may_change = [name for name in _MAY_CHANGE if not (differ and name == "minutes")]
+            folder.check_config(settings, but=tuple(may_change))
         frames, progress = read_frames(photographs, console), Progress()
         fitted = [frames[i] for i in chosen]
         config, cloud = start_from(photographs, fitted, options.fit, console)
