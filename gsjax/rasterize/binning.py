@@ -3,7 +3,7 @@
 Gaussians are ranked by depth. Each is expanded to the rows of tiles that its ellipse crosses, and in every
 row to the range of columns that it covers; so the number of pairs is known before they are laid out: every
 tile where it reaches alpha_min at a pixel's centre, and a few between centres or within rounding. Pairs are
-sorted by (tile, rank). Lists can have any length: only their total is bounded.
+then sorted by tile, stably. Lists can have any length: only their total is bounded.
 """
 
 from typing import NamedTuple
@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float, Int
 from gsjax.rasterize.lanes import slots
 from gsjax.rasterize.plan import Plan
 from gsjax.rasterize.projection import Projected
-from gsjax.rasterize.sorting import argsort_keys, repeat, running_sum, sort_keys
+from gsjax.rasterize.sorting import argsort_keys, lists, repeat, running_sum
 
 _TOO_MANY = 2**30  # above this an int32 running sum is no longer trusted
 _COUNTED = 2**16  # rows that are counted together when a plan is made
@@ -52,19 +52,24 @@ def bin_gaussians(projected: Projected, tile_mask: Bool[Array, "tiles"] | None, 
     rows = total(num_rows)
     enough_rows = rows <= plan.capacity // 2
     num_rows = jnp.where(enough_rows, num_rows, 0)
-    laid_out = _lay_out(by_depth, first_row, num_rows, plan)
-    spans = _spans(projected, tile_mask, laid_out, slots(plan.capacity // 2), laid_out.starts, plan)
+    in_order = [column[by_depth] for column in _ellipses(projected)]
+    laid_out = _lay_out(in_order, first_row, num_rows, plan)
+    slot = slots(plan.capacity // 2)
+    rank = _rank_of(slot, laid_out.starts, plan)
+    spans = _spans(tile_mask, laid_out, slot, rank, plan)
     pairs = total(spans.count)
     overflow = ~enough_rows | (pairs > plan.capacity)
     needed = jnp.where(enough_rows, jnp.maximum(pairs, 2 * rows), _bounding_pairs(projected, plan))
     count = jnp.where(overflow, 0, spans.count)  # a call that overflowed draws nothing and reports it
-    tiles, ids = _sorted_pairs(spans._replace(count=count), tile_mask, by_depth, plan)
-    edges = jnp.searchsorted(tiles, jnp.arange(plan.num_tiles + 1, dtype=tiles.dtype)).astype(jnp.int32)
+    entries = (a.ravel() for a in (spans.gaussian_rank, spans.first_tile, count))
+    ranks, edges = lists(*entries, len(by_depth), plan.num_tiles, slots(plan.capacity).size, plan.sort)
     counts = edges[1:] - edges[:-1]
+    if tile_mask is not None:
+        counts = jnp.where(tile_mask, counts, 0)
     if plan.max_per_tile is not None:
         counts = jnp.minimum(counts, plan.max_per_tile)
     return TileLists(
-        ids=ids,
+        ids=by_depth[ranks],
         starts=edges[:-1],
         counts=counts,
         pairs=counts.sum(dtype=jnp.int32),
@@ -87,13 +92,13 @@ def needed_capacity(
     first_row, num_rows = tile_rows(projected, tile_mask, plan)
     rows = total(num_rows)
     num_rows = jnp.where(rows > _TOO_MANY // 2, 0, num_rows)
-    unordered = jnp.arange(num_rows.shape[0], dtype=jnp.int32)
-    laid_out = _lay_out(unordered, first_row, num_rows, plan)
+    laid_out = _lay_out(_ellipses(projected), first_row, num_rows, plan)
 
     def count(state):
         first, pairs = state
-        begins = jnp.maximum(laid_out.starts - first, 0)
-        spans = _spans(projected, tile_mask, laid_out, slots(_COUNTED) + first, begins, plan)
+        slot = slots(_COUNTED)
+        rank = _rank_of(slot, jnp.maximum(laid_out.starts - first, 0), plan)
+        spans = _spans(tile_mask, laid_out, slot + first, rank, plan)
         more = pairs + spans.count.sum(dtype=jnp.int32)
         return first + _COUNTED, jnp.where(pairs > _TOO_MANY, jnp.iinfo(jnp.int32).max, more)
 
@@ -163,32 +168,36 @@ def _bounding_pairs(projected: Projected, plan: Plan) -> Int[Array, ""]:
 class _Rows(NamedTuple):
     """Rows of tiles of all Gaussians, one Gaussian after the other."""
 
-    gaussians: Int[Array, "n"]  # in the order in which they are laid out
-    first_row: Int[Array, "n"]  # of each
-    starts: Int[Array, "n"]  # where its rows start
+    ellipses: list[Float[Array, "n"]]  # from `_ellipses`, in the order in which rows are laid out
+    shift: Int[Array, "n"]  # a slot's row of tiles is the slot plus this
+    starts: Int[Array, "n"]  # where each Gaussian's rows start
     total: Int[Array, ""]
 
 
-def _lay_out(gaussians, first_row, num_rows, plan: Plan) -> _Rows:
+def _lay_out(ellipses, first_row, num_rows, plan: Plan) -> _Rows:
     ends = running_sum(num_rows, plan.sort)
-    return _Rows(gaussians, first_row, ends - num_rows, ends[-1])
+    starts = ends - num_rows
+    return _Rows(ellipses, first_row - starts, starts, ends[-1])
 
 
-def _spans(projected: Projected, tile_mask, laid_out: _Rows, slot, begins, plan: Plan) -> _Spans:
+def _rank_of(slot, starts, plan: Plan):
+    """Which of the Gaussians, whose slots begin at `starts`, each of the consecutive slots belongs to."""
+    ranks = jnp.arange(starts.shape[0], dtype=jnp.int32)
+    return repeat(ranks, starts, slot.size, plan.sort).reshape(slot.shape)
+
+
+def _spans(tile_mask, laid_out: _Rows, slot, rank, plan: Plan) -> _Spans:
     """The columns that Gaussians cover in their rows.
 
     Args:
-        projected: the Gaussians.
         tile_mask: tiles that are drawn (default: all).
-        laid_out: their rows.
-        slot: consecutive ones of these rows.
-        begins: where each Gaussian's rows start among `slot`, 0 if before it.
+        laid_out: the rows of all Gaussians.
+        slot: some of these rows.
+        rank: which Gaussian each belongs to, in the order in which they are laid out.
         plan: options.
     """
-    ranks = jnp.arange(begins.shape[0], dtype=jnp.int32)
-    rank = repeat(ranks, begins, slot.size, plan.sort).reshape(slot.shape)
-    row = slot + (laid_out.first_row - laid_out.starts)[rank]
-    low, high = _columns_in_row(projected, laid_out.gaussians[rank], row, plan)
+    row = slot + laid_out.shift[rank]
+    low, high = _columns_in_row([column[rank] for column in laid_out.ellipses], row, plan)
     count = jnp.where(slot < laid_out.total, jnp.maximum(high - low, 0), 0)
     if tile_mask is not None:
         grid = tile_mask.reshape(plan.tiles_y, plan.tiles_x).astype(jnp.int32)
@@ -198,15 +207,14 @@ def _spans(projected: Projected, tile_mask, laid_out: _Rows, slot, begins, plan:
     return _Spans(gaussian_rank=rank, first_tile=row * plan.tiles_x + low, count=count)
 
 
-def _columns_in_row(projected: Projected, gaussian, row, plan: Plan):
+def _columns_in_row(ellipses, row, plan: Plan):
     """First column of tiles and one past the last where alpha reaches alpha_min at pixel centres of a row.
 
     The ellipse A dx^2 + 2 B dx dy + C dy^2 = t, t = 2 ln(o / alpha_min), reaches furthest to the right at
     dy = -(B/C) h_x, as a concave function of dy; so within a band of rows it does so at the nearest dy of the
     band, and likewise to the left. At dy it spans -(B/A) dy +- sqrt(t/A (1 - (dy/h_y)^2)).
     """
-    u, v, half_x, half_y, a, b, c, opacity = (column[gaussian] for column in _ellipses(projected))
-    # The rest is recomputed for each row: only gathers of existing arrays are fast.
+    u, v, half_x, half_y, a, b, c, opacity = ellipses
     tiny = jnp.finfo(a.dtype).tiny  # a conic with an underflowed entry is flat in that direction
     level = 2 * jnp.log(jnp.maximum(opacity / plan.alpha_min, 1.0))
     level = level * 1.0002 + 1e-3  # compositing decides exactly: rounding errs towards keeping pairs
@@ -234,36 +242,3 @@ def _ellipses(projected: Projected) -> list[Float[Array, "n"]]:
     """u, v, h_x, h_y, the conic's A, B, C and the opacity of every Gaussian."""
     columns = [projected.means2d, projected.extents, projected.conics]
     return [a[:, i] for a in columns for i in range(a.shape[1])] + [projected.opacities]
-
-
-def _sorted_pairs(spans: _Spans, tile_mask, by_depth, plan: Plan):
-    """(tile, Gaussian) of every pair, ordered by (tile, depth); unused slots hold the tile past the last."""
-    num_tiles, n = plan.num_tiles, by_depth.shape[0]
-    slot, count = slots(plan.capacity), spans.count.ravel()
-    ends = running_sum(count, plan.sort)
-    starts = ends - count
-
-    def of_slots(values):
-        return repeat(values.ravel(), starts, slot.size, plan.sort).reshape(slot.shape)
-
-    def is_used(tile):
-        used = slot < ends[-1]
-        if tile_mask is not None:
-            used &= tile_mask[jnp.minimum(tile, num_tiles - 1)]
-        return used
-
-    base = spans.first_tile - starts.reshape(spans.count.shape)
-    rank_bits = max(1, (n - 1).bit_length())
-    if rank_bits + num_tiles.bit_length() > 32:
-        rank, tile = of_slots(spans.gaussian_rank), of_slots(base) + slot
-        tile = jnp.where(is_used(tile), tile, num_tiles).ravel()
-        order = argsort_keys(tile.astype(jnp.uint32), plan.sort)
-        return tile[order], by_depth[rank.ravel()[order]]
-    # One key holds both. Sums modulo 2^32 are exact, since the key itself fits.
-    key = (base.astype(jnp.uint32) << rank_bits) + spans.gaussian_rank.astype(jnp.uint32)
-    key = of_slots(key) + (slot.astype(jnp.uint32) << rank_bits)
-    used = is_used((key >> rank_bits).astype(jnp.int32))
-    key = jnp.where(used, key, jnp.uint32(num_tiles << rank_bits))
-    key = sort_keys(key.ravel(), plan.sort).reshape(slot.shape)
-    rank = key & jnp.uint32((1 << rank_bits) - 1)
-    return (key >> rank_bits).astype(jnp.int32).ravel(), by_depth[rank.astype(jnp.int32)].ravel()

@@ -88,7 +88,7 @@ def _views(buffers) -> list[np.ndarray]:
 
 
 def _handler(work: Callable[..., None]) -> ctypes._CFuncPtr:
-    """`work(*inputs, output)` on numpy views, as a function that XLA can call."""
+    """`work(*inputs, *outputs)` on numpy views, as a function that XLA can call."""
 
     def called_by_xla(pointer):  # exceptions would be lost here, so all are caught, Ctrl-C included
         frame = pointer.contents
@@ -114,7 +114,7 @@ _HANDLERS: dict[str, Any] = {}  # kept alive: XLA holds their addresses
 
 
 def register(name: str, work: Callable[..., None]) -> bool:
-    """Register `work(*inputs, output)`, which fills the output, with XLA:CPU under this name.
+    """Register `work(*inputs, *outputs)`, which fills the outputs, with XLA:CPU under this name.
 
     Returns:
         Whether registration succeeded: another version of the interface may refuse it.
@@ -146,8 +146,14 @@ def _let_checkpoints_repeat_calls() -> None:
 _let_checkpoints_repeat_calls()
 
 
-def call(name: str, result: jax.ShapeDtypeStruct, *arguments: Array) -> Array:
-    """Call the function registered under this name on int32 and uint32 arrays; vmap adds leading axes."""
+def call(name: str, result: Any, *arguments: Array) -> Any:
+    """Call the function registered under this name on int32 and uint32 arrays; vmap adds leading axes.
+
+    Args:
+        name: as registered.
+        result: jax.ShapeDtypeStruct of the output, or one for each output.
+        *arguments: the inputs.
+    """
     # The work needs the interpreter. Effects are awaited before Python exits; otherwise a program that exits
     # during a call would hang. XLA cannot split effects over several devices: there, programs must wait.
     return jax.ffi.ffi_call(

@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gsjax.rasterize.binning import _sorted_pairs, _Spans, bin_gaussians, needed_capacity, total
+from gsjax.rasterize.binning import bin_gaussians, needed_capacity, total
 from gsjax.rasterize.plan import Plan
 from gsjax.rasterize.projection import project_gaussians
 
@@ -72,36 +72,6 @@ def test_only_tiles_of_the_mask_get_lists():
     mask = jnp.arange(PLAN.num_tiles) % 2 == 0
     masked = jax.jit(bin_gaussians, static_argnames="plan")(projected, mask, PLAN)
     np.testing.assert_array_equal(masked.counts, jnp.where(mask, lists.counts, 0))
-
-
-def in_order(spans, by_depth, tiles_x, tiles_y):
-    """`_sorted_pairs` of spans given as rows (rank, first tile, count), and the same by numpy."""
-    rank, first, count = np.array(spans).T
-    plan = Plan(8 * tiles_x, 8 * tiles_y, capacity=4096)
-    columns = (jnp.asarray(np.pad(a, (0, 2048 - len(a))), jnp.int32) for a in (rank, first, count))
-    sorted_pairs = jax.jit(_sorted_pairs, static_argnames="plan")
-    tile, ids = sorted_pairs(_Spans(*columns), None, jnp.asarray(by_depth, jnp.int32), plan)
-    pairs = [(t, r) for r, f, c in zip(rank, first, count, strict=True) for t in range(f, f + c)]
-    want = np.array(sorted(pairs))
-    np.testing.assert_array_equal(tile[: len(pairs)], want[:, 0])
-    np.testing.assert_array_equal(ids[: len(pairs)], by_depth[want[:, 1]])
-    np.testing.assert_array_equal(tile[len(pairs) :], plan.num_tiles)
-
-
-def test_keys_wider_than_32_bits_are_sorted_correctly():
-    # 1e6 Gaussians x 32,400 tiles need 35 bits, and without x64 there is no wider integer.
-    assert not jax.config.jax_enable_x64
-    rng = np.random.default_rng(0)
-    n = 1_000_000
-    rank = np.sort(rng.integers(0, n, 1000))
-    spans = np.stack([rank, rng.integers(0, 32_395, 1000), rng.integers(0, 5, 1000)], axis=1)
-    in_order(spans, rng.permutation(n), 240, 135)
-
-
-def test_keys_that_just_fit_32_bits_are_sorted_as_one():
-    n, num_tiles = 2**20, 63 * 65  # 20 + 12 bits, the tile of unused slots included
-    spans = [(3, num_tiles - 2, 2), (5, 0, 3), (n - 2, 0, 0), (n - 1, num_tiles - 2, 2)]
-    in_order(spans, np.arange(n)[::-1], 63, 65)
 
 
 def test_a_count_beyond_int32_saturates_instead_of_wrapping():

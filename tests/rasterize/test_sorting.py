@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gsjax.rasterize import host, sorting
-from gsjax.rasterize.sorting import argsort_keys, repeat, running_sum, sort_keys
+from gsjax.rasterize.sorting import argsort_keys, lists, repeat, running_sum
 
 SORTS = ("host", "device")
 
@@ -26,7 +26,6 @@ def test_the_host_sort_is_there():
 def test_both_ways_sort_as_numpy_does(seed, length, top):
     keys = np.random.default_rng(seed).integers(0, top, length, dtype=np.uint32)
     for where in SORTS:
-        np.testing.assert_array_equal(sort_keys(jnp.asarray(keys), where), np.sort(keys))
         order = argsort_keys(jnp.asarray(keys), where)
         assert order.dtype == jnp.int32
         np.testing.assert_array_equal(order, np.argsort(keys, kind="stable"))
@@ -52,13 +51,44 @@ def test_sums_wrap_alike():
     np.testing.assert_array_equal(running_sum(counts), running_sum(counts, "device"))
 
 
-@pytest.mark.parametrize("sort", [sort_keys, argsort_keys])
-def test_vmap_and_loops_sort_every_row(sort):
+def entries(seed, length, num_lists):
+    """Entries in random ranges of lists, some of them empty, and as many unused slots after them."""
+    rng = np.random.default_rng(seed)
+    firsts = rng.integers(0, num_lists, length)
+    counts = rng.integers(0, np.minimum(num_lists - firsts, 4) + 1)
+    items = np.sort(rng.integers(0, length + 1, length))
+    unused = np.zeros(length, int)
+    return [jnp.asarray(np.append(a, unused), jnp.int32) for a in (items, firsts, counts)]
+
+
+@given(st.integers(0, 2**32), st.sampled_from([0, 1, 17, 300]), st.sampled_from([0, 2**30]))
+def test_both_ways_list_what_a_loop_lists(seed, length, more_items):
+    """Also where an item and a list do not fit into 32 bits together."""
+    items, firsts, counts = map(np.asarray, given := entries(seed, length, 7))
+    which = np.concatenate([np.arange(f, f + c) for f, c in zip(firsts, counts, strict=True)] or [[]])
+    want = np.repeat(items, counts)[np.argsort(which, kind="stable")]
+    for where in SORTS:
+        listed, edges = lists(*given, length + 1 + more_items, 7, len(want) + 5, where)
+        assert listed.dtype == edges.dtype == jnp.int32
+        np.testing.assert_array_equal(listed[: len(want)], want)
+        assert ((listed >= 0) & (listed <= length)).all()
+        np.testing.assert_array_equal(np.diff(edges), np.bincount(which.astype(int), minlength=7))
+        assert (edges[0], edges[-1]) == (0, len(want))
+
+
+def test_vmap_and_loops_sort_every_row():
     rows = jax.random.bits(jax.random.key(0), (3, 4, 50), jnp.uint32) % 20
-    want = [[sort(row) for row in some] for some in rows]
-    np.testing.assert_array_equal(jax.jit(jax.vmap(jax.vmap(sort)))(rows), want)
-    _, scanned = jax.lax.scan(lambda c, some: (c, jax.vmap(sort)(some)), None, rows)
+    want = [[argsort_keys(row) for row in some] for some in rows]
+    np.testing.assert_array_equal(jax.jit(jax.vmap(jax.vmap(argsort_keys)))(rows), want)
+    _, scanned = jax.lax.scan(lambda c, some: (c, jax.vmap(argsort_keys)(some)), None, rows)
     np.testing.assert_array_equal(scanned, want)
+
+
+def test_vmap_lists_every_row():
+    rows = [jnp.stack(column) for column in zip(*(entries(seed, 30, 9) for seed in range(3)), strict=True)]
+    got = jax.vmap(lambda *row: lists(*row, 31, 9, 200))(*rows)
+    for i, row in enumerate(zip(*rows, strict=True)):
+        jax.tree.map(np.testing.assert_array_equal, [a[i] for a in got], list(lists(*row, 31, 9, 200)))
 
 
 def test_vmap_repeats_every_row():
@@ -89,10 +119,9 @@ def test_without_the_interface_xla_sorts(monkeypatch):
         raise RuntimeError("unknown version")
 
     monkeypatch.setattr(jax.ffi, "register_ffi_target", refuse)
-    with pytest.warns(UserWarning, match="gsjax sorts without numpy.*gsjax_sort: unknown version"):
-        assert not host.register("gsjax_sort", sorting._sort_into)
+    with pytest.warns(UserWarning, match="gsjax sorts without numpy.*gsjax_argsort: unknown version"):
+        assert not host.register("gsjax_argsort", sorting._argsort_into)
     monkeypatch.setattr(sorting, "_AVAILABLE", False)
-    np.testing.assert_array_equal(sort_keys(jnp.array([3, 1, 2], jnp.uint32)), [1, 2, 3])
     np.testing.assert_array_equal(argsort_keys(jnp.array([3, 1, 2], jnp.uint32)), [1, 2, 0])
 
 
@@ -102,9 +131,9 @@ def test_one_core_does_not_hang():
     program = (
         "import os; os.sched_setaffinity(0, list(os.sched_getaffinity(0))[:1])\n"
         "import jax, jax.numpy as jnp\n"
-        "from gsjax.rasterize.sorting import sort_keys\n"
+        "from gsjax.rasterize.sorting import argsort_keys\n"
         "keys = jnp.arange(2_000_000, dtype=jnp.uint32)\n"
-        "step = lambda i, k: sort_keys(k * jnp.uint32(747796405) + 1)\n"
+        "step = lambda i, k: argsort_keys(k * jnp.uint32(747796405) + 1).astype(jnp.uint32)\n"
         "run = jax.jit(lambda k: jax.lax.fori_loop(0, 3, step, k))\n"
         "jax.block_until_ready([run(keys + i) for i in range(3)])\n"
     )
@@ -115,9 +144,9 @@ def test_a_program_may_end_while_a_call_is_under_way():
     # The host's work needs the interpreter, which is gone by then unless the exit waits for it.
     program = (
         "import jax, jax.numpy as jnp\n"
-        "from gsjax.rasterize.sorting import sort_keys\n"
+        "from gsjax.rasterize.sorting import argsort_keys\n"
         "keys = jnp.arange(2_000_000, dtype=jnp.uint32)\n"
-        "step = lambda i, k: sort_keys(k * jnp.uint32(747796405) + 1)\n"
+        "step = lambda i, k: argsort_keys(k * jnp.uint32(747796405) + 1).astype(jnp.uint32)\n"
         "run = jax.jit(lambda k: jax.lax.fori_loop(0, 20, step, k))\n"
         "run.lower(keys).compile()(keys)\n"
     )
@@ -126,7 +155,7 @@ def test_a_program_may_end_while_a_call_is_under_way():
 
 def test_a_checkpoint_may_repeat_the_call():
     def last(x):
-        return x * sort_keys((x * 7919).astype(jnp.uint32) % 101)[-1].astype(x.dtype)
+        return x * argsort_keys((x * 7919).astype(jnp.uint32) % 101)[-1].astype(x.dtype)
 
     x = jnp.arange(50.0)
     wanted = jax.grad(lambda x: last(x).sum())(x)

@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool, Float, Int, Shaped
 from gsjax.geometry.cameras import Camera, unproject
 from gsjax.geometry.rotations import matrix_of
 from gsjax.methods.track.config import AlignConfig
-from gsjax.rasterize.sorting import sort_keys
+from gsjax.rasterize.sorting import argsort_keys
 from gsjax.scene.frame import Frame
 
 
@@ -112,15 +112,13 @@ def first_members(
     """
     count = groups.shape[0]
     visit = np.random.default_rng(0).permutation(count).astype(np.int32)
-    bits = max(1, (count - 1).bit_length())
     group = jnp.where((groups >= 1) & (groups <= num_groups), groups, num_groups + 1)[visit]
-    keys = (group.astype(jnp.uint32) << bits) | jnp.arange(count, dtype=jnp.uint32)
-    keys = sort_keys(keys, "host")
-    reference = jnp.arange(1, num_groups + 1, dtype=jnp.uint32) << bits
-    places = jnp.searchsorted(keys, reference)[:, None] + jnp.arange(per_group)
-    found = keys[jnp.minimum(places, count - 1)]
-    real = (places < count) & ((found >> bits) == jnp.arange(1, num_groups + 1, dtype=jnp.uint32)[:, None])
-    return jnp.asarray(visit)[found & jnp.uint32((1 << bits) - 1)], real
+    order = argsort_keys(group.astype(jnp.uint32))
+    reference = jnp.arange(1, num_groups + 1, dtype=group.dtype)
+    places = jnp.searchsorted(group[order], reference)[:, None] + jnp.arange(per_group)
+    found = order[jnp.minimum(places, count - 1)]
+    real = (places < count) & (group[found] == reference[:, None])
+    return jnp.asarray(visit)[found], real
 
 
 def pixel_counts(labels: Int[Array, "c h w"], num_groups: int) -> Float[Array, "k"]:
