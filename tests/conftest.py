@@ -51,8 +51,10 @@ hypothesis.settings.load_profile("gsjax")
 def forget_compiled():
     """A compiled program holds memory maps, of which Linux grants a process 65,530: too few for all tests."""
     yield
-    jax.clear_caches()
-    gc.collect()  # programs are in cycles
+    from gsjax.optim.compiler import forget_programs
+
+    if forget_programs(20_000):
+        gc.collect()  # programs are in cycles
 
 
 @pytest.fixture
