@@ -63,7 +63,7 @@ class Problem(NamedTuple):
     truth: np.ndarray  # the class of each Gaussian
     held_out: list[tuple[Any, np.ndarray]]  # camera and true mask of every sixth frame
     shape: FrameShape
-    first: Run  # of the tracker
+    first: Run  # of the tracker, before it has seen a frame
 
 
 @cache
@@ -133,7 +133,7 @@ def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
     random, cells = np.random.default_rng(seed), slice(shrink // 2, None, shrink)
     taught = [[noisy(one, options["wrong"], options["share"], random) for one in pair] for pair in p.masks]
     in_space, overlap = [], LabelOverlap()
-    for t in range(1, len(p.frames)):
+    for t in range(len(p.frames)):  # the tracker only looks at the first
         batch, key = TrackBatch(p.frames[t], p.first.plans["track"]), jax.random.key(t)
         given = batch, views, jnp.asarray(np.stack(taught[t])[:, cells, cells]), jnp.float32(t / 10), key
         state, info = step(state, *given)
@@ -146,12 +146,12 @@ def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
     assert step._cache_size() == 1  # nothing is compiled between frames
     ms, without_ms = durations(options["graph"], shrink, given)
     things = range(1, len(p.codebook))
-    late = in_space[WARM - 1 :]
+    late = in_space[WARM:]
     return {
         "iou": overlap.mean_iou(things),
         "iou_3d": np.mean(late),
         "least_iou_3d": min(late),
-        "early_iou_3d": np.mean(in_space[: WARM - 1]),
+        "early_iou_3d": np.mean(in_space[1:WARM]),
         "step_ms": ms,
         "times_without": ms / without_ms,
         "losses": [f"{k}: {np.asarray(v).mean():.4f}" for k, v in info.items() if k != "overflow"],

@@ -1,6 +1,7 @@
 """One update of the tracker as a problem with a known solution: a scene, the next images, the true motion."""
 
 from dataclasses import replace
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -13,12 +14,13 @@ from gsjax.data import Sequence
 from gsjax.methods.track import (
     PRESETS,
     StartConfig,
+    Track,
     TrackBatch,
     Tracked,
     TrackedScene,
-    first_look,
     first_pose,
     plan_tracker,
+    shape_of,
     start_scene,
 )
 from gsjax.methods.track.layers import render_labels
@@ -102,8 +104,9 @@ def update_of(
     centers = group_means(pose.means, jnp.asarray(groups), scene.num_objects)
     near_plan = plan_render(place(around, pose), last.cameras, headroom=CONFIG.headroom)
     batch = RefineBatch(around, frame, near_plan, pose, centers, tiles_to_pixels(tiles, last))
-    look = jax.jit(first_look, static_argnums=2)
-    points = look(Tracked(scene, pose), TrackBatch(last, plan), CONFIG)[0].pixels
+    step, params = Track(CONFIG).step(shape_of(last)), Tracked(scene, pose)
+    look = jax.jit(partial(step.update, step=0, key=jax.random.key(0)))
+    points = look(params, step.init(params), TrackBatch(last, plan))[1].pixels
 
     truth = sequence.truth
     assert truth is not None

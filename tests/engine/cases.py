@@ -139,7 +139,8 @@ def track_step_case():
     batch = TrackBatch(second, plan)
     sick = TrackBatch(eqx.tree_at(lambda f: f.images, second, jnp.full_like(second.images, jnp.nan)), plan)
     tight = batch._replace(plan=replace(plan, near=replace(plan.near, capacity=16)))
-    return tracker.step(shape), run.params, batch, sick, tight, lambda params: run.state
+    first_batch = TrackBatch(first, plan)
+    return tracker.step(shape), run.params, batch, sick, tight, first_batch
 
 
 def features_case():

@@ -31,7 +31,7 @@ class Case(NamedTuple):
         batch: one in which nothing is wrong.
         sick: one with a number that is not finite; None if params are poisoned instead.
         tight: one whose plan is too small; None for a step without a plan.
-        begin: params -> state, where that is more than `step.init`.
+        first: a batch to be seen before the others, by the step itself; None for a step that needs none.
     """
 
     step: Step
@@ -39,10 +39,7 @@ class Case(NamedTuple):
     batch: Any
     sick: Any
     tight: Any = None
-    begin: Callable[[Any], Any] | None = None
-
-    def state(self) -> Any:
-        return self.step.init(self.params) if self.begin is None else self.begin(self.params)
+    first: Any = None
 
 
 def of_a_gradient() -> Case:
@@ -77,6 +74,15 @@ def jitted(name: str) -> Callable:
     return jax.jit(lambda params, state, batch, step: update(params, state, batch, step=step, key=KEY))
 
 
+@cache
+def state_of(name: str) -> Any:
+    case = case_of(name)
+    state = case.step.init(case.params)
+    if case.first is None:
+        return state
+    return jitted(name)(case.params, state, case.first, jnp.asarray(0))[1]
+
+
 @pytest.fixture(params=CASES)
 def name(request) -> str:
     return request.param
@@ -92,7 +98,7 @@ def assert_same(new, old):
 
 def test_params_and_state_keep_their_form_and_info_has_its_names(name):
     case = case_of(name)
-    state = case.state()
+    state = state_of(name)
     params, after, info = jitted(name)(case.params, state, case.batch, jnp.asarray(3))
     assert shapes(params) == shapes(case.params)
     assert shapes(after) == shapes(state)
@@ -107,7 +113,7 @@ def test_params_and_state_keep_their_form_and_info_has_its_names(name):
 
 def test_what_is_not_finite_changes_nothing(name):
     case = case_of(name)
-    state = case.state()
+    state = state_of(name)
     params, after, info = jitted(name)(case.params, state, case.sick, jnp.asarray(3))
     assert bool(info["skipped"])
     assert_same((params, after), (case.params, state))
@@ -117,7 +123,7 @@ def test_a_plan_that_is_too_small_changes_nothing_and_what_it_needs_is_enough(na
     case = case_of(name)
     if case.tight is None:
         pytest.skip("draws with no plan")
-    state = case.state()
+    state = state_of(name)
     params, after, info = jitted(name)(case.params, state, case.tight, jnp.asarray(3))
     assert bool(info["overflow"])
     assert bool(info["skipped"])
@@ -126,7 +132,7 @@ def test_a_plan_that_is_too_small_changes_nothing_and_what_it_needs_is_enough(na
 
 def test_it_runs_in_a_scan_as_it_does_alone(name):
     case = case_of(name)
-    params, state = case.params, case.state()
+    params, state = case.params, state_of(name)
 
     def both(carry, step):
         *carry, info = case.step.update(*carry, case.batch, step=step, key=KEY)
@@ -150,7 +156,7 @@ def test_a_step_that_wraps_it_works(name):
             moved = jax.tree.map(lambda m, p: jnp.where(info["skipped"], m, 0.9 * m + 0.1 * p), mean, params)
             return params, (inner, jax.tree.map(lambda m, p: m.astype(p.dtype), moved, params)), info
 
-        return Step(lambda params: (case.state(), params), update)
+        return Step(lambda params: (state_of(name), params), update)
 
     wrapped = averaged(case.step)
     update = jax.jit(lambda p, s, b, i: wrapped.update(p, s, b, step=i, key=KEY))

@@ -52,8 +52,9 @@ def test_the_ladder_goes_from_the_richest_to_one_camera():
     ("budget_ms", "expected", "fits", "most_measured"),
     [
         (33.0, "fast", True, 1),
-        (60.0, "fast", True, 2),  # fast fits with all groups, balanced does not
-        (250.0, "balanced", True, 3),
+        (60.0, "fast", True, 1),  # fast fits with all groups, but not twice
+        (100.0, "fast", True, 2),  # twice does, and balanced does not
+        (250.0, "balanced", True, 2),
         (5000.0, "accurate", True, 3),
         (15.0, "fast, half the resolution", True, 2),
         (5.5, "fast, half the resolution, 1 camera", True, 4),

@@ -116,7 +116,7 @@ class TestOneStep:
         memory = page_names()["empty_memory"](3, len(nodes))
         state = tracked, tracking, features, init(features), memory
         step, tracks = jax.jit(step), jax.jit(partial(tracker.update, step=0))
-        for t in (1, 2):
+        for t in (0, 1, 2):
             batch, key = small.batches[t], jax.random.key(t)
             before = state
             state, info = step(state, batch, batch.frame.cameras, small.ids[t], jnp.float32(t), key)

@@ -200,9 +200,9 @@ def test_an_overflow_changes_nothing_and_track_plans_again(table, started, track
     shape, run = tracker.start(started, frames[0])
     plan = run.plans[PLAN]
     small = replace(plan, num_near=16, full=replace(plan.full, capacity=4096))
-    update = jax.jit(partial(tracker.step(shape).update, step=0))
-    batch = TrackBatch(frames[1], small)
-    params, state, info = update(run.params, run.state, batch, key=jax.random.key(0))
+    update = jax.jit(partial(tracker.step(shape).update, step=0, key=jax.random.key(0)))
+    run = run.having(state=update(run.params, run.state, TrackBatch(frames[0], plan))[1])
+    params, state, info = update(run.params, run.state, TrackBatch(frames[1], small))
     assert info["overflow"]
     assert info["skipped"]
     jax.tree.map(np.testing.assert_array_equal, (params, state), (run.params, run.state))

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gsjax.methods.track import PLAN, PRESETS, AlignConfig, Track, TrackBatch, first_look
+from gsjax.methods.track import PLAN, PRESETS, AlignConfig, Track, TrackBatch
 from gsjax.methods.track.grow import empty_slots
 
 # Looks nowhere but where things were, which compiles fast, and for all groups, so that rounding chooses none.
@@ -20,12 +20,14 @@ CONFIG = replace(PRESETS["fast"], align=LITTLE)
 
 @pytest.fixture(scope="module")
 def begun(table, started):
-    """The step, its jitted update, and the run at the first frame."""
+    """The step, its jitted update, and the run after the first frame."""
     _, frames, _ = table()
     tracker = Track(CONFIG)
     shape, run = tracker.start(started, frames[0])
     step = tracker.step(shape)
-    return step, jax.jit(partial(step.update, step=0, key=jax.random.key(0))), run
+    update = jax.jit(partial(step.update, step=0, key=jax.random.key(0)))
+    params, state, _ = update(run.params, run.state, TrackBatch(frames[0], run.plans[PLAN]))
+    return step, update, run.having(params=params, state=state)
 
 
 def assert_same(found, expected):
@@ -45,26 +47,37 @@ def test_a_blank_state_has_the_form_that_a_first_look_fills(table, started, conf
     _, frames, _ = table()
     tracker = Track(config)
     shape, run = tracker.start(started, frames[0])
-    batch = TrackBatch(frames[0], run.plans[PLAN])
-    seen, _ = jax.eval_shape(partial(first_look, config=config), run.params, batch)
-    blank = jax.eval_shape(tracker.step(shape).init, run.params)
-    assert jax.tree.structure(blank) == jax.tree.structure(seen)
-    for one, other in zip(jax.tree.leaves(blank), jax.tree.leaves(seen), strict=True):
+    update = partial(tracker.step(shape).update, step=0, key=jax.random.key(0))
+    _, seen, _ = jax.eval_shape(update, run.params, run.state, TrackBatch(frames[0], run.plans[PLAN]))
+    assert jax.tree.structure(run.state) == jax.tree.structure(seen)
+    for one, other in zip(jax.tree.leaves(run.state), jax.tree.leaves(seen), strict=True):
         assert (one.shape, one.dtype) == (other.shape, other.dtype)
 
 
-def test_an_update_of_a_blank_state_moves_nothing_and_remembers_what_it_saw(table, started, begun):
+def test_the_first_update_only_looks(table, started, begun):
     _, frames, _ = table()
     step, update, run = begun
-    blank = step.init(run.params)
-    params, state, info = update(run.params, blank, TrackBatch(frames[0], run.plans[PLAN]))
+    params, state, info = update(run.params, step.init(run.params), TrackBatch(frames[0], run.plans[PLAN]))
     assert not info["skipped"]
     assert not info["lost"].any()
-    own = slice(started.num_moving)  # surfaces may join at once
-    np.testing.assert_allclose(params.pose.means[own], run.params.pose.means[own], atol=1e-6)
-    assert_same(state.shown.labels, run.state.shown.labels)
-    np.testing.assert_allclose(state.pixels.seen.sum(), run.state.pixels.seen.sum())
-    assert all(bool(jnp.isfinite(leaf).all()) for leaf in jax.tree.leaves((params, state)))
+    assert not np.any(info["motion"].twists)
+    assert_same(params, Track(CONFIG).start(started, frames[0])[1].params)
+    assert_same(state, run.state)
+    assert int(state.count) == 0
+    assert not np.any(state.motion.delta)
+    assert {1, 2} <= set(np.unique(state.shown.labels))
+    assert_same(state.keyframe.points, state.pixels)
+    assert (np.asarray(state.watch.showed) > 0.2).all()
+    assert np.asarray(state.watch.agrees == 1).all()
+
+
+def test_a_first_frame_that_cannot_be_read_leaves_the_state_blank(table, begun):
+    _, frames, _ = table()
+    step, update, run = begun
+    broken = replace(frames[0], images=jnp.full_like(frames[0].images, jnp.nan))
+    _, state, info = update(run.params, step.init(run.params), TrackBatch(broken, run.plans[PLAN]))
+    assert info["skipped"]
+    assert_same(state, step.init(run.params))
 
 
 def test_it_runs_in_a_scan_as_frame_by_frame_and_grows_there(table, begun):

@@ -118,7 +118,7 @@ def _ticks(
 
 
 def first_update(scene: TrackedScene, first: Frame, config: TrackConfig) -> Tick:
-    """The tick of an update to the first frame itself, whose programs are then at hand."""
+    """The tick of the first look, whose programs are then at hand."""
     method = Track(config)
     shape, run = method.start(scene, first)
     run, info, *seconds = _Updates(method, shape, run)(run, first, 0)
@@ -136,15 +136,21 @@ def _begun(
     """A run before its next frame; `anew` keeps only the scene of `after`, because its state belongs to other
     settings."""
     if after is None:
-        return method.start(scene, first, like.run if like and like.method == method else None)
+        shape, run = method.start(scene, first, like.run if like and like.method == method else None)
+        return shape, _looked(method, shape, run, first)
     if anew:
         shape, run = method.start_at(after.run.params, first)
-        return shape, run.having(step=after.run.step)
+        return shape, _looked(method, shape, run, first).having(step=after.run.step)
     run = after.run
     if after.method.config != method.config:  # and thus perhaps another plan
         _, planned = method.start_at(run.params, first)
         run = run.having(plans=planned.plans, kept=planned.kept)
     return shape_of(first), run
+
+
+def _looked(method: Track, shape: FrameShape, run: Run, first: Frame) -> Run:
+    """A run that had seen no frame yet, after the first one."""
+    return _Updates(method, shape, run)(run, first, 0)[0].having(step=run.step)
 
 
 class _Updates:

@@ -50,7 +50,6 @@ from gsjax.methods.track.query import Match, find_object
 from gsjax.methods.track.scene import EMPTY, TrackedScene
 from gsjax.methods.track.shapes import scene_from_shapes
 from gsjax.methods.track.state import TrackBatch, Tracked, TrackState
-from gsjax.methods.track.update import first_look
 from gsjax.methods.track.update import track_step as step
 
 __all__ = [
@@ -78,7 +77,6 @@ __all__ = [
     "distill_features",
     "feature_distiller",
     "find_object",
-    "first_look",
     "first_pose",
     "place",
     "plan_tracker",

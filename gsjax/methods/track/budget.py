@@ -12,6 +12,7 @@ from typing import NamedTuple
 from gsjax.methods.track.config import PRESETS, TrackConfig
 
 _FIRST = "fast"  # the rung that is measured first
+_RICHER = 2.0  # a richer rung costs at least this many times as much (docs/results-tracking.md)
 _USED = 0.9  # fraction of the budget that is planned; the rest is a reserve
 _MAX_DEBT = 5.0  # largest delay to be compensated, in budgets, in case the machine was suspended
 _NEW_WEIGHT = 0.1  # weight of an update in the running estimate of the cost
@@ -63,7 +64,7 @@ def choose(
 
     Args:
         rungs: from `ladder`. Each measurement compiles an update, so the choice starts at `first_rung`, and a
-            richer rung is tried only if the one below leaves time to search for all groups.
+            richer rung is tried only if twice the time of the one below, with a search for all groups, fits.
         measure: settings -> measured costs.
         budget: seconds per update.
         num_groups: number of groups.
@@ -76,7 +77,7 @@ def choose(
         return tried[name].base + groups * tried[name].search
 
     at = names.index(_FIRST)
-    while at > 0 and cost(names[at], num_groups) <= _USED * budget:
+    while at > 0 and _RICHER * cost(names[at], num_groups) <= _USED * budget:
         at -= 1
     while cost(names[at], 1) > _USED * budget and at + 1 < len(names):
         at += 1

@@ -1,9 +1,7 @@
 """The tracker as one value. Its frames are not steps of descent, so it is run not by `drive` but by the
 generator of `gsjax.engine.track.tracking`, on the same runs and ticks."""
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -16,11 +14,10 @@ from gsjax.methods.track.grow import with_slots
 from gsjax.methods.track.motion import first_pose
 from gsjax.methods.track.plan import plan_tracker
 from gsjax.methods.track.scene import TrackedScene
-from gsjax.methods.track.state import TrackBatch, Tracked
-from gsjax.methods.track.update import first_look, track_step
+from gsjax.methods.track.state import Tracked, blank_state
+from gsjax.methods.track.update import track_step
 from gsjax.optim.method import Run
 from gsjax.optim.step import Step
-from gsjax.optim.traces import jit_once
 from gsjax.scene.frame import Frame
 
 PLAN = "track"
@@ -55,31 +52,26 @@ class Track:
         named_losses(self.extra_losses)
 
     def start(self, scene: TrackedScene, first: Frame, like: Run | None = None) -> tuple[FrameShape, Run]:
-        """The shape of the frames and the run at the first frame, with slots if there is depth.
+        """The shape of the frames and a run that has seen no frame yet, with slots if there is depth. Its
+        first update, to the frame that the scene shows, only looks.
 
         Args:
             scene: from `start_scene` or `scene_from_shapes`.
             first: the frame that it shows, of all cameras.
-            like: an earlier run of a scene of the same shapes, whose plans are used again if they hold this
-                one.
+            like: an earlier run of a scene of the same shapes, whose plans are used again.
         """
         if self.config.grow.slots and first.depths is not None:
             scene = with_slots(scene, self.config.grow.slots)
         return self.start_at(Tracked(scene, first_pose(scene)), first, like)
 
     def start_at(self, params: Tracked, frame: Frame, like: Run | None = None) -> tuple[FrameShape, Run]:
-        """The shape of the frames and the run at a frame of all cameras that shows the scene, with its slots
-        as they are, at the pose of `params`; `like` as for `start`."""
+        """The same with the slots that the scene has, where it shows `frame` at the pose of `params`."""
         if like is None:
             plan = plan_tracker(params.scene, params.pose, frame, self.config)
         else:
             plan = like.plans[PLAN]
-        state, overflow = _first_look(self.config)(params, TrackBatch(frame, plan))
-        if overflow:
-            plan = plan_tracker(params.scene, params.pose, frame, self.config)
-            state, _ = _first_look(self.config)(params, TrackBatch(frame, plan))
-        kept = Kept(matching_reduction(params.scene, frame, self.config))
-        return shape_of(frame), Run(params, state, 0, {PLAN: plan}, kept)
+        shape, kept = shape_of(frame), Kept(matching_reduction(params.scene, frame, self.config))
+        return shape, Run(params, blank_state(params, self.config, shape), 0, {PLAN: plan}, kept)
 
     def step(self, shape: FrameShape, reduction: int = 1) -> Step:
         """See `track_step`."""
@@ -88,16 +80,6 @@ class Track:
     def result(self, problem: FrameShape | None, run: Run) -> Tracked:
         """The scene and the pose of its objects."""
         return run.params
-
-
-@lru_cache(maxsize=8)
-def _first_look(config: TrackConfig) -> Callable:
-    """The jitted first look."""
-
-    def look(params, batch):
-        return first_look(params, batch, config)
-
-    return jit_once(look, config)
 
 
 def matching_reduction(scene: TrackedScene, frame: Frame, config: TrackConfig) -> int:

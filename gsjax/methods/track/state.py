@@ -3,7 +3,7 @@
 from typing import NamedTuple
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from gsjax.geometry.cameras import Camera
 from gsjax.methods.track.config import TrackConfig
@@ -50,7 +50,7 @@ class TrackState(NamedTuple):
         relocation_guesses: for groups that may be elsewhere, the twist from where they are believed to be:
             translation, metres, and rotation vector, radians.
         watch: record of how each group has been followed.
-        count: number of frames so far.
+        count: number of frames after the first one; -1 before that.
         shown: what the scene showed in the last frame; None if the whole scene is redrawn.
         backdrop: the background in `shown`; None likewise.
         images: images of the last frame if templates are taken from them; else None.
@@ -66,6 +66,11 @@ class TrackState(NamedTuple):
     shown: Shown | None
     backdrop: Backdrop | None
     images: Float[Array, "c height width 3"] | None
+
+    @property
+    def is_blank(self) -> Bool[Array, ""]:
+        """Whether no frame has been seen yet."""
+        return self.count < 0
 
 
 class TrackBatch(NamedTuple):
@@ -85,8 +90,8 @@ class TrackBatch(NamedTuple):
 def blank_state(params: Tracked, config: TrackConfig, shape: FrameShape) -> TrackState:
     """The state of a tracker that has seen no frame yet: no pixel shows any group, and nothing was drawn.
 
-    An update from here moves no group that only pixels of the last frame would constrain, and stores what it
-    saw. `params` is the scene and the pose of its objects, `shape` that of the frames to come.
+    An update from here changes no parameters: the scene shows that frame, and the state stores what it saw.
+    `params` is the scene and the pose of its objects, `shape` that of the frames to come.
     """
     scene, pose = params
     dtype, groups = pose.means.dtype, scene.num_objects
@@ -112,7 +117,7 @@ def blank_state(params: Tracked, config: TrackConfig, shape: FrameShape) -> Trac
         unexplained,
         nowhere,
         first_watch(jnp.zeros(groups, dtype)),
-        jnp.int32(0),
+        jnp.int32(-1),
         shown,
         backdrop,
         images,

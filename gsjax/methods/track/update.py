@@ -6,22 +6,18 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Key
+from jaxtyping import Array, Key
 
 from gsjax.losses.extra import ExtraLosses, named_losses
 from gsjax.methods.track.config import TrackConfig
 from gsjax.methods.track.frames import FrameShape, prepared
 from gsjax.methods.track.grow import empty_slots, grow
-from gsjax.methods.track.layers import draw_backdrop, reduced
-from gsjax.methods.track.lost import group_confidence
-from gsjax.methods.track.motion import Motion, group_means
-from gsjax.methods.track.points import first_keyframe, tone_images
-from gsjax.methods.track.reference import all_points_facing, reference_points
-from gsjax.methods.track.search import first_watch
+from gsjax.methods.track.motion import group_means
+from gsjax.methods.track.points import tone_images
+from gsjax.methods.track.reference import reference_points
 from gsjax.methods.track.stages.context import UpdateContext
 from gsjax.methods.track.stages.follow import align_and_search, look_back, refine_motion, starting_points
 from gsjax.methods.track.stages.settle import detect_lost, remember
-from gsjax.methods.track.stages.shown import memory_of, pixels_shown, show
 from gsjax.methods.track.state import TrackBatch, Tracked, TrackState, blank_state
 from gsjax.optim.step import Step, all_finite, keep_if
 
@@ -32,9 +28,9 @@ def track_step(
     """The step of the object-aware tracker: one frame per update.
 
     params: `Tracked`, a scene with `config.grow.slots` slots (see `with_slots`) and the pose of its objects.
-    state: `TrackState`; that of `init` has seen no frame yet, and `first_look` returns the state after the
-    frame from which the scene was made. batch: `TrackBatch`, with the frame of all cameras. `key` is used to
-    relocate lost groups; `step` is not used.
+    state: `TrackState`; that of `init` has seen no frame yet, so the first update, with the frame that the
+    scene shows, only looks: it changes no parameters. batch: `TrackBatch`, with the frame of all cameras.
+    `key` is used to relocate lost groups; `step` is not used.
 
     A frame passes through six stages (`gsjax.methods.track.stages`):
 
@@ -102,7 +98,8 @@ def track_step(
         if growing:
             how = (config.grow, config.coarseness, new_state.watch.lost)
             new = Tracked(*grow(*new, shown, frame, new_state.count, *how))
-        params, state = keep_if(sound, (new, new_state), (params, state))
+        params = keep_if(sound & ~state.is_blank, new, params)
+        state = keep_if(sound, new_state, state)
         still = jax.tree.map(jnp.zeros_like, settled.motion)
         motion, watch = keep_if(sound, settled.motion, still), state.watch
         joined = config.grow.slots - empty_slots(params.scene).sum() if growing else jnp.int32(0)
@@ -129,42 +126,3 @@ def track_step(
         return params, state, info
 
     return Step(partial(blank_state, config=config, shape=shape), update)
-
-
-def first_look(params: Tracked, batch: TrackBatch, config: TrackConfig) -> tuple[TrackState, Bool[Array, ""]]:
-    """The state after the frame that `params` shows, from which the step continues, and whether the plan was
-    too small, so that parts are missing in it.
-
-    Args:
-        params: the scene and the pose of its objects in this frame.
-        batch: the frame of all cameras, and a plan that holds the scene (`plan_tracker`).
-    """
-    (scene, pose), plan = params, batch.plan
-    frame, _ = prepared(batch.frame, config)
-    nowhere = Motion(jnp.zeros((scene.num_objects, 6), pose.means.dtype), jnp.zeros_like(pose.means))
-    views = reduced(frame.cameras, config.coarseness)
-    if config.redraw == "moving":
-        backdrop, behind = draw_backdrop(scene, views, plan.full)
-        shown, moving = show(scene, pose, frame, backdrop, plan, config)
-        overflow = (behind > plan.full.capacity) | (moving > plan.near.capacity)
-    else:
-        backdrop = None
-        shown, needed = show(scene, pose, frame, backdrop, plan, config)
-        overflow = needed > plan.full.capacity
-    images = tone_images(frame, config.align.shading)
-    pixels, unexplained_pixels = pixels_shown(shown, images, scene.num_objects, config)
-    reference = reference_points(scene, pose, config.align)
-    centers = group_means(pose.means, scene.groups, scene.num_objects)
-    facing = all_points_facing(reference, nowhere.twists, centers, images)
-    coverage = group_confidence(facing, images, config.start.depth_gap).coverage
-    state = TrackState(
-        nowhere,
-        pixels,
-        first_keyframe(pixels),
-        unexplained_pixels,
-        nowhere.twists,
-        first_watch(coverage),
-        jnp.int32(0),
-        *memory_of(shown, backdrop, frame, config),
-    )
-    return state, overflow

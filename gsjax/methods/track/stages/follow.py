@@ -54,7 +54,7 @@ def look_back(now: UpdateContext, config: TrackConfig) -> Past:
         shown = Shown(labels, rendered.depths, mostly)
     enough = _ENOUGH_PIXELS / config.coarseness**2
     counts = pixel_counts(shown.labels, num_objects)
-    visible = counts > jnp.minimum(_MIN_SHARE * state.watch.largest, enough)
+    visible = (counts > jnp.minimum(_MIN_SHARE * state.watch.largest, enough)) & ~state.is_blank
     return Past(shown, cameras, template, rendered, backdrop, background, needed, counts, visible)
 
 
@@ -144,6 +144,7 @@ def refine_motion(
         assert past.rendered is not None
         refined, shifts, needed, info = _refine(now, start, past.rendered, config, extra_losses)
         if shifts is not None:
+            shifts = jnp.where(now.state.is_blank, 0.0, shifts)
             scene = shift_background(scene, shifts)
         # Points do not capture outlines, which rendered images do, so they veto the refinement only if it
         # went clearly wrong; without depth they are hardly more reliable at all.

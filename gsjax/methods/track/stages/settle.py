@@ -13,6 +13,7 @@ from gsjax.methods.track.plan import Needed
 from gsjax.methods.track.points import carry, carry_keyframe, renewed, where_groups
 from gsjax.methods.track.recover import evidence, relative_twists
 from gsjax.methods.track.reference import all_points_facing, radii
+from gsjax.methods.track.search import first_watch
 from gsjax.methods.track.stages.context import Alignment, Past, Refined, Settled, UpdateContext
 from gsjax.methods.track.stages.shown import memory_of, pixels_shown, show
 from gsjax.methods.track.state import TrackState
@@ -26,18 +27,21 @@ def detect_lost(
     """Fifth stage: whether each group is where it is believed to be, and whether it moves to where it was
     found instead. Arguments `now`, `past` and others from the earlier stages."""
     state, gap, kept = now.state, config.start.depth_gap, refined.motion
-    lost, showed = state.watch.lost, state.watch.showed
+    lost, showed, background = state.watch.lost, state.watch.showed, past.background
+    if background is not None:  # what shows at first is all that will ever show, wherever it is
+        background = jnp.where(state.is_blank, 0.0, background)
     tried, relocation = alignment.search.relocation_tried, alignment.search.relocation
     carried = jax.vmap(carry)(alignment.reference, kept.twists, now.centers)
-    confidence = group_confidence(carried, now.images, gap, past.background)
+    confidence = group_confidence(carried, now.images, gap, background)
 
     def by_all_facing() -> Confidence:
-        """From all points that face the cameras: a lost group is not where it was last seen."""
+        """From all points that face the cameras: a lost group is not where it was last seen, and at first
+        nothing has been seen."""
         points = all_points_facing(now.reference, kept.twists, now.centers, now.images)
-        return group_confidence(points, now.images, gap, past.background, alignment.other_depths)
+        return group_confidence(points, now.images, gap, background, alignment.other_depths)
 
-    of_facing = jax.lax.cond(alignment.suspects.any(), by_all_facing, lambda: confidence)
-    confidence = jax.tree.map(partial(where_groups, lost), of_facing, confidence)
+    of_facing = jax.lax.cond(alignment.suspects.any() | state.is_blank, by_all_facing, lambda: confidence)
+    confidence = jax.tree.map(partial(where_groups, lost | state.is_blank), of_facing, confidence)
     better = evidence(relocation.confidence) > _BETTER * evidence(of_facing)
     twice = is_found(relocation.confidence, showed) & is_found(relocation.guess_confidence, showed)
     # A group that is not lost is seen where it is. If it is only turned there, it is in no other place.
@@ -76,10 +80,12 @@ def remember(
         needed = needed._replace(full=past.needed, near=jnp.maximum(needed.near, near))
     pixels, unexplained_pixels = pixels_shown(shown, now.images, now.scene.num_objects, config)
     keyframe = carry_keyframe(state.keyframe, motion.twists, now.centers)
-    keyframe = renewed(keyframe, pixels, config.align.keyframe_turn, relocated)
+    keyframe = renewed(keyframe, pixels, config.align.keyframe_turn, relocated | state.is_blank)
     watch = state.watch.after(
         refined.residuals, alignment.search, past.counts, settled.confidence, settled.elsewhere, relocated
     )
+    at_first = first_watch(settled.confidence.coverage)
+    watch = jax.tree.map(partial(jnp.where, state.is_blank), at_first, watch)
     still = jnp.zeros_like(motion.twists)
     guesses = where_groups(
         watch.doubtful & ~relocated, relative_twists(settled.guesses, motion.twists), still
