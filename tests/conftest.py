@@ -43,17 +43,22 @@ import jax
 import jaxtyping
 import pytest
 
+from gsjax.engine.machine import resident_mb
+from gsjax.optim.compiler import forget_programs
+
 hypothesis.settings.register_profile("gsjax", deadline=None, max_examples=25, derandomize=True, database=None)
 hypothesis.settings.load_profile("gsjax")
+
+MOST_MAPS, MOST_MB = 20_000, 3_000  # what programs of earlier files may hold
 
 
 @pytest.fixture(autouse=True, scope="module")
 def forget_compiled():
-    """A compiled program holds memory maps, of which Linux grants a process 65,530: too few for all tests."""
+    """Compiled programs hold memory, and memory maps, of which Linux grants a process 65,530: too few for all
+    tests."""
     yield
-    from gsjax.optim.compiler import forget_programs
-
-    if forget_programs(20_000):
+    most = 0 if resident_mb() > MOST_MB else MOST_MAPS
+    if forget_programs(most):
         gc.collect()  # programs are in cycles
 
 

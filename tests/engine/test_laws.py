@@ -68,19 +68,36 @@ def case_of(name: str) -> Case:
     return CASES[name]()
 
 
+def averaged(step: Step) -> Step:
+    """A step that wraps another, with an average of params over steps, as one keeps for evaluation."""
+
+    def update(params, state, batch, *, step_=step, step, key):
+        inner, mean = state
+        params, inner, info = step_.update(params, inner, batch, step=step, key=key)
+        moved = jax.tree.map(lambda m, p: jnp.where(info["skipped"], m, 0.9 * m + 0.1 * p), mean, params)
+        return params, (inner, jax.tree.map(lambda m, p: m.astype(p.dtype), moved, params)), info
+
+    return Step(lambda params: (step.init(params), params), update)
+
+
 @cache
 def jitted(name: str) -> Callable:
-    update = case_of(name).step.update
+    """The wrapped update of a case: one program for the laws of both."""
+    update = averaged(case_of(name).step).update
     return jax.jit(lambda params, state, batch, step: update(params, state, batch, step=step, key=KEY))
+
+
+def updated(name: str, params: Any, state: Any, batch: Any, step: int = 3) -> tuple[Any, Any, dict]:
+    """Params, state and info after one update."""
+    params, (state, _), info = jitted(name)(params, (state, case_of(name).params), batch, jnp.asarray(step))
+    return params, state, info
 
 
 @cache
 def state_of(name: str) -> Any:
     case = case_of(name)
     state = case.step.init(case.params)
-    if case.first is None:
-        return state
-    return jitted(name)(case.params, state, case.first, jnp.asarray(0))[1]
+    return state if case.first is None else updated(name, case.params, state, case.first)[1]
 
 
 @pytest.fixture(params=CASES)
@@ -99,7 +116,7 @@ def assert_same(new, old):
 def test_params_and_state_keep_their_form_and_info_has_its_names(name):
     case = case_of(name)
     state = state_of(name)
-    params, after, info = jitted(name)(case.params, state, case.batch, jnp.asarray(3))
+    params, after, info = updated(name, case.params, state, case.batch)
     assert shapes(params) == shapes(case.params)
     assert shapes(after) == shapes(state)
     assert {"loss", "skipped", "overflow", "needed"} <= set(info)
@@ -114,7 +131,7 @@ def test_params_and_state_keep_their_form_and_info_has_its_names(name):
 def test_what_is_not_finite_changes_nothing(name):
     case = case_of(name)
     state = state_of(name)
-    params, after, info = jitted(name)(case.params, state, case.sick, jnp.asarray(3))
+    params, after, info = updated(name, case.params, state, case.sick)
     assert bool(info["skipped"])
     assert_same((params, after), (case.params, state))
 
@@ -124,7 +141,7 @@ def test_a_plan_that_is_too_small_changes_nothing_and_what_it_needs_is_enough(na
     if case.tight is None:
         pytest.skip("draws with no plan")
     state = state_of(name)
-    params, after, info = jitted(name)(case.params, state, case.tight, jnp.asarray(3))
+    params, after, info = updated(name, case.params, state, case.tight)
     assert bool(info["overflow"])
     assert bool(info["skipped"])
     assert_same((params, after), (case.params, state))
@@ -140,26 +157,18 @@ def test_it_runs_in_a_scan_as_it_does_alone(name):
 
     carry, losses = jax.jit(lambda carry: jax.lax.scan(both, carry, jnp.arange(2)))((params, state))
     for i in range(2):
-        params, state, info = jitted(name)(params, state, case.batch, jnp.asarray(i))
+        params, state, info = updated(name, params, state, case.batch, i)
     np.testing.assert_allclose(losses[-1], info["loss"], rtol=1e-3, atol=1e-6)
     assert shapes(carry) == shapes((params, state))
 
 
 def test_a_step_that_wraps_it_works(name):
-    """An average of params over steps, as one keeps for evaluation."""
     case = case_of(name)
-
-    def averaged(step: Step) -> Step:
-        def update(params, state, batch, *, step_=step, step, key):
-            inner, mean = state
-            params, inner, info = step_.update(params, inner, batch, step=step, key=key)
-            moved = jax.tree.map(lambda m, p: jnp.where(info["skipped"], m, 0.9 * m + 0.1 * p), mean, params)
-            return params, (inner, jax.tree.map(lambda m, p: m.astype(p.dtype), moved, params)), info
-
-        return Step(lambda params: (state_of(name), params), update)
-
     wrapped = averaged(case.step)
-    update = jax.jit(lambda p, s, b, i: wrapped.update(p, s, b, step=i, key=KEY))
-    params, state, info = update(case.params, wrapped.init(case.params), case.batch, jnp.asarray(0))
+    assert shapes(wrapped.init(case.params)) == shapes((case.step.init(case.params), case.params))
+    before = state_of(name), jax.tree.map(jnp.zeros_like, case.params)
+    params, (_, mean), info = jitted(name)(case.params, before, case.batch, jnp.asarray(0))
     assert np.isfinite(float(info["loss"]))
-    assert shapes(state[1]) == shapes(params)
+    assert shapes(mean) == shapes(params)
+    for m, p in zip(jax.tree.leaves(mean), jax.tree.leaves(params), strict=True):
+        np.testing.assert_allclose(m, (0.1 * np.asarray(p)).astype(m.dtype), rtol=1e-5)

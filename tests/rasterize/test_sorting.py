@@ -16,6 +16,11 @@ from gsjax.rasterize.sorting import argsort_keys, lists, repeat, running_sum
 
 SORTS = ("host", "device")
 
+argsorted = jax.jit(argsort_keys, static_argnames="where")
+summed = jax.jit(running_sum, static_argnames="where")
+repeated = jax.jit(repeat, static_argnames=("length", "where"))
+listed_by = jax.jit(lists, static_argnames=("num_items", "num_lists", "length", "where"))
+
 
 def test_the_host_sort_is_there():
     # If XLA's interface changes, everything still works, but slower: an upgrade of JAX should reveal it.
@@ -26,7 +31,7 @@ def test_the_host_sort_is_there():
 def test_both_ways_sort_as_numpy_does(seed, length, top):
     keys = np.random.default_rng(seed).integers(0, top, length, dtype=np.uint32)
     for where in SORTS:
-        order = argsort_keys(jnp.asarray(keys), where)
+        order = argsorted(keys, where)
         assert order.dtype == jnp.int32
         np.testing.assert_array_equal(order, np.argsort(keys, kind="stable"))
 
@@ -39,10 +44,10 @@ def test_both_ways_sum_and_repeat_as_numpy_does(seed, length, top):
     ends = np.cumsum(counts, dtype=np.int32)
     want = np.repeat(values, counts)
     for where in SORTS:
-        np.testing.assert_array_equal(running_sum(jnp.asarray(counts), where), ends)
-        for room in (len(want) // 2, len(want), len(want) + 7):
-            got = repeat(jnp.asarray(values), jnp.asarray(ends - counts), room, where)
-            assert got.dtype == jnp.uint32
+        np.testing.assert_array_equal(summed(counts, where), ends)
+        for room in (0, 10, 1000, 5000):  # too little and too much
+            got = np.asarray(repeated(values, ends - counts, room, where))
+            assert got.dtype == np.uint32
             np.testing.assert_array_equal(got[: len(want)], want[:room])
 
 
@@ -58,18 +63,19 @@ def entries(seed, length, num_lists):
     counts = rng.integers(0, np.minimum(num_lists - firsts, 4) + 1)
     items = np.sort(rng.integers(0, length + 1, length))
     unused = np.zeros(length, int)
-    return [jnp.asarray(np.append(a, unused), jnp.int32) for a in (items, firsts, counts)]
+    return [np.append(a, unused).astype(np.int32) for a in (items, firsts, counts)]
 
 
 @given(st.integers(0, 2**32), st.sampled_from([0, 1, 17, 300]), st.sampled_from([0, 2**30]))
 def test_both_ways_list_what_a_loop_lists(seed, length, more_items):
     """Also where an item and a list do not fit into 32 bits together."""
-    items, firsts, counts = map(np.asarray, given := entries(seed, length, 7))
+    items, firsts, counts = entries(seed, length, 7)
     which = np.concatenate([np.arange(f, f + c) for f, c in zip(firsts, counts, strict=True)] or [[]])
     want = np.repeat(items, counts)[np.argsort(which, kind="stable")]
     for where in SORTS:
-        listed, edges = lists(*given, length + 1 + more_items, 7, len(want) + 5, where)
-        assert listed.dtype == edges.dtype == jnp.int32
+        found = listed_by(items, firsts, counts, length + 1 + more_items, 7, 1500, where)
+        listed, edges = map(np.asarray, found)
+        assert listed.dtype == edges.dtype == np.int32
         np.testing.assert_array_equal(listed[: len(want)], want)
         assert ((listed >= 0) & (listed <= length)).all()
         np.testing.assert_array_equal(np.diff(edges), np.bincount(which.astype(int), minlength=7))
@@ -78,26 +84,28 @@ def test_both_ways_list_what_a_loop_lists(seed, length, more_items):
 
 def test_vmap_and_loops_sort_every_row():
     rows = jax.random.bits(jax.random.key(0), (3, 4, 50), jnp.uint32) % 20
-    want = [[argsort_keys(row) for row in some] for some in rows]
+    want = [[argsorted(row) for row in some] for some in np.asarray(rows)]
     np.testing.assert_array_equal(jax.jit(jax.vmap(jax.vmap(argsort_keys)))(rows), want)
     _, scanned = jax.lax.scan(lambda c, some: (c, jax.vmap(argsort_keys)(some)), None, rows)
     np.testing.assert_array_equal(scanned, want)
 
 
 def test_vmap_lists_every_row():
-    rows = [jnp.stack(column) for column in zip(*(entries(seed, 30, 9) for seed in range(3)), strict=True)]
-    got = jax.vmap(lambda *row: lists(*row, 31, 9, 200))(*rows)
-    for i, row in enumerate(zip(*rows, strict=True)):
-        jax.tree.map(np.testing.assert_array_equal, [a[i] for a in got], list(lists(*row, 31, 9, 200)))
+    rows = [entries(seed, 30, 9) for seed in range(3)]
+    got = jax.jit(jax.vmap(lambda *row: lists(*row, 31, 9, 200)))(*map(np.stack, zip(*rows, strict=True)))
+    for i, row in enumerate(rows):
+        want = listed_by(*row, 31, 9, 200)
+        jax.tree.map(np.testing.assert_array_equal, [np.asarray(a)[i] for a in got], list(want))
 
 
 def test_vmap_repeats_every_row():
-    values = jax.random.bits(jax.random.key(0), (3, 50), jnp.uint32)
-    starts = jnp.sort(jax.random.randint(jax.random.key(1), (3, 50), 0, 40), axis=1)
-    got = jax.vmap(lambda v, s: repeat(v, s, 40))(values, starts)
-    np.testing.assert_array_equal(got, [repeat(v, s, 40) for v, s in zip(values, starts, strict=True)])
-    one_for_all = jax.vmap(lambda s: repeat(values[0], s, 40))(starts)
-    np.testing.assert_array_equal(one_for_all[1], repeat(values[0], starts[1], 40))
+    rng = np.random.default_rng(0)
+    values = rng.integers(0, 2**32, (3, 50), dtype=np.uint32)
+    starts = np.sort(rng.integers(0, 40, (3, 50), dtype=np.int32), axis=1)
+    got = jax.jit(jax.vmap(lambda v, s: repeat(v, s, 40)))(values, starts)
+    np.testing.assert_array_equal(got, [repeated(v, s, 40) for v, s in zip(values, starts, strict=True)])
+    one_for_all = jax.jit(jax.vmap(lambda s: repeat(jnp.asarray(values[0]), s, 40)))(starts)
+    np.testing.assert_array_equal(one_for_all[1], repeated(values[0], starts[1], 40))
 
 
 @pytest.mark.parametrize("error", [MemoryError("no room"), KeyboardInterrupt("no room")])
