@@ -249,7 +249,7 @@ def _from_stored(array: np.ndarray, dtype: str, kind: str) -> Any:
         return jax.random.wrap_key_data(jnp.asarray(array), impl=dtype[len("key<") : -1])
     if not (array.dtype.isbuiltin == 1 and str(array.dtype) == dtype):
         array = array.view(jnp.dtype(dtype))
-    return jnp.asarray(array) if kind == "jax" else array
+    return jax.device_put(array) if kind == "jax" else array
 
 
 def _checksum(arrays: Mapping[str, np.ndarray]) -> str:

@@ -1,6 +1,7 @@
 """Checks of the rasterizer's arguments, with errors that name them, and their conversion to one layout."""
 
 import math
+from functools import partial
 from typing import Any
 
 import jax
@@ -74,60 +75,70 @@ def check_inputs(
     _expect("Ks", Ks, (*lead, num_cameras, 3, 3), "one for each of viewmats; one camera: Ks[None]")
     if 0 in (*lead, num_cameras):
         raise ValueError(f"viewmats must hold at least one camera of one scene; got {tuple(viewmats.shape)}")
-    colors = _check_colors(colors, plan, lead, num_cameras, n)
+    colors_shape = _check_colors(colors, plan, lead, num_cameras, n)
 
-    scenes = math.prod(lead)
-    dtype = jnp.result_type(*arrays.values(), jnp.float32)
+    dtype, channels = jnp.result_type(*arrays.values(), jnp.float32), colors.shape[-1]
+    shapes, kinds = {}, {}
 
-    def flat(array, inner, stored=False):
-        half = stored and jnp.asarray(array).dtype in (jnp.bfloat16, jnp.float16)
-        return jnp.asarray(array, None if half else dtype).reshape(scenes, *inner)
+    def lay_out(name, *inner, kind=dtype):
+        shapes[name], kinds[name] = (math.prod(lead), *inner), jnp.dtype(kind)
 
-    channels = colors.shape[-1]
+    def stored(array):
+        return array.dtype if array.dtype in (jnp.bfloat16, jnp.float16) else dtype
+
     if backgrounds is not None:
         wanted = (*lead, num_cameras, channels)
         _expect("backgrounds", backgrounds, wanted, "one row per camera, as wide as colors")
-        backgrounds = flat(backgrounds, (num_cameras, channels))
+        lay_out("backgrounds", num_cameras, channels)
     if features is not None:
         _expect("features", features, (*lead, n, None), lead_words)
-        features = flat(features, features.shape[-2:], stored=True)
+        lay_out("features", *features.shape[-2:], kind=stored(features))
     if means2d_offset is not None:
         wanted = (*lead, num_cameras, n, 2)
         _expect("means2d_offset", means2d_offset, wanted, "a pixel offset per camera and Gaussian")
-        means2d_offset = flat(means2d_offset, (num_cameras, n, 2))
-    tile_mask = None
+        lay_out("means2d_offset", num_cameras, n, 2)
     if roi is not None:
         inner = (num_cameras, plan.height, plan.width)
         _expect("roi", roi, (*lead, *inner), "a pixel mask per camera; one camera: roi[None]")
         if roi.dtype != bool:
             raise ValueError(f"roi must hold booleans, True where a pixel is wanted; got {roi.dtype}")
-        tile_mask = _tiles_with_a_pixel(jnp.asarray(roi, bool).reshape(scenes, *inner), plan.tile_size)
+        lay_out("roi", *inner, kind=bool)
     if reads is not None:
         wanted = (*lead, num_cameras, plan.num_tiles)
         _expect("reads", reads, wanted, "meta.reads of a call under the same plan")
         if not jnp.issubdtype(jnp.result_type(reads), jnp.integer):
             raise ValueError(f"reads must hold integers, as meta.reads does; got {reads.dtype}")
-        reads = jnp.asarray(reads, jnp.int32).reshape(scenes, num_cameras, plan.num_tiles)
-
-    views = (
-        flat(means, (n, 3)),
-        flat(quats, (n, 4)),
-        flat(scales, (n, 3)),
-        flat(opacities, (n,)),
-        flat(colors, colors.shape[len(lead) :], stored=plan.sh_degree is None),
-        features,
-        flat(viewmats, (num_cameras, 4, 4)),
-        flat(Ks, (num_cameras, 3, 3)),
-        means2d_offset,
-        backgrounds,
-        tile_mask,
-        reads,
-    )
+        lay_out("reads", num_cameras, plan.num_tiles, kind=jnp.int32)
+    lay_out("means", n, 3)
+    lay_out("quats", n, 4)
+    lay_out("scales", n, 3)
+    lay_out("opacities", n)
+    lay_out("colors", *colors_shape[len(lead) :], kind=stored(colors) if plan.sh_degree is None else dtype)
+    lay_out("viewmats", num_cameras, 4, 4)
+    lay_out("Ks", num_cameras, 3, 3)
+    given = {
+        name: array for name, array in {**arrays, "roi": roi, "reads": reads}.items() if array is not None
+    }
+    views = _laid_out(given, tuple(shapes.items()), tuple(kinds.items()), plan.tile_size)
     return views, (*lead, num_cameras)
 
 
-def _check_colors(colors, plan: Plan, lead: tuple[int, ...], num_cameras: int, n: int):
-    """Colours as [*lead, 1 or C, N, ...]."""
+_ORDER = ("means", "quats", "scales", "opacities", "colors", "features", "viewmats", "Ks")
+_ORDER += ("means2d_offset", "backgrounds", "roi", "reads")
+
+
+@partial(jax.jit, static_argnums=(1, 2, 3), inline=True)
+def _laid_out(arrays: dict[str, Any], shapes: tuple, kinds: tuple, edge: int) -> tuple:
+    """The arrays in their shapes and types, by one program; the pixels of interest as tiles."""
+    kinds = dict(kinds)
+    laid_out = {name: arrays[name].astype(kinds[name]).reshape(shape) for name, shape in shapes}
+    if "roi" in laid_out:
+        laid_out["roi"] = _tiles_with_a_pixel(laid_out["roi"], edge)
+    return tuple(laid_out.get(name) for name in _ORDER)
+
+
+def _check_colors(colors, plan: Plan, lead: tuple[int, ...], num_cameras: int, n: int) -> tuple[int, ...]:
+    """The shape of colours as [*lead, 1 or C, N, ...]."""
     inner = 1 if plan.sh_degree is None else 2
     per_camera = colors.ndim == len(lead) + 2 + inner
     bases = () if plan.sh_degree is None else (None,)
@@ -143,7 +154,7 @@ def _check_colors(colors, plan: Plan, lead: tuple[int, ...], num_cameras: int, n
         )
     if colors.shape[-1] == 0 and "RGB" in plan.render_mode:
         raise ValueError(f"colors must have at least one channel in render_mode {plan.render_mode!r}; got 0")
-    return colors if per_camera else jnp.expand_dims(colors, len(lead))
+    return colors.shape if per_camera else (*lead, 1, *colors.shape[len(lead) :])
 
 
 def _tiles_with_a_pixel(roi, edge: int):

@@ -157,7 +157,11 @@ def gaussians_from_activated(
 
 def _on_device(value: Any, dtype: Any) -> Array:
     """An array of this type; what is on the host is converted there, without a program for each shape."""
-    return jnp.asarray(value if isinstance(value, jax.Array) else np.asarray(value, dtype), dtype)
+    return (
+        jnp.asarray(value, dtype)
+        if isinstance(value, jax.Array)
+        else jax.device_put(np.asarray(value, dtype))
+    )
 
 
 @jax.jit
@@ -203,12 +207,15 @@ Tree = TypeVar("Tree", Gaussians, Tags)
 
 def take(tree: Tree, indices: Integer[ArrayLike, "M"] | Bool[ArrayLike, "N"]) -> Tree:
     """The rows `indices` (or, outside a trace, those where a boolean mask is True) of Gaussians or Tags."""
-    indices = jnp.asarray(indices)
-    return _rows(tree, jnp.flatnonzero(indices) if indices.dtype == bool else indices)
+    if not isinstance(indices, jax.core.Tracer):
+        indices = np.asarray(indices)
+    if indices.dtype == bool:
+        indices = np.flatnonzero(indices)
+    return _rows(tree, indices)
 
 
 @partial(jax.jit, inline=True)
-def _rows(tree: Tree, indices: Integer[Array, "M"]) -> Tree:
+def _rows(tree: Tree, indices: Integer[ArrayLike, "M"]) -> Tree:
     return jax.tree.map(lambda leaf: jnp.asarray(leaf)[indices], tree)
 
 

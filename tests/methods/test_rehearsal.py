@@ -1,7 +1,5 @@
 """An update that is compiled while the first scene is fitted is the update of the fitted scene."""
 
-from dataclasses import replace
-
 import equinox as eqx
 import jax
 import numpy as np
@@ -9,7 +7,7 @@ import pytest
 
 from gsjax.engine.track.rehearsal import Rehearsal
 from gsjax.engine.track.tracking import track
-from gsjax.methods.track import PLAN, Track, TrackConfig
+from gsjax.methods.track import TrackConfig
 
 CONFIG = TrackConfig()
 
@@ -30,18 +28,6 @@ def test_poses_are_those_without_a_rehearsal_and_nothing_is_compiled(rehearsed, 
     assert with_one.compile_seconds == 0
     (without,) = track(started, frames[0], frames[1:2], CONFIG)
     for one, other in zip(*map(jax.tree.leaves, (with_one.result.pose, without.result.pose)), strict=True):
-        np.testing.assert_array_equal(one, other)
-
-
-def test_a_plan_that_does_not_hold_the_scene_is_made_anew(rehearsed, started):
-    frames, rehearsal = rehearsed
-    method, run = Track(CONFIG), rehearsal.tick().run
-    plan = run.plans[PLAN]
-    small = replace(plan, full=replace(plan.full, capacity=16), near=replace(plan.near, capacity=16))
-    _, begun = method.start(started, frames[0], run.having(plans={PLAN: small}))
-    _, alone = method.start(started, frames[0])
-    assert begun.plans == alone.plans
-    for one, other in zip(*map(jax.tree.leaves, (begun.state, alone.state)), strict=True):
         np.testing.assert_array_equal(one, other)
 
 

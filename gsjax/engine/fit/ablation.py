@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import equinox as eqx
-import jax.numpy as jnp
+import jax
 import numpy as np
 from jaxtyping import Float
 
@@ -65,11 +65,13 @@ def ablate_time(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
 
 def _emptied(gaussians: Gaussians, rows: np.ndarray) -> Gaussians:
     """The scene without some rows; their slots stay, so that one program draws all parts."""
-    logits = jnp.asarray(gaussians.logit_opacities).at[rows].set(EMPTY_LOGIT)
-    return eqx.tree_at(lambda g: g.logit_opacities, gaussians, logits)
+    logits = np.array(gaussians.logit_opacities)
+    logits[rows] = EMPTY_LOGIT
+    return eqx.tree_at(lambda g: g.logit_opacities, gaussians, jax.device_put(logits))
 
 
 def _plainer(gaussians: Gaussians, degree: int) -> Gaussians:
     """The scene with spherical harmonics of a lower degree."""
-    shN = jnp.asarray(gaussians.shN).at[:, (degree + 1) ** 2 - 1 :].set(0)
-    return eqx.tree_at(lambda g: g.shN, gaussians, shN)
+    shN = np.array(gaussians.shN)
+    shN[:, (degree + 1) ** 2 - 1 :] = 0
+    return eqx.tree_at(lambda g: g.shN, gaussians, jax.device_put(shN))

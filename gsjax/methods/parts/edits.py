@@ -12,6 +12,7 @@ A trajectory keeps its times: motion that an edit moves past its last moment is 
 """
 
 from collections.abc import Sequence
+from functools import partial
 
 import equinox as eqx
 import jax
@@ -347,14 +348,23 @@ def _state(trajectory: Trajectory) -> tuple[HandlePose, Float[Array, "T P"], Flo
 def _only(trajectory: Trajectory, parts: Sequence[int]) -> Trajectory:
     """The trajectory of some parts alone."""
     chosen = _checked(trajectory, parts)
-    return Trajectory(trajectory.times, *jax.tree.map(lambda leaf: leaf[:, chosen], _state(trajectory)))
+    return Trajectory(trajectory.times, *_columns(_state(trajectory), chosen))
 
 
 def _with(trajectory: Trajectory, parts: Sequence[int], seen: Trajectory) -> Trajectory:
     """The trajectory with that of some parts replaced."""
     chosen = _checked(trajectory, parts)
-    changed = jax.tree.map(lambda old, new: old.at[:, chosen].set(new), _state(trajectory), _state(seen))
-    return Trajectory(trajectory.times, *changed)
+    return Trajectory(trajectory.times, *_with_columns(_state(trajectory), chosen, _state(seen)))
+
+
+@partial(jax.jit, inline=True)
+def _columns(tree, chosen):
+    return jax.tree.map(lambda leaf: leaf[:, chosen], tree)
+
+
+@partial(jax.jit, inline=True)
+def _with_columns(tree, chosen, columns):
+    return jax.tree.map(lambda old, new: old.at[:, chosen].set(new), tree, columns)
 
 
 def _over_time(trajectory: Trajectory, share: Share) -> Float[Array, "T 1"]:

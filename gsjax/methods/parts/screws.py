@@ -1,5 +1,8 @@
 """Poses of handles as rigid motions, and operations on these that jaxlie lacks."""
 
+from functools import partial
+
+import jax
 import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Float
@@ -27,6 +30,7 @@ def turned_about(
     return jaxlie.SE3.from_rotation_and_translation(rotation, points - rotation.apply(points))
 
 
+@partial(jax.jit, inline=True)
 def unwound(since: jaxlie.SE3) -> Float[Array, "T P 6"]:
     """Twists of consecutive motions, one of which is close to the identity. A rotation of more than half a
     turn from there, up to a full one, is not replaced by the shorter one in the opposite direction."""

@@ -89,7 +89,7 @@ def fit_scene(
         ValueError: no step had a finite loss.
     """
     gaussians, info, skipped = scene.gaussians, {}, 0
-    state = _STEP.init(gaussians)
+    state = jax.jit(_STEP.init)(gaussians)
     plan = plan_render(gaussians, frame.cameras, headroom=headroom)
 
     def advanced(gaussians, state, i, plan):

@@ -65,7 +65,13 @@ class Track:
         return self.start_at(Tracked(scene, first_pose(scene)), first, like)
 
     def start_at(self, params: Tracked, frame: Frame, like: Run | None = None) -> tuple[FrameShape, Run]:
-        """The same with the slots that the scene has, where it shows `frame` at the pose of `params`."""
+        """The same with the slots that the scene has, where it shows `frame` at the pose of `params`.
+
+        Args:
+            params: the scene and the pose.
+            frame: of all cameras.
+            like: see `start`; a plan that is too small for this scene grows in the first update.
+        """
         if like is None:
             plan = plan_tracker(params.scene, params.pose, frame, self.config)
         else:

@@ -1,6 +1,8 @@
 """x_t = D_k x_{t-1} + delta_i: the motion of groups and of their Gaussians (Object-Aware Gaussian Splatting
 for Robotic Manipulation, section II-C)."""
 
+from functools import partial
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -59,6 +61,7 @@ def select_motion(chosen: Bool[Array, "k"], a: Motion, b: Motion, groups: Int[Ar
     )
 
 
+@partial(jax.jit, inline=True)
 def place(scene: TrackedScene, pose: Pose) -> Gaussians:
     """The scene's Gaussians, with the moving ones at `pose`."""
     still = scene.num_moving
@@ -68,6 +71,7 @@ def place(scene: TrackedScene, pose: Pose) -> Gaussians:
     return eqx.tree_at(lambda g: (g.means, g.quats), gaussians, (means, quats))
 
 
+@partial(jax.jit, inline=True)
 def first_pose(scene: TrackedScene) -> Pose:
     """The pose in the first frame."""
     return Pose(scene.gaussians.means[: scene.num_moving], scene.gaussians.quats[: scene.num_moving])
