@@ -27,6 +27,7 @@ from gsjax.methods.track import (
 )
 from gsjax.methods.track import StartConfig as TrackStart
 from gsjax.scene.feature_grid import FeatureGridConfig
+from gsjax.scene.gaussians import Gaussians
 from gsjax.scene.handles import at_rest
 from gsjax.scene.initialize import gaussians_from_points
 from gsjax.scene.render import plan_render
@@ -64,7 +65,7 @@ def fit_problem(config: FitConfig = FIT):
 
 
 def started(make):
-    """step, params, a batch of the first step, one that is not finite, and one whose plan is too small."""
+    """A step, its run, and the batch of its first step."""
     method, problem, run = make()
     run = method.between(problem, run, 0.9)
     batch, _ = method.batch(problem, run, 0.9)
@@ -73,8 +74,9 @@ def started(make):
 
 def fit_step_case():
     step, run, batch = started(fit_problem)
+    batch = batch._replace(plan=replace(batch.plan, capacity=1024))  # for the scene and little more
     sick = batch._replace(progress=jnp.nan)  # what the rasterizer is given it culls
-    return step, run.params, batch, sick, batch._replace(plan=replace(batch.plan, capacity=16))
+    return step, run.params, batch, sick
 
 
 def deform_step_case():
@@ -85,11 +87,10 @@ def deform_step_case():
     run = method.between(problem, run, 0.0)
     batch, _ = method.batch(problem, run, 0.0)
     sick = batch._replace(codebook=batch.codebook * jnp.nan)
-    return method.step, run.params, batch, sick, batch._replace(plan=replace(batch.plan, capacity=16))
+    return method.step, run.params, batch, sick
 
 
 def distill_step_case():
-    """A distillation draws frozen views, so there is no plan that is too small."""
     random = np.random.default_rng(0)
     means, colors = random.uniform(-0.5, 0.5, (40, 3)), random.uniform(size=(40, 3))
     scene = jax.tree.map(jnp.asarray, gaussians_from_points(means, colors))
@@ -107,9 +108,7 @@ def stream_step_case():
     """A frame of parts, with a picture of the past."""
     batch, bodies = batch_of(two_boxes())
     params = params_of(shifted(0.01), soft(bodies), bodies)
-    small = replace(batch.plan, capacity=16)
-    tight = batch._replace(plan=small, past_plan=small)
-    return parts_step(PartsConfig()), params, batch, batch._replace(progress=jnp.nan), tight
+    return parts_step(PartsConfig()), params, batch, batch._replace(progress=jnp.nan)
 
 
 def refine_step_case():
@@ -119,8 +118,7 @@ def refine_step_case():
     poses = jax.tree.map(lambda a: jnp.stack([a, a]), rest)
     params = RefineParams(scene.movable, scene.fixed, poses)
     batch = RefineBatch(scene, given.weights, given.now, jnp.int32(1), jnp.int32(0), 0.0, given.plan)
-    tight = batch._replace(plan=replace(batch.plan, capacity=16))
-    return parts_step(PartsConfig()), params, batch, batch._replace(progress=jnp.nan), tight
+    return parts_step(PartsConfig()), params, batch, batch._replace(progress=jnp.nan)
 
 
 @cache
@@ -136,11 +134,10 @@ def track_step_case():
     tracker = Track(TRACK)
     shape, run = tracker.start(scene, first)
     plan = run.plans[PLAN]
+    plan = replace(plan, near=replace(plan.near, capacity=256))  # for the scene and little more
     batch = TrackBatch(second, plan)
     sick = TrackBatch(eqx.tree_at(lambda f: f.images, second, jnp.full_like(second.images, jnp.nan)), plan)
-    tight = batch._replace(plan=replace(plan, near=replace(plan.near, capacity=16)))
-    first_batch = TrackBatch(first, plan)
-    return tracker.step(shape), run.params, batch, sick, tight, first_batch
+    return tracker.step(shape), run.params, batch, sick, TrackBatch(first, plan)
 
 
 def features_case():
@@ -151,9 +148,11 @@ def features_case():
     known = valid, prior, jnp.ones(gaussians.num), jnp.float32(0.1), plan
     batch = FeatureBatch(gaussians, first.cameras, first.images, *known)
     sick = batch._replace(maps=jnp.full_like(first.images, jnp.nan))
-    return feature_distiller(), prior, batch, sick, batch._replace(plan=replace(plan, capacity=16))
+    return feature_distiller(), prior, batch, sick
 
 
+# Each makes a step, its params, a batch, one with a number that is not finite, and, for a step that needs it,
+# one to be seen before the others.
 STEPS = {
     "fit": fit_step_case,
     "distill": distill_step_case,
@@ -163,3 +162,17 @@ STEPS = {
     "track": track_step_case,
     "features": features_case,
 }
+
+WITHOUT_PLAN = ("distill",)  # draws frozen views
+
+
+def enlarged(tree):
+    """The tree with its Gaussians fifty times as large."""
+
+    def larger(node):
+        return eqx.tree_at(lambda g: g.log_scales, node, node.log_scales + 4) if is_gaussians(node) else node
+
+    def is_gaussians(node):
+        return isinstance(node, Gaussians)
+
+    return jax.tree.map(larger, tree, is_leaf=is_gaussians)
