@@ -36,6 +36,12 @@ from tests.geometry.lenses import (
     x64,
 )
 
+undistorted_map = jax.jit(undistort_map, static_argnames=("width", "height", "model"))
+distorted_map = jax.jit(distort_map, static_argnames=("width", "height", "model"))
+undistorted_image = jax.jit(undistort_image, static_argnames=("size", "model"))
+distorted_image = jax.jit(distort_image, static_argnames=("size", "model"))
+sampled = jax.jit(sample)
+
 
 @x64
 @two_lenses
@@ -45,9 +51,7 @@ def test_maps_are_those_of_opencv_half_a_pixel_on(lens, pinhole):
     new = K if pinhole is None else pinhole
     init = cv2.fisheye.initUndistortRectifyMap if model == "opencv_fisheye" else cv2.initUndistortRectifyMap
     maps = init(for_cv(K), np.asarray(coeffs), np.eye(3), for_cv(new), (WIDTH, HEIGHT), cv2.CV_32FC1)
-    pixels = undistort_map(
-        jnp.asarray(K), coeffs, WIDTH, HEIGHT, None if pinhole is None else jnp.asarray(pinhole), model
-    )
+    pixels = np.asarray(undistorted_map(K, coeffs, WIDTH, HEIGHT, pinhole, model))
     np.testing.assert_allclose(pixels - 0.5, np.stack(maps, -1), atol=1e-5)  # theirs are float32
 
 
@@ -55,13 +59,14 @@ def test_maps_are_those_of_opencv_half_a_pixel_on(lens, pinhole):
 @two_lenses
 def test_the_two_maps_are_inverse_also_with_skew(lens):
     model, coeffs = lens_of(lens)
-    skewed = jnp.asarray(K).at[0, 1].set(0.7)
-    there, valid = distort_map(skewed, coeffs, WIDTH, HEIGHT, jnp.asarray(PINHOLE_K), model)
+    skewed = K.copy()
+    skewed[0, 1] = 0.7
+    there, valid = jax.device_get(distorted_map(skewed, coeffs, WIDTH, HEIGHT, PINHOLE_K, model))
     assert valid.all()
     inverse = np.linalg.inv(PINHOLE_K)
     rays = np.concatenate([there, np.ones((HEIGHT, WIDTH, 1))], -1) @ inverse.T
     bent = cv_distorted(rays[..., :2].reshape(-1, 2), coeffs, model)
-    pixels = np.concatenate([bent, np.ones((len(bent), 1))], -1) @ np.asarray(skewed).T
+    pixels = np.concatenate([bent, np.ones((len(bent), 1))], -1) @ skewed.T
     np.testing.assert_allclose(pixels[:, :2].reshape(HEIGHT, WIDTH, 2), pixel_grid(WIDTH, HEIGHT), atol=1e-9)
 
 
@@ -70,7 +75,7 @@ def test_sampling_is_bilinear_as_in_scipy_and_opencv():
     image = picture()
     pixels = np.random.default_rng(3).uniform([0.5, 0.5], [WIDTH - 0.5, HEIGHT - 0.5], (20, 30, 2))
     pixels[0, :3] = [[0.5, 0.5], [WIDTH - 0.5, HEIGHT - 0.5], [10.5, 7.5]]
-    values, valid = sample(jnp.asarray(image), jnp.asarray(pixels))
+    values, valid = jax.device_get(sampled(image, pixels))
     assert valid.all()
     at = np.moveaxis(pixels - 0.5, -1, 0)[::-1]
     want = np.stack([scipy.ndimage.map_coordinates(image[..., c], at, order=1) for c in range(3)], -1)
@@ -80,22 +85,24 @@ def test_sampling_is_bilinear_as_in_scipy_and_opencv():
     coarse = np.round(pixels * 32) / 32
     x, y = np.float32(np.moveaxis(coarse - 0.5, -1, 0))
     theirs = cv2.remap(np.float32(image), x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    np.testing.assert_allclose(sample(jnp.asarray(image), jnp.asarray(coarse)).image, theirs, atol=1e-5)
+    np.testing.assert_allclose(sampled(image, coarse).image, theirs, atol=1e-5)
 
 
 def test_sampling_says_what_lies_outside_or_has_no_value():
-    image = jnp.asarray(picture(6, 4), jnp.float32).at[1, 2, 0].set(jnp.nan)
-    pixels = jnp.array([[[0.4, 2.0], [0.5, 2.0], [5.5, 3.5], [5.6, 3.5], [jnp.nan, 1.0]]])
-    values, valid = sample(image, pixels)
+    image = np.float32(picture(6, 4))
+    image[1, 2, 0] = np.nan
+    pixels = np.float32([[[0.4, 2.0], [0.5, 2.0], [5.5, 3.5], [5.6, 3.5], [np.nan, 1.0]]])
+    values, valid = jax.device_get(sampled(image, pixels))
     np.testing.assert_array_equal(valid, [[False, True, True, False, False]])
     np.testing.assert_array_equal(values[~valid], 0.0)
-    touched = sample(image, pixel_grid(6, 4) + jnp.array([0.25, 0.0])).valid
+    centres = np.asarray(pixel_grid(6, 4))
+    touched = sampled(image, centres + np.float32([0.25, 0.0])).valid
     expected = np.ones((4, 6), bool)
     expected[:, 5] = expected[1, 1] = expected[1, 2] = False
     np.testing.assert_array_equal(touched, expected)
-    centred = sample(image, pixel_grid(6, 4))
-    assert centred.valid.sum() == 23  # a neighbour of weight 0 spoils nothing
-    gradient = jax.grad(lambda i: sample(i, pixel_grid(6, 4) + 0.25).image.sum())(image)
+    centred = sampled(image, centres)
+    assert np.asarray(centred.valid).sum() == 23  # a neighbour of weight 0 spoils nothing
+    gradient = jax.jit(jax.grad(lambda i: sampled(i, centres + 0.25).image.sum()))(image)
     assert np.isfinite(gradient).all()
 
 
@@ -103,7 +110,7 @@ def test_sampling_says_what_lies_outside_or_has_no_value():
 def test_photographs_are_undistorted_as_opencv_does(lens):
     model, coeffs = lens_of(lens, np.float32)
     photo = np.float32(picture(blur=3.0))
-    ours = undistort_image(jnp.asarray(photo), jnp.asarray(K, jnp.float32), coeffs, model=model)
+    ours = jax.device_get(undistorted_image(photo, np.float32(K), coeffs, model=model))
     if model == "opencv_fisheye":
         theirs = cv2.fisheye.undistortImage(photo, for_cv(K), np.float64(coeffs), Knew=for_cv(K))
     else:
@@ -115,20 +122,20 @@ def test_photographs_are_undistorted_as_opencv_does(lens):
 
 def test_the_optical_axis_stays_where_it_is():
     # The axis meets the centre of pixel (10, 20); with any other convention a strong lens would move it.
-    centred = jnp.asarray(K, jnp.float32).at[:2, 2].set(jnp.array([20.5, 10.5]))
-    image = jnp.asarray(picture(), jnp.float32)
-    for warp in (distort_image, undistort_image):
-        warped, valid = warp(image, centred, jnp.array([-0.3, 0.1, 0.0, 0.0]))
+    centred, image = np.float32(K), np.float32(picture())
+    centred[:2, 2] = [20.5, 10.5]
+    for warp in (distorted_image, undistorted_image):
+        warped, valid = jax.device_get(warp(image, centred, np.float32([-0.3, 0.1, 0.0, 0.0])))
         assert valid[10, 20]
         np.testing.assert_allclose(warped[10, 20], image[10, 20], atol=1e-5)
-        assert jnp.abs(warped[10, 30] - image[10, 30]).max() > 0.01
+        assert np.abs(warped[10, 30] - image[10, 30]).max() > 0.01
 
 
 def test_no_lens_changes_no_image():
-    image, matrix = jnp.asarray(picture(), jnp.float32), jnp.asarray(K, jnp.float32)
-    for warp in (distort_image, undistort_image):
-        warped, valid = warp(image, matrix, jnp.zeros(5))
-        assert valid.all()
+    image = np.float32(picture())
+    for warp in (distorted_image, undistorted_image):
+        warped, valid = warp(image, np.float32(K), np.zeros(5, np.float32))
+        assert np.asarray(valid).all()
         np.testing.assert_allclose(warped, image, atol=1e-5)
 
 
@@ -137,15 +144,16 @@ def test_no_lens_changes_no_image():
 def test_a_distorted_image_shows_what_opencv_projects(lens):
     model, coeffs = lens_of(lens)
     wide_K, width, height = with_margin(jnp.asarray(K), WIDTH, HEIGHT, 40)
+    wide_K = np.asarray(wide_K)
 
     def scene(points):  # colours by direction, smooth enough for bilinear interpolation to be accurate
-        return jnp.stack([jnp.sin(3 * points[..., 0]), jnp.cos(2 * points[..., 1]), points[..., 0]], -1)
+        return np.stack([np.sin(3 * points[..., 0]), np.cos(2 * points[..., 1]), points[..., 0]], -1)
 
-    rays = (pixel_grid(width, height) - wide_K[:2, 2]) / jnp.diag(wide_K)[:2]
-    warped, valid = distort_image(
-        scene(rays), jnp.asarray(K), coeffs, pinhole_K=wide_K, size=(WIDTH, HEIGHT), model=model
+    rays = (np.asarray(pixel_grid(width, height)) - wide_K[:2, 2]) / np.diag(wide_K)[:2]
+    warped, valid = distorted_image(
+        scene(rays), K, coeffs, pinhole_K=wide_K, size=(WIDTH, HEIGHT), model=model
     )
-    assert valid.all()
+    assert np.asarray(valid).all()
     pixels = (np.asarray(pixel_grid(WIDTH, HEIGHT)) - K[:2, 2]) / np.diag(K)[:2]
     seen = cv_undistorted(pixels.reshape(-1, 2), coeffs, model).reshape(HEIGHT, WIDTH, 2)
     np.testing.assert_allclose(warped, scene(seen), atol=2e-3)
@@ -187,10 +195,10 @@ def scene_and_plan(means, sigma, seed=0, **options):
         "scales": np.full((n, 3), sigma),
         "opacities": np.full(n, 0.8),
     }
-    scene = {k: jnp.asarray(v, jnp.float32) for k, v in arrays.items()}
+    scene = {k: jnp.asarray(np.float32(v)) for k, v in arrays.items()}
     wide, width, height = with_margin(jnp.asarray(intrinsics(36.0, WIDTH, HEIGHT)), WIDTH, HEIGHT, MARGIN)
     p = plan(*scene.values(), VIEWMAT[None], wide[None], width, height, headroom=2.0, **options)
-    return scene | {"colors": jnp.asarray(rng.uniform(size=(n, 3)), jnp.float32)}, p
+    return scene | {"colors": jnp.asarray(np.float32(rng.uniform(size=(n, 3))))}, p
 
 
 @pytest.mark.parametrize("lens", ["4", "fisheye"])
@@ -199,17 +207,22 @@ def test_a_gaussian_is_seen_where_opencv_projects_its_centre(lens):
     camera = jnp.asarray(intrinsics(36.0, WIDTH, HEIGHT), jnp.float32)
     centre = np.array([[0.2, 0.7, -0.4]])
     scene, p = scene_and_plan(centre, 0.04)
-    image, wide, _ = rendered(scene, camera, p)
-    seen, valid = distort_image(image, camera, coeffs, pinhole_K=wide, size=(WIDTH, HEIGHT), model=model)
-    weights = np.where(np.asarray(valid), np.asarray(seen).sum(-1), 0.0)
+
+    @jax.jit
+    def through_the_lens(scene):
+        image, wide, _ = rendered(scene, camera, p)
+        return distort_image(image, camera, coeffs, pinhole_K=wide, size=(WIDTH, HEIGHT), model=model)
+
+    seen, valid = jax.device_get(through_the_lens(scene))
+    weights = np.where(valid, seen.sum(-1), 0.0)
     found = (weights[..., None] * pixel_grid(WIDTH, HEIGHT)).sum((0, 1)) / weights.sum()
     K_cv, R, t = for_cv(camera), np.asarray(VIEWMAT[:3, :3], np.float64), np.float64(VIEWMAT[:3, 3])
     if model == "opencv_fisheye":
         want = cv2.fisheye.projectPoints(centre[None], cv2.Rodrigues(R)[0], t, K_cv, np.float64(coeffs))[0]
     else:
         want = cv2.projectPoints(centre, cv2.Rodrigues(R)[0], t, K_cv, np.float64(coeffs))[0]
-    plain, _ = project(jnp.asarray(centre, jnp.float32), VIEWMAT, camera)
-    assert np.linalg.norm(want.ravel() + 0.5 - plain) > 0.5  # the lens has a visible effect
+    plain, _ = jax.jit(project)(np.float32(centre), VIEWMAT, camera)
+    assert np.linalg.norm(want.ravel() + 0.5 - np.asarray(plain)) > 0.5  # the lens has a visible effect
     np.testing.assert_allclose(
         found, want.ravel() + 0.5, atol=0.1
     )  # a blob's centre is not its middle's image

@@ -19,12 +19,15 @@ from tests.methods.carton import CONFIG, SIZE, error, gap, see
 
 # Compiled once for calls that differ in values alone.
 found_by = jax.jit(align, static_argnums=4)
+carried = jax.jit(carry)
+residuals = jax.jit(_residuals, static_argnums=2)
+normal_equations = jax.jit(_normal_equations, static_argnums=4)
 
 
 def run(points, center, sight, config=CONFIG):
     """(the twist found from standing still, where it carries the points)."""
-    found = found_by(jnp.zeros(6), points, center, sight, config)
-    return found, np.asarray(carry(points, found, center).means)
+    found = found_by(np.zeros(6, np.float32), points, center, sight, config)
+    return found, np.asarray(carried(points, found, center).means)
 
 
 def without_depth(sight):
@@ -48,7 +51,7 @@ def test_colour_alone_finds_it_too(moved):
 @pytest.mark.parametrize("depth", [True, False])
 def test_a_group_that_nobody_sees_stands_still(moved, depth):
     points, center, sight, _, _ = moved
-    unseen = points._replace(seen=jnp.zeros_like(points.seen))
+    unseen = points._replace(seen=jnp.zeros(points.seen.shape))
     found, _ = run(unseen, center, sight if depth else without_depth(sight))
     np.testing.assert_allclose(found, 0, atol=1e-6)
     assert gap(unseen, sight) == 0
@@ -58,14 +61,16 @@ def test_disagreement_is_nothing_for_a_perfect_fit_and_half_outside_the_picture(
     points = moved[0]
     _, frames, _ = table(8, 2, **SIZE)
     assert gap(points, see(frames[6])) < 1e-3
-    away = points._replace(means=points.means + jnp.array([0.0, 50.0, 0.0])[:, None])
+    away = points._replace(means=jnp.asarray(points.means + np.float32([0.0, 50.0, 0.0])[:, None]))
     np.testing.assert_allclose(gap(away, see(frames[6])), 0.5, atol=1e-6)
 
 
 def test_bilinear_reads_between_pixel_centres_and_knows_its_slope():
-    image = jnp.asarray(np.mgrid[0:4, 0:5].transpose(1, 2, 0) + 0.5, jnp.float32)  # (row, column) of centres
-    places = jnp.array([[2.3, 1.7], [0.5, 0.5], [4.5, 3.5]])
-    read = bilinear(image, pixel_position(*places.T, 5, 4))
+    image = np.float32(np.mgrid[0:4, 0:5].transpose(1, 2, 0) + 0.5)  # (row, column) of centres
+    places = np.float32([[2.3, 1.7], [0.5, 0.5], [4.5, 3.5]])
+    read = jax.device_get(
+        jax.jit(lambda image, *at: bilinear(image, pixel_position(*at, 5, 4)))(image, *places.T)
+    )
     np.testing.assert_allclose(read.values.T, places[:, ::-1], atol=2e-3)
     np.testing.assert_allclose(read.slopes, np.tile([[[0], [1]], [[1], [0]]], 3), atol=1e-6)
     np.testing.assert_allclose(read.nearest.T, [[1.5, 2.5], [0.5, 0.5], [3.5, 4.5]])
@@ -76,17 +81,19 @@ def test_gradients_of_residuals_are_those_of_finite_differences(moved, depth):
     points, _, sight, _, _ = moved
     sight = sight if depth else without_depth(sight)
     # Off the centres of pixels, where a bilinear image has its kinks.
-    one = Points(points.means[..., :20] + 1.3e-3, points.tones[..., :20], points.seen[..., :20])
-    found = _residuals(one, sight, CONFIG)
-    small = 2e-5
+    one = Points(*(np.asarray(a)[..., :20] for a in points))
+    one = one._replace(means=one.means + np.float32(1.3e-3))
+    gradients = np.asarray(residuals(one, sight, CONFIG).gradients)
+    small = np.float32(2e-5)
     for axis in range(3):
-        step = small * jnp.eye(3)[axis][:, None]
+        step = small * np.eye(3, dtype=np.float32)[axis][:, None]
         ahead, behind = (
-            _residuals(one._replace(means=one.means + s * step), sight, CONFIG).values for s in (1, -1)
+            np.asarray(residuals(one._replace(means=one.means + s * step), sight, CONFIG).values, np.float64)
+            for s in (1, -1)
         )
-        slope = np.asarray(ahead - behind, np.float64) / (2 * small)
+        slope = (ahead - behind) / (2 * small)
         # A depth edge is a jump: few points sit on one.
-        close = np.isclose(slope, found.gradients[:, axis], rtol=0.05, atol=2.0)
+        close = np.isclose(slope, gradients[:, axis], rtol=0.05, atol=2.0)
         assert close.mean() > 0.9
 
 
@@ -95,27 +102,28 @@ def test_normal_equations_are_those_of_differentiation(moved, depth):
     """J^T W J and J^T W r, put together by hand, against the Jacobian that forward mode has."""
     points, center, sight, _, _ = moved
     sight = sight if depth else without_depth(sight)
-    fit = _normal_equations(jnp.zeros(6), points, center, sight, CONFIG)
+    still = np.zeros(6, np.float32)
+    fit = normal_equations(still, points, center, sight, CONFIG)
 
     def values(twist):
         return _residuals(carry(points, twist, center), sight, CONFIG).values
 
-    jacobian, base = jax.jacfwd(values)(jnp.zeros(6)), _residuals(points, sight, CONFIG)
+    jacobian, base = jax.device_get((jax.jit(jax.jacfwd(values))(still), residuals(points, sight, CONFIG)))
     squared = base.values**2
-    squared = squared.at[:, :3].set(squared[:, :3].mean(1, keepdims=True))
+    squared[:, :3] = squared[:, :3].mean(1, keepdims=True)
     counts = base.counts[:, [0, 0, 0, 1][: squared.shape[1]]]  # the channels of colour share theirs
-    weights = points.seen[:, None] * counts / (1 + squared) ** 2
-    expected = jnp.einsum("cdpi,cdp,cdpj->ij", jacobian, weights, jacobian)
-    np.testing.assert_allclose(fit.hessian, expected, rtol=1e-3, atol=1e-3 * float(jnp.abs(expected).max()))
-    expected = jnp.einsum("cdpi,cdp,cdp->i", jacobian, weights, base.values)
-    np.testing.assert_allclose(fit.gradient, expected, rtol=1e-3, atol=1e-3 * float(jnp.abs(expected).max()))
+    weights = np.asarray(points.seen)[:, None] * counts / (1 + squared) ** 2
+    expected = np.einsum("cdpi,cdp,cdpj->ij", jacobian, weights, jacobian)
+    np.testing.assert_allclose(fit.hessian, expected, rtol=1e-3, atol=1e-3 * np.abs(expected).max())
+    expected = np.einsum("cdpi,cdp,cdp->i", jacobian, weights, base.values)
+    np.testing.assert_allclose(fit.gradient, expected, rtol=1e-3, atol=1e-3 * np.abs(expected).max())
 
 
 def test_many_starts_at_once_are_each_alone(moved):
     points, center, sight, _, _ = moved
-    starts = 0.004 * jax.random.normal(jax.random.key(0), (3, 6))
-    together = jax.vmap(align, in_axes=(0, None, None, None, None))(starts, points, center, sight, CONFIG)
-    alone = jnp.stack([align(start, points, center, sight, CONFIG) for start in starts])
+    starts = np.float32(0.004 * np.random.default_rng(0).normal(size=(3, 6)))
+    together = jax.vmap(lambda start: found_by(start, points, center, sight, CONFIG))(starts)
+    alone = np.stack([found_by(start, points, center, sight, CONFIG) for start in starts])
     np.testing.assert_allclose(together, alone, atol=2e-4)
 
 
@@ -127,10 +135,11 @@ def test_a_ball_grid_holds_the_origin_and_nothing_outside():
 
 
 def test_turn_hypotheses_hold_the_start_and_turns_about_its_own_axes():
-    twist = jnp.array([0.1, 0.2, 0.3, 0.0, 0.0, 0.4])
-    hypotheses = turn_hypotheses(twist, jnp.eye(3), (0.2, 0.6))
+    twist = np.float32([0.1, 0.2, 0.3, 0.0, 0.0, 0.4])
+    turned = jax.jit(turn_hypotheses, static_argnums=2)
+    hypotheses = np.asarray(turned(twist, np.eye(3, dtype=np.float32), (0.2, 0.6)))
     assert hypotheses.shape == (13, 6)
     np.testing.assert_allclose(hypotheses[0], twist, atol=1e-6)
-    np.testing.assert_allclose(hypotheses[:, :3], jnp.tile(twist[:3], (13, 1)))
+    np.testing.assert_allclose(hypotheses[:, :3], np.tile(twist[:3], (13, 1)))
     about_z = [float(h[5]) for h in hypotheses if np.allclose(h[3:5], 0, atol=1e-6)]
     np.testing.assert_allclose(sorted(about_z), [-0.2, 0.2, 0.4, 0.6, 1.0], atol=1e-5)

@@ -37,7 +37,7 @@ from tests.engine.cases import FIT
 from tests.methods.tissue import CONFIG, tissue
 
 ROOT = Path(__file__).resolve().parents[2]
-CODES = jnp.eye(7, 8)
+CODES = jnp.asarray(np.eye(7, 8), jnp.float32)
 RADIUS = 0.5
 
 
@@ -137,44 +137,47 @@ class TestOneStep:
         assert set(terms) - {"overflow"} <= set(info)
 
 
+ids_seen = jax.jit(seen_ids)
+
+
 class TestSeenIds:
     def test_they_are_those_of_the_pixels_that_show_a_place(self, small, table):
         sequence, _, _ = table()
         batch = small.batches[0]
-        frame, ids = batch.frame, small.ids[0]
+        frame, ids = jax.device_get((batch.frame, small.ids[0]))
         # Points of camera 1's own depth: it sees all of them, and has its mask's ids for them.
-        rows, columns = np.nonzero(np.asarray(frame.depths[1]) > 0)
+        rows, columns = np.nonzero(frame.depths[1] > 0)
         places = _unprojected(frame, 1, rows, columns)
         alone = jax.tree.map(lambda a: a[1:], frame.cameras)
-        found = seen_ids(places, alone, ids[1:], frame.depths[1:])
+        found = ids_seen(places, alone, ids[1:], frame.depths[1:])
         np.testing.assert_array_equal(found, sequence.mask(0, 1)[rows, columns])
         # A teacher's grid of half the size has that of the pixel at the same share of the picture.
-        half = seen_ids(places, alone, ids[1:, ::2, ::2], frame.depths[1:])
-        np.testing.assert_array_equal(half, np.asarray(ids)[1, ::2, ::2][rows // 2, columns // 2])
+        half = ids_seen(places, alone, ids[1:, ::2, ::2], frame.depths[1:])
+        np.testing.assert_array_equal(half, ids[1, ::2, ::2][rows // 2, columns // 2])
 
     def test_what_is_hidden_or_outside_has_none_and_the_next_camera_is_asked(self, small):
-        frame, ids = small.batches[0].frame, small.ids[0]
+        frame, ids = jax.device_get((small.batches[0].frame, small.ids[0]))
         rows, columns = (np.array([40, 41]), np.array([40, 50]))
         places = _unprojected(frame, 1, rows, columns)
-        nearer = frame.depths.at[1].multiply(0.5)
+        nearer = frame.depths * np.array([1, 0.5], np.float32)[:, None, None]
         alone = jax.tree.map(lambda a: a[1:], frame.cameras)
-        assert (seen_ids(places, alone, ids[1:], nearer[1:]) == -1).all()
-        assert (seen_ids(places + 100.0, frame.cameras, ids, frame.depths) == -1).all()
+        assert (np.asarray(ids_seen(places, alone, ids[1:], nearer[1:])) == -1).all()
+        assert (np.asarray(ids_seen(places + np.float32(100), frame.cameras, ids, frame.depths)) == -1).all()
         both = jax.tree.map(lambda a: a[::-1], frame.cameras)
-        turned = seen_ids(places, both, ids[::-1], frame.depths.at[1].multiply(0.5)[::-1])
+        turned = ids_seen(places, both, ids[::-1], nearer[::-1])
         first = jax.tree.map(lambda a: a[:1], frame.cameras)
-        np.testing.assert_array_equal(turned, seen_ids(places, first, ids[:1], frame.depths[:1]))
+        np.testing.assert_array_equal(turned, ids_seen(places, first, ids[:1], frame.depths[:1]))
 
 
 def _unprojected(frame, c, rows, columns):
-    pixels = jnp.asarray(np.stack([columns, rows], axis=1) + 0.5, jnp.float32)
-    depths = jnp.asarray(np.asarray(frame.depths[c])[rows, columns])
-    return unproject(pixels, depths, frame.cameras.viewmat[c], frame.cameras.K[c])
+    pixels = np.float32(np.stack([columns, rows], axis=1) + 0.5)
+    depths = frame.depths[c][rows, columns]
+    return np.asarray(jax.jit(unproject)(pixels, depths, frame.cameras.viewmat[c], frame.cameras.K[c]))
 
 
 def test_nodes_of_groups_are_blended_within_their_groups(small, started):
     groups = np.asarray(started.labels)
-    nodes = nodes_of(started.gaussians, 8, groups)
+    nodes = small.nodes
     of_nodes = groups[np.asarray(nodes.rows)]
     weights, indices = np.asarray(nodes.weights), np.asarray(nodes.indices)
     np.testing.assert_allclose(weights.sum(axis=1), 1.0, atol=1e-5)

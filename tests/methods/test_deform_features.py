@@ -22,6 +22,12 @@ from gsjax.scene.deformation import DeformationConfig, init_deformation
 from gsjax.scene.initialize import gaussians_from_points
 from tests.methods.tissue import CODES, CONFIG, tissue
 
+CODES32 = CODES.astype(np.float32)
+
+of_pictures = jax.jit(feature_loss)
+probabilities = jax.jit(prompt_probabilities)
+of_graph = jax.jit(graph_loss, static_argnums=2)
+
 
 @pytest.fixture(scope="module")
 def frames():
@@ -35,7 +41,7 @@ def ids():
 
 class TestFeatureLoss:
     def test_is_of_the_teachers_grid(self):
-        drawn = jnp.asarray(np.random.default_rng(0).uniform(size=(8, 12, 4)), jnp.float32)
+        drawn = np.random.default_rng(0).uniform(size=(8, 12, 4)).astype(np.float32)
         ids = np.zeros((4, 6), np.int32)
         ids[1, 2] = -1
         # A triangle two cells wide around the middle of each cell, in each axis.
@@ -44,24 +50,24 @@ class TestFeatureLoss:
             for n in ids.shape
         )
         by_rows, by_columns = (one / one.sum(axis=1, keepdims=True) for one in (by_rows, by_columns))
-        small = np.einsum("ir,jc,rcd->ijd", by_rows, by_columns, np.asarray(drawn))
+        small = np.einsum("ir,jc,rcd->ijd", by_rows, by_columns, drawn)
         expected = np.abs(small - CODES[0]).mean(-1)[ids >= 0].mean()
-        found = feature_loss(drawn, jnp.asarray(CODES, jnp.float32), jnp.asarray(ids))
+        found = of_pictures(drawn, CODES32, ids)
         np.testing.assert_allclose(found, expected, rtol=1e-6)
 
     def test_a_teacher_of_the_same_size_is_not_resized(self):
-        drawn = jnp.asarray(np.random.default_rng(1).uniform(size=(5, 7, 4)), jnp.float32)
-        found = feature_loss(drawn, jnp.asarray(CODES, jnp.float32), jnp.ones((5, 7), jnp.int32))
-        np.testing.assert_allclose(found, np.abs(np.asarray(drawn) - CODES[1]).mean(), rtol=1e-6)
+        drawn = np.random.default_rng(1).uniform(size=(5, 7, 4)).astype(np.float32)
+        found = of_pictures(drawn, CODES32, np.ones((5, 7), np.int32))
+        np.testing.assert_allclose(found, np.abs(drawn - CODES[1]).mean(), rtol=1e-6)
 
     def test_every_pixel_learns_from_a_coarse_teacher(self):
-        codes, ids = jnp.asarray(CODES, jnp.float32), jnp.zeros((3, 4), jnp.int32)
-        slope = jax.jit(jax.grad(feature_loss))(jnp.full((24, 32, 4), 2.0), codes, ids)
-        assert (jnp.abs(slope) > 0).all()
+        drawn, ids = np.full((24, 32, 4), 2.0, np.float32), np.zeros((3, 4), np.int32)
+        slope = jax.jit(jax.grad(feature_loss))(drawn, CODES32, ids)
+        assert (np.abs(slope) > 0).all()
 
     def test_without_labels_there_is_none(self):
-        drawn = jnp.ones((4, 4, 4))
-        assert feature_loss(drawn, jnp.asarray(CODES, jnp.float32), jnp.full((4, 4), -1)) == 0
+        drawn = np.ones((4, 4, 4), np.float32)
+        assert of_pictures(drawn, CODES32, np.full((4, 4), -1, np.int32)) == 0
 
 
 @pytest.fixture(scope="module")
@@ -84,28 +90,28 @@ class TestGraph:
         places = np.zeros((len(frames), len(nodes), 3))
         none = frame_graphs(places, nodes, covered, ids, CODES, CONFIG.graph, 0.05)
         assert not np.asarray(none[0].valid).any()
-        features = jnp.ones((nodes.max() + 1, 4))
-        assert all(value == 0 for value in graph_loss(features, none[0], CONFIG.graph).values())
+        features = np.ones((nodes.max() + 1, 4), np.float32)
+        assert all(value == 0 for value in of_graph(features, none[0], CONFIG.graph).values())
 
     def test_the_teachers_own_features_cost_nothing(self, graphs):
         """One class in view: features that are its code have no node loss, and no pair apart."""
         nodes, found = graphs
-        features = jnp.zeros((nodes.max() + 1, 4)).at[:, 0].set(1.0)
+        features = np.tile(CODES32[0], (nodes.max() + 1, 1))
         for kind, names in (("matching", ("node", "structure")), ("similarity", ("spatial", "temporal"))):
-            values = graph_loss(features, found[kind][0], replace(CONFIG.graph, kind=kind))
+            values = of_graph(features, found[kind][0], replace(CONFIG.graph, kind=kind))
             np.testing.assert_allclose([values[name] for name in names], 0, atol=1e-5)
-        apart = jnp.asarray(np.random.default_rng(0).normal(size=features.shape), jnp.float32)
+        apart = np.random.default_rng(0).normal(size=features.shape).astype(np.float32)
         for kind in found:
-            values = graph_loss(apart, found[kind][0], replace(CONFIG.graph, kind=kind))
+            values = of_graph(apart, found[kind][0], replace(CONFIG.graph, kind=kind))
             assert sum(values.values()) > 0.01
 
     def test_gradients_reach_only_nodes(self, graphs):
         nodes, found = graphs
-        features = jnp.asarray(np.random.default_rng(0).normal(size=(nodes.max() + 5, 4)), jnp.float32)
+        features = np.random.default_rng(0).normal(size=(nodes.max() + 5, 4)).astype(np.float32)
         slope = jax.jit(jax.grad(lambda f: sum(graph_loss(f, found["matching"][2], CONFIG.graph).values())))(
             features
         )
-        assert jnp.isfinite(slope).all()
+        assert np.isfinite(slope).all()
         others = np.setdiff1d(np.arange(len(features)), nodes)
         assert (np.asarray(slope)[others] == 0).all()
         assert (np.asarray(slope)[nodes] != 0).any()
@@ -115,19 +121,24 @@ class TestGraph:
 @pytest.mark.parametrize("changes", [True, False])
 def test_features_of_some_at_times_are_those_of_the_scene_there(kind, changes):
     points = np.random.default_rng(0).uniform(0, 1, (20, 3)).astype(np.float32)
-    gaussians = gaussians_from_points(points, points)
     values = jax.random.normal(jax.random.key(1), (20, 3))
+    gaussians = gaussians_from_points(points, points)
     gaussians = eqx.tree_at(lambda g: g.features, gaussians, values, is_leaf=lambda leaf: leaf is None)
     config = DeformationConfig(
         resolution=4, time_resolution=3, levels=1, channels=2, hidden=5, feature=changes
     )
-    field = init_deformation(jax.random.key(2), config, np.array([[0, 0, 0], [1, 1, 1]]), 3)
-    field = jax.tree.map(lambda leaf: leaf + 0.1 * jax.random.normal(jax.random.key(3), leaf.shape), field)
-    scene = DeformingScene(gaussians, field)
-    moving = {"all": None, "rows": jnp.array([1, 4, 7, 20]), "nodes": nodes_of(gaussians, 6)}[kind]
-    times, some = jnp.array([0.0, 0.3, 1.0]), jnp.array([4, 0, 9])
-    found = scene.features_at(times, some, moving)
-    wanted = jnp.stack([scene.at(time, moving).features[some] for time in times])
+
+    @jax.jit
+    def noisy():
+        field = init_deformation(jax.random.key(2), config, np.array([[0, 0, 0], [1, 1, 1]]), 3)
+        return jax.tree.map(lambda leaf: leaf + 0.1 * jax.random.normal(jax.random.key(3), leaf.shape), field)
+
+    scene = DeformingScene(gaussians, noisy())
+    moving = {"all": None, "rows": np.array([1, 4, 7, 20]), "nodes": nodes_of(gaussians, 6)}[kind]
+    times, some = np.array([0.0, 0.3, 1.0], np.float32), np.array([4, 0, 9])
+    found = jax.jit(DeformingScene.features_at)(scene, times, some, moving)
+    at = jax.jit(DeformingScene.at)
+    wanted = np.stack([np.asarray(at(scene, time, moving).features)[some] for time in times])
     np.testing.assert_allclose(found, wanted, atol=1e-6)
     assert (np.ptp(found, axis=0).max() > 1e-3) == changes
 
@@ -141,15 +152,15 @@ class TestPrompts:
             np.linalg.norm(features, axis=1), np.linalg.norm(prompts, axis=1)
         )
         expected = np.exp(cosines / 0.1) / np.exp(cosines / 0.1).sum(axis=1, keepdims=True)
-        found = prompt_probabilities(jnp.asarray(features), jnp.asarray(prompts))
+        found = probabilities(features, prompts)
         np.testing.assert_allclose(found, expected, atol=1e-12)
-        longer = prompt_probabilities(jnp.asarray(1e3 * features), jnp.asarray(1e-3 * prompts))
+        longer = probabilities(1e3 * features, 1e-3 * prompts)
         np.testing.assert_allclose(longer, expected, atol=1e-12)
 
     def test_a_feature_of_length_0_makes_all_equally_likely(self):
-        features = jnp.zeros((2, 4)).at[1, 0].set(1.0)
-        found = prompt_probabilities(features, jnp.asarray(CODES))
+        features = np.array([[0.0, 0, 0, 0], [1, 0, 0, 0]])
+        found = probabilities(features, CODES)
         np.testing.assert_allclose(found[0], 0.5)
         assert found[1, 0] > 0.99
         slope = jax.jit(jax.grad(lambda f: prompt_probabilities(f, jnp.asarray(CODES))[:, 0].sum()))(features)
-        assert jnp.isfinite(slope).all()
+        assert np.isfinite(slope).all()

@@ -43,6 +43,12 @@ GRID = FeatureGridConfig(
 QUICK = DistillConfig(iterations=120, channels=12, grid=GRID, contrast_patch=8)
 BOOK = np.linalg.qr(np.random.default_rng(0).normal(size=(DIMENSION, 3)))[0].T.astype(np.float32)
 
+painted = jax.jit(paint)
+features_now = jax.jit(features_of)
+rendered_now = jax.jit(rendered_features)
+cosines_now = jax.jit(gaussian_cosines)
+pixels_now = jax.jit(pixel_cosines)
+
 
 def cameras(count: int) -> list[Camera]:
     angles = np.linspace(0, 2 * np.pi, count, endpoint=False)
@@ -66,7 +72,7 @@ def two_balls():
     labels = np.repeat([1, 2], 80)
     masks = []
     for view, plan in frozen_views(scene, cameras(8)):
-        shares = np.asarray(paint(view, jax.nn.one_hot(labels, 3), plan)[0])
+        shares = np.asarray(painted(view, np.eye(3, dtype=np.float32)[labels], plan)[0])
         masks.append(np.where(shares.sum(-1) > 0.5, shares.argmax(-1), 0))
     return scene, labels, masks
 
@@ -97,12 +103,12 @@ def copied(leaf):
 def test_rendering_the_hidden_layer_equals_rendering_features(problem):
     given, run = problem
     batch = given.views[0]
-    parts = rendered_features(run.params, batch.located)
-    image, alphas = paint(batch.view, parts.values, batch.plan)
-    some = rendered_features(run.params, batch.located, batch.view.rows)
-    np.testing.assert_array_equal(paint_shown(batch.view, some.values, batch.plan)[0], image)
+    parts = rendered_now(run.params, batch.located)
+    image, alphas = painted(batch.view, parts.values, batch.plan)
+    some = rendered_now(run.params, batch.located, batch.view.rows)
+    np.testing.assert_array_equal(jax.jit(paint_shown)(batch.view, some.values, batch.plan)[0], image)
     of_hidden = parts.channels_of(parts.joined(image, alphas))
-    of_features, _ = paint(batch.view, features_of(run.params, batch.located), batch.plan)
+    of_features, _ = painted(batch.view, features_now(run.params, batch.located), batch.plan)
     assert parts.values.shape[1] == 16 != of_features.shape[-1]
     np.testing.assert_allclose(of_hidden, of_features, atol=1e-5)
 
@@ -137,16 +143,15 @@ def test_only_active_entries_are_trained_and_the_full_grid_agrees(two_balls):
     field, located = init_field(jax.random.key(0), QUICK, scene.means, DIMENSION)
     small, near, rows = active_table(field, located)
     assert small.encoding.table.shape[0] < field.encoding.table.shape[0]
-    np.testing.assert_array_equal(features_of(small, near), features_of(field, located))
+    of_all = features_now(field, located)
+    np.testing.assert_array_equal(features_now(small, near), of_all)
     again = full_table(small, rows)
-    np.testing.assert_array_equal(
-        features_of(again, locate(again.encoding, scene.means)), features_of(field, located)
-    )
+    np.testing.assert_array_equal(features_now(again, locate(again.encoding, scene.means)), of_all)
 
 
 def test_it_learns_the_label_of_each_gaussian(two_balls, learned, problem):
     _, labels, _ = two_balls
-    cosines = np.asarray(gaussian_cosines(learned, problem[0].views[0].located, jnp.asarray(BOOK)))
+    cosines = np.asarray(cosines_now(learned, problem[0].views[0].located, BOOK))
     assert (cosines[:, 1:].argmax(1) + 1 == labels).mean() > 0.97
     assert np.median(cosines[np.arange(160), labels]) > 0.7
 
@@ -166,7 +171,7 @@ class Numerals:
 def test_the_result_scores_its_gaussians_and_others(two_balls, result, problem):
     scene, *_ = two_balls
     vectors = BOOK[[2, 1]]
-    want = relevancy(gaussian_cosines(result.field, problem[0].views[0].located, jnp.asarray(vectors)))
+    want = relevancy(cosines_now(result.field, problem[0].views[0].located, vectors))
     np.testing.assert_allclose(result.scores(vectors), want, atol=1e-6)
     assert result.features().shape == (160, 12)
     some = replace(result, means=scene.means[::2])
@@ -190,15 +195,15 @@ def test_2d_and_3d_agree_and_occluded_objects_are_selected_whole(two_balls, lear
     # Camera 6 looks along y: one ball is behind the other.
     hidden = [v for v, mask in enumerate(masks) if (mask == 2).sum() < 0.3 * (mask == 1).sum()]
     assert hidden
-    query = jnp.asarray(BOOK[[2, 0, 1]])
-    scores = relevancy(gaussian_cosines(learned, given.views[0].located, query))
+    query = BOOK[[2, 0, 1]]
+    scores = relevancy(cosines_now(learned, given.views[0].located, query))
     selected = np.asarray(scores > threshold_for(np.asarray(scores), True).value)
     assert (selected == (labels == 2)).mean() > 0.97
     for v, (view, plan) in enumerate(frozen_views(scene, cameras(8))):
-        parts = rendered_features(learned, given.views[0].located, view.rows)
-        of_pixels, alphas = pixel_cosines(learned, parts, view, plan, query)
-        flat = np.asarray((relevancy(of_pixels) > 0.5) & (alphas > 0.5))
-        solid = np.asarray(paint(view, jnp.asarray(selected, jnp.float32)[:, None], plan)[0][..., 0]) > 0.5
+        parts = rendered_now(learned, given.views[0].located, view.rows)
+        of_pixels, alphas = pixels_now(learned, parts, view, plan, query)
+        flat = (np.asarray(relevancy(of_pixels)) > 0.5) & (np.asarray(alphas) > 0.5)
+        solid = np.asarray(painted(view, np.float32(selected)[:, None], plan)[0])[..., 0] > 0.5
         true = masks[v] == 2
         for found in (flat, solid):
             assert (found & true).sum() >= 0.8 * (found | true).sum() or v in hidden
@@ -219,23 +224,23 @@ def test_a_vector_for_each_gaussian_learns_too_and_weights_of_zero_cost_nothing(
 
 def test_inverses_rank_gaussians_as_the_exact_query_does(learned, problem):
     located = problem[0].views[0].located
-    query = jnp.asarray(BOOK[1:])
-    exact = np.asarray(gaussian_cosines(learned, located, query))
-    features = features_of(learned, located)
+    query = BOOK[1:]
+    exact = np.asarray(cosines_now(learned, located, query))
+    features = features_now(learned, located)
     inverse, losses = learned_inverse(learned.lift, features, jax.random.key(0), 300, 256)
     assert losses[-1] < 0.2 * losses[0]
     for back in (jnp.linalg.pinv(learned.lift), inverse):
-        found = np.asarray(back_projected_cosines(learned, located, query, back))
+        found = np.asarray(jax.jit(back_projected_cosines)(learned, located, query, back))
         for of_found, of_exact in zip(found.T, exact.T, strict=True):
             assert np.corrcoef(of_found, of_exact)[0, 1] > 0.95
 
 
 def test_the_pseudo_inverse_is_exact_up_to_a_factor_for_orthonormal_columns(learned, problem):
-    located, query = problem[0].views[0].located, jnp.asarray(BOOK[1:])
+    located, query = problem[0].views[0].located, BOOK[1:]
     turning = jnp.linalg.qr(learned.lift)[0]  # columns of length 1, at right angles
     field = replace(learned, lift=turning)
-    exact = np.asarray(gaussian_cosines(field, located, query))
-    found = np.asarray(back_projected_cosines(field, located, query, jnp.linalg.pinv(turning)))
+    exact = np.asarray(cosines_now(field, located, query))
+    found = np.asarray(jax.jit(back_projected_cosines)(field, located, query, jnp.linalg.pinv(turning)))
     shown = np.linalg.norm(turning.T @ query.T, axis=0)  # how much of each query the field can show at all
     np.testing.assert_allclose(found * shown, exact, atol=1e-5)
 
@@ -286,15 +291,16 @@ def test_settings_out_of_range_are_refused(change, message):
 def test_votes_are_the_light_that_gaussians_send_to_labels(two_balls):
     scene, _, masks = two_balls
     view, plan = frozen_views(scene, cameras(8))[0]
-    ids = jnp.asarray(masks[0])
+    ids, voted = masks[0], jax.jit(label_votes, static_argnums=3)
     votes = np.zeros((scene.num, 3))
-    np.add.at(votes, view.rows, np.asarray(label_votes(view, plan, ids, 3)))
+    np.add.at(votes, np.asarray(view.rows), np.asarray(voted(view, plan, ids, 3)))
     # One Gaussian at a time: what it alone adds to the picture.
     for row in (3, 90, 150):
-        own, _ = paint(view, jnp.zeros((scene.num, 1)).at[row].set(1.0), plan)
+        alone = np.float32(np.arange(scene.num) == row)[:, None]
+        own = np.asarray(painted(view, alone, plan)[0])[..., 0]
         for label in range(3):
-            np.testing.assert_allclose(votes[row, label], own[..., 0][ids == label].sum(), atol=1e-4)
-    none = np.asarray(label_votes(view, plan, jnp.full_like(ids, -1), 3))
+            np.testing.assert_allclose(votes[row, label], own[ids == label].sum(), atol=1e-4)
+    none = np.asarray(voted(view, plan, np.full_like(ids, -1), 3))
     assert not none.any()
 
 
@@ -309,12 +315,13 @@ def test_a_majority_of_true_masks_is_the_truth(two_balls):
 def test_pixels_features_are_what_their_cosines_are_of(problem, learned):
     given, _ = problem
     batch = given.views[0]
-    parts = rendered_features(learned, batch.located, batch.view.rows)
-    cosines, alphas = pixel_cosines(learned, parts, batch.view, batch.plan, jnp.asarray(BOOK))
-    y, x = np.unravel_index(int(np.asarray(alphas).argmax()), alphas.shape)
-    features, there = pixel_features(
-        learned, batch.located, batch.view, batch.plan, jnp.array([[int(x), int(y)]])
+    parts = rendered_now(learned, batch.located, batch.view.rows)
+    cosines, alphas = jax.device_get(pixels_now(learned, parts, batch.view, batch.plan, BOOK))
+    y, x = np.unravel_index(alphas.argmax(), alphas.shape)
+    pixels = np.array([[x, y]], np.int32)
+    features, there = jax.device_get(
+        jax.jit(pixel_features)(learned, batch.located, batch.view, batch.plan, pixels)
     )
     np.testing.assert_allclose(there[0], alphas[y, x], rtol=1e-6)
-    unit = features[0] / jnp.linalg.norm(features[0])
+    unit = features[0] / np.linalg.norm(features[0])
     np.testing.assert_allclose(unit @ BOOK.T, cosines[y, x], atol=1e-4)

@@ -1,6 +1,7 @@
 """Target features of pixels reach the loss unchanged, from masks and from maps."""
 
 from dataclasses import replace
+from functools import partial
 
 import cv2
 import jax
@@ -68,8 +69,9 @@ def maps(seed: int = 0):
     return teacher_of_maps([random.normal(size=(9, 12, DIMENSION)) for _ in range(3)], [(HEIGHT, WIDTH)] * 3)
 
 
-def loss_of(config, run, batch, step=0):
-    return distill_loss(config)(run.params, batch, step=step, key=jax.random.key(0))
+@partial(jax.jit, static_argnums=0)
+def loss_of(config, params, batch, step=0):
+    return distill_loss(config)(params, batch, step=step, key=jax.random.key(0))
 
 
 def test_a_view_keeps_what_it_shows_of_the_codebook_and_that_is_as_good(scene):
@@ -84,8 +86,9 @@ def test_a_view_keeps_what_it_shows_of_the_codebook_and_that_is_as_good(scene):
     problem, run = Distill(config).start(scene, cameras(3), teacher)
     whole = problem.views[1]._replace(ids=jnp.asarray(teacher.ids[1]), codebook=jnp.asarray(teacher.codebook))
     assert len(whole.codebook) == 6 > len(problem.views[1].codebook) == 2
-    for name, value in loss_of(config, run, problem.views[1])[1].items():
-        np.testing.assert_allclose(value, loss_of(config, run, whole)[1][name], rtol=1e-5)
+    of_all = loss_of(config, run.params, whole)[1]
+    for name, value in loss_of(config, run.params, problem.views[1])[1].items():
+        np.testing.assert_allclose(value, of_all[name], rtol=1e-5)
 
 
 def test_views_that_show_all_or_nothing_of_the_codebook():
@@ -104,7 +107,7 @@ def test_masks_with_maps_give_the_weighted_mean_of_both_losses(scene, weight):
     config, both, found = replace(QUICK, weights=weights), with_maps(objects(), maps()), []
     for teacher in (objects(), maps(), both):
         problem, run = Distill(config).start(scene, cameras(3), teacher)
-        found.append(loss_of(config, run, problem.views[0])[1])
+        found.append(loss_of(config, run.params, problem.views[0])[1])
     of_objects, of_maps, of_both = found
     known = (HEIGHT - 4) * WIDTH
     share = weight * HEIGHT * WIDTH / (known + weight * HEIGHT * WIDTH)
@@ -136,8 +139,9 @@ def test_maps_are_stretched_as_opencv_does(scene, size):
     plan = problem.views[0].plan
     features = np.random.default_rng(2).normal(size=(*size, 3)).astype(np.float32)
     want = cv2.resize(features, (WIDTH, HEIGHT), interpolation=cv2.INTER_LINEAR)
-    np.testing.assert_allclose(_stretched(jnp.asarray(features), 0, HEIGHT, plan), want, atol=1e-4)
-    np.testing.assert_allclose(_stretched(jnp.asarray(features), 8, 4, plan), want[8:12], atol=1e-4)
+    stretched = jax.jit(_stretched, static_argnums=2)
+    np.testing.assert_allclose(stretched(features, 0, HEIGHT, plan), want, atol=1e-4)
+    np.testing.assert_allclose(stretched(features, 8, 4, plan), want[8:12], atol=1e-4)
 
 
 def test_the_length_of_an_encoders_vectors_does_not_matter(scene):
@@ -158,7 +162,7 @@ def test_it_learns_from_maps(scene):
     labels = np.digitize(np.asarray(scene.means)[:, 2], [-0.25, 0.25])
     stripes = []
     for view, plan in frozen_views(scene, cameras(3)):
-        shares = np.asarray(paint(view, jax.nn.one_hot(labels, 3), plan)[0])
+        shares = np.asarray(jax.jit(paint)(view, np.eye(3, dtype=np.float32)[labels], plan)[0])
         stripes.append(BOOK[shares.argmax(-1)] + 0.0)
     teacher = teacher_of_maps(stripes, [(HEIGHT, WIDTH)] * 3)
     method = Distill(replace(QUICK, iterations=150))
@@ -172,7 +176,9 @@ def test_it_learns_from_maps(scene):
 def test_the_contrast_counts_from_its_step_on(scene):
     config = replace(QUICK, iterations=10, contrast_after=0.5)
     problem, run = Distill(config).start(scene, cameras(3), objects())
-    values = [float(loss_of(config, run, problem.views[0], step)[1]["contrast"]) for step in (0, 4, 5, 9)]
+    values = [
+        float(loss_of(config, run.params, problem.views[0], step)[1]["contrast"]) for step in (0, 4, 5, 9)
+    ]
     assert values[:2] == [0, 0]
     assert values[2] == values[3] > 0
 
@@ -201,20 +207,21 @@ def test_a_few_gaussians_far_out_do_not_make_cells_coarse():
 @pytest.mark.usefixtures("x64")
 @pytest.mark.parametrize("megabytes", [256.0, 0.1])
 def test_gradients_are_those_of_central_differences(scene, megabytes):
+    @jax.jit
     def wide(tree):
         return jax.tree.map(lambda a: a.astype(np.float64) if a.dtype == np.float32 else a, tree)
 
     config = replace(QUICK, contrast_after=0.0, strip_megabytes=megabytes)
     problem, run = Distill(config).start(wide(scene), cameras(3), with_maps(objects(), maps()))
     batch, random = wide(problem.views[0]), np.random.default_rng(1)
-    field = jax.tree.map(lambda a: a + 0.1 * jnp.asarray(random.normal(size=a.shape)), wide(run.params))
+    field = jax.tree.map(lambda a: np.asarray(a) + 0.1 * random.normal(size=a.shape), wide(run.params))
     loss = jax.jit(lambda f: distill_loss(config)(f, batch, step=0, key=jax.random.key(0))[0])
     slope = jax.jit(jax.grad(loss))(field)
     for pick in ("table", "layers", "lift"):
         along = jax.tree_util.tree_map_with_path(
-            lambda path, a, pick=pick: jnp.asarray(random.normal(size=a.shape)) * (pick in str(path)), field
+            lambda path, a, pick=pick: random.normal(size=a.shape) * (pick in str(path)), field
         )
-        want = sum((s * d).sum() for s, d in zip(*map(jax.tree.leaves, (slope, along)), strict=True))
+        want = sum(np.vdot(s, d) for s, d in zip(*map(jax.tree.leaves, (slope, along)), strict=True))
         ahead, behind = (
             loss(jax.tree.map(lambda a, d, step=step: a + step * d, field, along)) for step in (1e-6, -1e-6)
         )

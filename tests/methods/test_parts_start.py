@@ -180,14 +180,14 @@ def test_votes_are_shares_of_pixels(boxes):
 def test_a_field_has_weights_of_living_parts_only(kind):
     rng = np.random.default_rng(0)
     means = jnp.asarray(rng.uniform(-1, 1, (200, 3)), jnp.float32)
-    wanted = jax.nn.one_hot((means[:, 0] > 0).astype(int), 4)
+    wanted = jnp.asarray(np.eye(4)[(np.asarray(means)[:, 0] > 0).astype(int)], jnp.float32)
     alive = jnp.array([True, True, False, False])
     config = PartsConfig(weights=kind, grid=FeatureGridConfig(4, 4, 16, 10, 2, 16))
-    field, located = new_field(jax.random.key(0), config, means, 4)
+    field, located = jax.jit(new_field, static_argnums=(1, 3))(jax.random.key(0), config, means, 4)
     field, losses = fit_field_to_weights(field, located, wanted, alive, 60)
     if kind == "grid":
         assert losses[-1] < 0.1 * losses[0]
-    found = np.asarray(weights_of(field, located, alive))
+    found = np.asarray(jax.jit(weights_of)(field, located, alive))
     np.testing.assert_allclose(found.sum(-1), 1, rtol=1e-5)
     assert (found[:, 2:] == 0).all()
     assert (found.argmax(-1) == np.asarray(wanted).argmax(-1)).mean() > 0.97
@@ -213,7 +213,7 @@ def test_a_start_knows_its_pieces(boxes):
     means = np.concatenate([start.canonical.movable.means, start.canonical.fixed.means])
     np.testing.assert_array_equal(means, np.asarray(boxes.gaussians.means)[order])
     assert start.canonical.alive.tolist() == [True, True, True, False]
-    weights = np.asarray(skinning_weights(start.field, start.canonical))
+    weights = np.asarray(jax.jit(skinning_weights)(start.field, start.canonical))
     np.testing.assert_allclose(weights.sum(-1), 1, rtol=1e-5)
     assert (weights[:, 3] == 0).all()
     bodies = boxes.bodies[order[:count]]
@@ -231,7 +231,7 @@ def test_a_start_knows_its_pieces(boxes):
 def test_one_camera_and_stillness_are_refused(boxes):
     anchor = choose_anchor(boxes.image, FRAMES, 3, 0)
     one = MovingBoxes(boxes.boxes, cameras=1)
-    moved = moved_pixels(one.image, anchor, 1)
+    moved = moved_pixels(boxes.image, anchor, 1)
     with pytest.raises(ValueError, match="cameras: expected at least 2, synchronised, found 1"):
         begin(one, one.gaussians, anchor, moved, PartsConfig(), None, jax.random.key(0))
     two = MovingBoxes(boxes.boxes, cameras=2)

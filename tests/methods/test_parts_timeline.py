@@ -1,5 +1,7 @@
 """The films that edit scripts make: what is written is done, and a film is as long as it needs."""
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -29,14 +31,16 @@ from tests.methods.made_up_parts import STEP, assert_same, rows, scene_of, traje
 from tests.methods.test_parts_scripts import EXAMPLE
 
 NAMES = {"drawer": 1, "lid": 2, "faucet": 3}
+gaussians_then = jax.jit(film_gaussians)
 
 
 def layer_of(seed=0, moments=9, start=0.0):
     """Four parts, each Gaussian of one of them, from 0 to 1 s unless told."""
     scene = scene_of(seed, num=8, parts=4)
-    scene = PartScene(scene.gaussians, jnp.eye(4)[jnp.arange(8) % 4], scene.centers)
+    weights = jnp.asarray(np.eye(4)[np.arange(8) % 4], jnp.float32)
+    scene = PartScene(scene.gaussians, weights, scene.centers)
     one = trajectory(seed, moments)
-    return Layer(scene, type(one)(one.times + start, one.poses, one.opacities, one.scales))
+    return Layer(scene, replace(one, times=jnp.asarray(np.asarray(one.times) + start, jnp.float32)))
 
 
 def film_of(*script, layer=None, load_scene=None, **options):
@@ -95,14 +99,13 @@ class TestLength:
     )
     def test_and_no_longer(self, edit):
         """At the end of the film the part still moves."""
-        before, last = np.asarray(film_of(edit)[0].trajectory.poses.quats[-2:, 1])
+        before, last = np.asarray(film_of(edit)[0].trajectory.poses.quats)[-2:, 1]
         assert np.abs(last - before).max() > 1e-3
 
     def test_copies_are_seen_to_their_end(self):
         film = film_of(Echo(parts=(1,), copies=2, every=0.25))
-        np.testing.assert_array_equal(
-            film[2].trajectory.poses.quats[:, 1], layer_of().trajectory.poses.quats[[0] * 4 + [*range(9)], 1]
-        )
+        found, recorded = (np.asarray(of.trajectory.poses.quats)[:, 1] for of in (film[2], layer_of()))
+        np.testing.assert_array_equal(found, recorded[[0] * 4 + [*range(9)]])
 
     def test_of_copies_the_scene_itself_knows_nothing(self):
         """It goes backwards from its own end."""
@@ -205,12 +208,11 @@ class TestFilms:
 
     def test_isolate_and_ghost_are_of_the_others(self):
         film = film_of(Isolate(parts=("lid",)), Ghost(parts=("lid", "background"), opacity=0.5))
-        before, after = layer_of().trajectory, film[0].trajectory
+        before, after = jax.device_get((layer_of().trajectory, film[0].trajectory))
         assert_same(after.poses.quats[:, 2], before.poses.quats[:, 2])
         for p in (0, 1, 3):
-            assert_same(after.poses.quats[:, p], jnp.tile(before.poses.quats[0, p], (9, 1)))
-        shown = before.opacities[jnp.array([0] * 9), 1] * 0.5
-        np.testing.assert_allclose(after.opacities[:, 1], shown, rtol=1e-6)
+            assert_same(after.poses.quats[:, p], np.tile(before.poses.quats[0, p], (9, 1)))
+        np.testing.assert_allclose(after.opacities[:, 1], before.opacities[[0] * 9, 1] * 0.5, rtol=1e-6)
         assert_same(after.opacities[:, 2], before.opacities[:, 2])
 
     @pytest.mark.parametrize(
@@ -236,20 +238,17 @@ class TestFilms:
     )
     def test_operations_are_the_functions_in_degrees_metres_and_seconds(self, edit, expected):
         layer = layer_of()
-        arms = jnp.array([1.0, 1.0, 0.0]) - layer.scene.centers[1:3]
+        arms = jnp.asarray([1.0, 1.0, 0.0] - np.asarray(layer.scene.centers)[1:3])
         assert_same(film_of(edit)[0].trajectory, expected(layer.trajectory, arms), atol=1e-5)
 
     def test_order_matters_where_it_should(self):
         shift = (0.0, 0.0, 0.5)
         first = film_of(Move(parts=(1,), by=shift, begin=0.5), Speed(parts=(1,), factor=-1))
         then = film_of(Speed(parts=(1,), factor=-1), Move(parts=(1,), by=shift, begin=0.5))
-        plain = layer_of().trajectory.poses.translations[::-1, 1, 2]
-        np.testing.assert_allclose(
-            first[0].trajectory.poses.translations[:, 1, 2] - plain, [0.5] * 5 + [0] * 4, atol=1e-6
-        )
-        np.testing.assert_allclose(
-            then[0].trajectory.poses.translations[:, 1, 2] - plain, [0] * 4 + [0.5] * 5, atol=1e-6
-        )
+        layers = first[0], then[0], layer_of()
+        first, then, plain = (np.asarray(of.trajectory.poses.translations)[:, 1, 2] for of in layers)
+        np.testing.assert_allclose(first - plain[::-1], [0.5] * 5 + [0] * 4, atol=1e-6)
+        np.testing.assert_allclose(then - plain[::-1], [0] * 4 + [0.5] * 5, atol=1e-6)
 
     def test_echo_adds_layers_of_the_part_alone(self):
         film = film_of(Echo(parts=("faucet",), copies=2, every=0.25, fade=0.5, begin=0.5), length=1.125)
@@ -302,33 +301,30 @@ class TestComposite:
     def test_parts_of_another_run_are_brought_in(self):
         film = self.film()
         assert [layer.scene.gaussians.num for layer in film] == [8, 2]
-        other = self.load("elsewhere")[0].trajectory
-        assert_same(
-            film[1].trajectory.opacities[:, 1], other.opacities[jnp.array([0, 1, 2, 3, 4, 4, 4, 4, 4]), 1]
-        )
-        assert film_gaussians(film, 7).num == 10
+        layers = film[1], self.load("elsewhere")[0]
+        found, other = (np.asarray(layer.trajectory.opacities)[:, 1] for layer in layers)
+        assert_same(found, other[[0, 1, 2, 3, 4, 4, 4, 4, 4]])
+        assert gaussians_then(film, 7).num == 10
 
     def test_they_are_edited_on_their_own(self):
         film = self.film(
             edits=(Speed(parts=("cup",), factor=-1), Echo(parts=("hand",), copies=1, every=0.125))
         )
-        other = self.load("elsewhere")[0]
         assert len(film) == 3
-        at = jnp.array([4, 3, 2, 1, 0, 0, 0, 0, 0])
-        np.testing.assert_allclose(
-            film[1].trajectory.opacities[:, 1], other.trajectory.opacities[at, 1], rtol=1e-6
-        )
+        layers = film[1], self.load("elsewhere")[0]
+        found, other = (np.asarray(layer.trajectory.opacities)[:, 1] for layer in layers)
+        np.testing.assert_allclose(found, other[[4, 3, 2, 1, 0, 0, 0, 0, 0]], rtol=1e-6)
         np.testing.assert_array_equal(np.asarray(film[2].scene.labels), 2)
 
     def test_they_come_to_their_place(self):
         """The handle at the start is where it was sent; what is 10 cm from it is 5 cm at half the size."""
         place = Place(to=(1, 2, 3), axis=(0, 0, 1), degrees=90, scale=0.5)
-        plain, there = self.film()[1], self.film(place=place)[1]
-        start = film_gaussians((plain,), 0).means
+        plain, there = jax.device_get((self.film()[1], self.film(place=place)[1]))
+        start = gaussians_then((plain,), 0).means
         handle = plain.scene.centers[1] + plain.trajectory.poses.translations[0, 1]
-        offset = np.asarray(start - handle)
+        offset = np.asarray(start) - handle
         turned = np.stack([-offset[:, 1], offset[:, 0], offset[:, 2]], axis=1)
-        found = film_gaussians((there,), 0).means
+        found = gaussians_then((there,), 0).means
         np.testing.assert_allclose(found, np.array([1, 2, 3]) + 0.5 * turned, atol=1e-5)
 
     def test_they_may_come_for_a_while(self):
@@ -357,9 +353,8 @@ class TestComposite:
     def test_a_run_that_is_longer_is_seen_to_its_end_too(self):
         longer = layer_of(5, moments=13)
         film = film_of(Composite(parts=(1,), from_run="x"), load_scene=lambda path: (longer, NAMES))
-        np.testing.assert_allclose(
-            film[1].trajectory.opacities[:, 1], longer.trajectory.opacities[:, 1], rtol=1e-6
-        )
+        found, other = (np.asarray(layer.trajectory.opacities)[:, 1] for layer in (film[1], longer))
+        np.testing.assert_allclose(found, other, rtol=1e-6)
 
     def test_a_part_is_looked_up_there(self):
         with pytest.raises(
@@ -379,4 +374,4 @@ def test_the_example_makes_a_film_that_can_be_drawn():
     film = apply(script, layer_of(), NAMES, lambda path: (layer_of(5), {"cup": 1}))
     assert len(film) == 4
     for t in (0, 15):
-        assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(film_gaussians(film, t)))
+        assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gaussians_then(film, t)))

@@ -6,7 +6,6 @@ from functools import partial
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -25,7 +24,11 @@ def begun(table, started):
     tracker = Track(CONFIG)
     shape, run = tracker.start(started, frames[0])
     step = tracker.step(shape)
-    update = jax.jit(partial(step.update, step=0, key=jax.random.key(0)))
+    jitted = jax.jit(step.update)
+
+    def update(params, state, batch, step=0, key=jax.random.key(0)):  # noqa: B008
+        return jitted(params, state, batch, step=step, key=key)
+
     params, state, _ = update(run.params, run.state, TrackBatch(frames[0], run.plans[PLAN]))
     return step, update, run.having(params=params, state=state)
 
@@ -74,7 +77,7 @@ def test_the_first_update_only_looks(table, started, begun):
 def test_a_first_frame_that_cannot_be_read_leaves_the_state_blank(table, begun):
     _, frames, _ = table()
     step, update, run = begun
-    broken = replace(frames[0], images=jnp.full_like(frames[0].images, jnp.nan))
+    broken = replace(frames[0], images=np.full_like(frames[0].images, np.nan))
     _, state, info = update(run.params, step.init(run.params), TrackBatch(broken, run.plans[PLAN]))
     assert info["skipped"]
     assert_same(state, step.init(run.params))
@@ -92,7 +95,7 @@ def test_it_runs_in_a_scan_as_frame_by_frame_and_grows_there(table, begun):
         params, state, info = step.update(*carried, TrackBatch(frame, plan), step=0, key=jax.random.key(0))
         return (params, state), info["joined"]
 
-    stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *frames[1:])
+    stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *frames[1:])
     (scanned, _), joined = jax.jit(partial(jax.lax.scan, body))((run.params, run.state), stacked)
     # The same bits as XLA compiles by default. Unoptimised, rounding decides between steps of half a
     # millimetre.
@@ -106,7 +109,7 @@ def test_a_frame_that_cannot_be_read_changes_nothing(table, begun, what):
     _, frames, _ = table()
     _, update, run = begun
     where = {"viewmat": lambda f: f.cameras.viewmat}.get(what, lambda f: getattr(f, what))
-    broken = eqx.tree_at(where, frames[1], jnp.full_like(where(frames[1]), jnp.nan))
+    broken = eqx.tree_at(where, frames[1], np.full_like(where(frames[1]), np.nan))
     params, state, info = update(run.params, run.state, TrackBatch(broken, run.plans[PLAN]))
     assert info["skipped"]
     assert_same((params, state), (run.params, run.state))
@@ -117,7 +120,7 @@ def test_bytes_are_seen_as_floats_are(table, begun):
     _, update, run = begun
     images = np.asarray(255 * frames[1].images).round().astype(np.uint8)
     as_bytes = replace(frames[1], images=images)
-    as_floats = replace(frames[1], images=jnp.asarray(images, jnp.float32) / 255)
+    as_floats = replace(frames[1], images=np.float32(images) / 255)
     plan = run.plans[PLAN]
     found = [update(run.params, run.state, TrackBatch(f, plan))[0] for f in (as_bytes, as_floats)]
     np.testing.assert_allclose(found[0].pose.means, found[1].pose.means, atol=1e-5)
@@ -126,7 +129,7 @@ def test_bytes_are_seen_as_floats_are(table, begun):
 def test_what_draws_at_random_takes_its_key(table, begun):
     """Nothing does where nothing is lost: another key gives the same bits."""
     _, frames, _ = table()
-    step, update, run = begun
+    _, update, run = begun
     batch = TrackBatch(frames[1], run.plans[PLAN])
-    other = jax.jit(partial(step.update, step=5))(run.params, run.state, batch, key=jax.random.key(7))
+    other = update(run.params, run.state, batch, step=5, key=jax.random.key(7))
     assert_same(other[0], update(run.params, run.state, batch)[0])

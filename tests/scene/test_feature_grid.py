@@ -2,6 +2,7 @@
 
 import itertools
 import re
+from functools import partial
 
 import equinox as eqx
 import jax
@@ -23,9 +24,20 @@ SMALL = FeatureGridConfig(
 seeds = st.integers(0, 10_000)
 
 
+@partial(jax.jit, static_argnums=(1, 2))
+def initial(key, config, outputs):
+    return init_feature_grid(key, config, outputs, BOUNDS)
+
+
+located_in = jax.jit(locate)
+encoded = jax.jit(lambda grid, located: grid.encode(located))
+values_at = jax.jit(lambda grid, positions: grid(positions))
+slopes_by_position = jax.jit(jax.grad(lambda positions, grid: grid(positions).sum()))
+
+
 def some_grid(config=SMALL, outputs=3, seed=0):
     """A grid with features of order 1, so that their effect is visible."""
-    grid = init_feature_grid(jax.random.key(seed), config, outputs, BOUNDS)
+    grid = initial(jax.random.key(seed), config, outputs)
     return eqx.tree_at(lambda g: g.table, grid, 1e4 * grid.table)
 
 
@@ -33,7 +45,7 @@ def some_positions(num, seed=0, beyond=0.0):
     """Random positions in the box, extended by this share of its edges."""
     low, high = BOUNDS
     share = np.random.default_rng(seed).uniform(-beyond, 1 + beyond, (num, 3))
-    return jnp.asarray(low + share * (high - low))
+    return low + share * (high - low)
 
 
 def by_loops(grid, position):
@@ -125,11 +137,11 @@ class TestInit:
         network = sum(out * (inp + 1) for inp, out in itertools.pairwise(widths))
         assert sum(leaf.size for leaf in jax.tree.leaves(grid)) == 2 * entries + network
         assert all(jnp.issubdtype(leaf.dtype, jnp.floating) for leaf in jax.tree.leaves(grid))
-        assert grid(some_positions(6).astype(jnp.float32)).shape == (6, 3)
+        assert values_at(grid, some_positions(6)).shape == (6, 3)
 
     def test_first_features_are_small_and_keys_differ(self):
         config = FeatureGridConfig(4, 4, 18, 9, hidden=5, depth=3)
-        one, other = (init_feature_grid(jax.random.key(i), config, 3, BOUNDS) for i in (0, 1))
+        one, other = (jax.device_get(initial(jax.random.key(i), config, 3)) for i in (0, 1))
         np.testing.assert_allclose([one.table.min(), one.table.max()], [-1e-4, 1e-4], rtol=0.01)
         for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True):
             assert not (a == b).any()
@@ -159,19 +171,25 @@ class TestFormula:
     def test_features_are_those_of_loops(self):
         grid = some_grid()
         positions = some_positions(40, beyond=0.2)
-        expected = [by_loops(grid, position) for position in np.asarray(positions)]
-        np.testing.assert_allclose(grid.encode(locate(grid, positions)), expected, atol=1e-12)
+        expected = [by_loops(grid, position) for position in positions]
+        found = encoded(grid, located_in(grid, positions))
+        np.testing.assert_allclose(found, expected, atol=1e-12)
 
     def test_the_network_is_relu_between_affine_maps(self):
         grid = some_grid(FeatureGridConfig(4, 4, 18, 9, 2, hidden=5, depth=2))
-        located = locate(grid, some_positions(10))
-        values = np.asarray(grid.encode(located))
+
+        @jax.jit
+        def both(positions):
+            located = locate(grid, positions)
+            return grid.encode(located), grid.at(located), grid(positions)
+
+        values, found, by_call = both(some_positions(10))
         for i, layer in enumerate(grid.layers):
             values = np.asarray(layer.weight) @ values[..., None]
             values = values[..., 0] + np.asarray(layer.bias)
             values = np.maximum(values, 0) if i < 2 else values
-        np.testing.assert_allclose(grid.at(located), values, atol=1e-12)
-        np.testing.assert_array_equal(grid(some_positions(10)), grid.at(located))
+        np.testing.assert_allclose(found, values, atol=1e-12)
+        np.testing.assert_array_equal(by_call, found)
 
     @given(seeds)
     def test_weights_are_a_partition_of_unity_that_reproduces_the_position(self, seed):
@@ -179,7 +197,7 @@ class TestFormula:
         config = FeatureGridConfig(1, 4, 4, 9)
         grid = some_grid(config)
         positions = some_positions(5, seed)
-        located = locate(grid, positions)
+        located = jax.device_get(located_in(grid, positions))
         assert (located.weights >= 0).all()
         np.testing.assert_allclose(located.weights.sum(-1), 1, atol=1e-14)
         vertices = np.stack(np.unravel_index(located.indices, (5, 5, 5), order="F"), axis=-1)
@@ -191,29 +209,31 @@ class TestFormula:
         """Halfway along x, where the levels of 4, 6, 10 and 18 all have a vertex."""
         grid = some_grid()
         low, high = BOUNDS
-        middle = some_positions(1).at[0, 0].set((low[0] + high[0]) / 2)
-        before, after = middle.at[0, 0].add(-1e-9), middle.at[0, 0].add(1e-9)
-        assert (locate(grid, before).indices != locate(grid, after).indices).any(-1).all()
-        np.testing.assert_allclose(grid(before), grid(after), atol=1e-7)
-        slopes = [jax.jacfwd(grid)(x)[0, :, 0, 0] for x in (before, after)]
+        middle = some_positions(1)
+        middle[0, 0] = (low[0] + high[0]) / 2
+        step = np.array([1e-9, 0, 0])
+        before, after = middle - step, middle + step
+        indices = [np.asarray(located_in(grid, x).indices) for x in (before, after)]
+        assert (indices[0] != indices[1]).any(-1).all()
+        np.testing.assert_allclose(values_at(grid, before), values_at(grid, after), atol=1e-7)
+        slope = jax.jit(jax.jacfwd(values_at, argnums=1))
+        slopes = [np.asarray(slope(grid, x))[0, :, 0, 0] for x in (before, after)]
         assert np.abs(slopes[0] - slopes[1]).min() > 1e-2
 
     def test_outside_counts_as_on_the_surface(self):
         grid = some_grid()
         low, high = BOUNDS
-        outside = jnp.array([[-9.0, 1.0, 9.0], [jnp.inf, -jnp.inf, 3.0], [0.0, 0.0, 0.0]])
-        np.testing.assert_array_equal(grid(outside), grid(jnp.clip(outside, low, high)))
-        slopes = jax.jit(jax.grad(lambda x: grid(x).sum()))(outside)
+        outside = np.array([[-9.0, 1.0, 9.0], [np.inf, -np.inf, 3.0], [0.0, 0.0, 0.0]])
+        inside = np.clip(outside, low, high)
+        np.testing.assert_array_equal(values_at(grid, outside), values_at(grid, inside))
+        slopes = np.asarray(slopes_by_position(outside, grid))
         np.testing.assert_array_equal(slopes == 0, (outside < low) | (outside > high))
 
     def test_on_the_surface_the_derivative_is_that_of_inside(self):
         grid = some_grid()
         low, high = BOUNDS
         for surface, inwards in ((low, 1e-7), (high, -1e-7)):
-            at, inside = (
-                jax.jit(jax.grad(lambda x: grid(x).sum()))(jnp.asarray(surface)[None] + shift)
-                for shift in (0.0, inwards)
-            )
+            at, inside = (slopes_by_position(surface[None] + shift, grid) for shift in (0.0, inwards))
             np.testing.assert_allclose(at, inside, rtol=1e-4)
 
 
@@ -227,21 +247,21 @@ class TestEntries:
         steps = np.linspace(0, 1, 15)
         low, high = BOUNDS.astype(np.float32)
         share = np.stack(np.meshgrid(steps, steps, steps), axis=-1).reshape(-1, 3).astype(np.float32)
-        located = locate(grid, jnp.asarray(low + share * (high - low)))
+        indices = np.asarray(located_in(grid, low + share * (high - low)).indices)
         begins = np.cumsum([0, *config.entries])
         for level in range(3):
-            used = np.asarray(located.indices[:, level])
+            used = indices[:, level]
             assert len(np.unique(used, axis=0)) == config.resolutions[level] ** 3  # one set per cell
             np.testing.assert_array_equal(np.unique(used), np.arange(begins[level], begins[level + 1]))
 
     @pytest.mark.parametrize("log2", [3, 19])
     def test_hashed_rows_stay_in_their_level_and_spread_over_it(self, log2):
         config = FeatureGridConfig(2, 2**10, 2**20, log2, features=1, hidden=1)
-        grid = init_feature_grid(jax.random.key(0), config, 1, BOUNDS)
-        indices = locate(grid, some_positions(3000).astype(jnp.float32)).indices
-        assert indices.dtype == jnp.int32
+        grid = initial(jax.random.key(0), config, 1)
+        indices = np.asarray(located_in(grid, some_positions(3000)).indices)
+        assert indices.dtype == np.int32
         for level in range(2):
-            rows = np.asarray(indices[:, level]) - level * 2**log2
+            rows = indices[:, level] - level * 2**log2
             assert rows.min() >= 0
             assert rows.max() < 2**log2
             # The number of m entries that a uniform hash uses for n vertices.
@@ -251,10 +271,17 @@ class TestEntries:
     def test_the_corners_of_the_box_at_the_most_resolution(self):
         """At the limit of float32, no vertex lies beyond the last."""
         config = FeatureGridConfig(2, 2, 2**20, 10, features=1, hidden=1)
-        grid = init_feature_grid(jax.random.key(0), config, 1, BOUNDS)
-        located = locate(grid, jnp.asarray(BOUNDS, jnp.float32))
-        assert (np.asarray(located.indices[:, 0]) < 3**3).all()
+        grid = initial(jax.random.key(0), config, 1)
+        located = jax.device_get(located_in(grid, np.float32(BOUNDS)))
+        assert (located.indices[:, 0] < 3**3).all()
         np.testing.assert_array_equal(located.weights[:, 1], np.full((2, 8), 0.125))
+
+
+@jax.jit
+def forward_and_back(arguments, tangents, cotangent):
+    """What a JVP and a VJP of a grid give."""
+    _, pull = jax.vjp(values_at, *arguments)
+    return jax.jvp(values_at, arguments, tangents)[1], pull(cotangent)
 
 
 class TestDerivatives:
@@ -264,7 +291,7 @@ class TestDerivatives:
         config = FeatureGridConfig(2, 4, 10, 9, features=2, hidden=3)
         grid = some_grid(config, outputs=2)
         positions = some_positions(4, seed=3)
-        scaled = np.asarray((positions - BOUNDS[0]) / np.ptp(BOUNDS, axis=0))
+        scaled = (positions - BOUNDS[0]) / np.ptp(BOUNDS, axis=0)
         scaled = scaled[:, None] * np.array([[3], [9]]) + 0.5
         assert np.abs(scaled - np.round(scaled)).min() > 1e-3
         leaves, structure = jax.tree.flatten(grid)
@@ -279,19 +306,16 @@ class TestDerivatives:
     @pytest.mark.parametrize("seed", range(3))
     def test_jvp_is_the_transpose_of_vjp(self, seed):
         grid, positions = some_grid(seed=seed), some_positions(6, seed, beyond=0.1)
-        key = jax.random.key(seed)
-        tangents = jax.tree.map(
-            lambda leaf: jax.random.normal(jax.random.fold_in(key, leaf.size), leaf.shape), (grid, positions)
-        )
-        cotangent = jax.random.normal(key, (6, 3))
-        _, forward = jax.jvp(lambda g, x: g(x), (grid, positions), tangents)
-        _, pull = jax.vjp(lambda g, x: g(x), grid, positions)
-        products = jax.tree.map(jnp.vdot, tangents, pull(cotangent))
-        np.testing.assert_allclose(jnp.vdot(cotangent, forward), sum(jax.tree.leaves(products)), rtol=1e-10)
+        rng = np.random.default_rng(seed)
+        tangents = jax.tree.map(lambda leaf: rng.normal(size=leaf.shape), (grid, positions))
+        cotangent = rng.normal(size=(6, 3))
+        forward, pulled = forward_and_back((grid, positions), tangents, cotangent)
+        products = jax.tree.map(np.vdot, tangents, pulled)
+        np.testing.assert_allclose(np.vdot(cotangent, forward), sum(jax.tree.leaves(products)), rtol=1e-10)
 
     def test_only_the_entries_around_a_position_have_gradients(self):
-        grid, positions = some_grid(), some_positions(2).astype(jnp.float32)
-        located = locate(grid, positions)
+        grid = some_grid()
+        located = located_in(grid, some_positions(2))
         pulled = jax.jit(jax.grad(lambda g: jnp.sum(g.at(located) ** 2)))(grid).table
         rows = np.flatnonzero(np.abs(pulled).max(axis=1))
         np.testing.assert_array_equal(rows, np.unique(located.indices))
@@ -299,39 +323,41 @@ class TestDerivatives:
 
 def test_a_batch_of_grids_and_positions_is_a_loop():
     grids = [some_grid(seed=seed) for seed in range(3)]
-    places = [some_positions(4, seed).astype(jnp.float32) for seed in range(3)]
-    stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *grids)
-    batch = jax.jit(jax.vmap(lambda grid, x: grid(x)))(stacked, jnp.stack(places))
+    places = [some_positions(4, seed) for seed in range(3)]
+    stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *grids)
+    batch = np.asarray(jax.vmap(values_at)(stacked, np.stack(places)))
     for one, grid, x in zip(batch, grids, places, strict=True):
-        np.testing.assert_allclose(one, grid(x), rtol=1e-5, atol=1e-6)
+        np.testing.assert_allclose(one, values_at(grid, x), rtol=1e-5, atol=1e-6)
+
+
+@jax.jit
+@partial(jax.grad, argnums=(0, 1))
+def slopes_of_kept(grid, positions, kept):
+    return jnp.sum(jnp.where(kept[:, None], grid(positions), 0.0) ** 2)
 
 
 @pytest.mark.parametrize("axis", range(3))
 def test_nan_makes_one_row_nan_and_touches_no_gradient(axis):
-    grid, positions = some_grid(), some_positions(5).astype(jnp.float32)
-    poisoned = positions.at[2, axis].set(jnp.nan)
-    kept = jnp.arange(5) != 2
-    outputs = jax.jit(lambda g, x: g(x))(grid, poisoned)
+    grid, positions, kept = some_grid(), some_positions(5), np.arange(5) != 2
+    poisoned = positions.copy()
+    poisoned[2, axis] = np.nan
+    outputs, sound = (np.asarray(values_at(grid, x)) for x in (poisoned, positions))
     np.testing.assert_array_equal(np.isnan(outputs), np.repeat(~kept[:, None], 3, axis=1))
-    np.testing.assert_allclose(outputs[kept], grid(positions)[kept], rtol=1e-5)
-    located = locate(grid, poisoned)
+    np.testing.assert_allclose(outputs[kept], sound[kept], rtol=1e-5)
+    located = located_in(grid, poisoned)
     assert np.isin(located.indices, np.arange(len(grid.table))).all()
-    assert (grid.encode(located)[2] == 0).all()
+    assert (np.asarray(encoded(grid, located))[2] == 0).all()
 
-    def loss(grid, positions):
-        return jnp.sum(jnp.where(kept[:, None], grid(positions), 0.0) ** 2)
-
-    gradients = jax.jit(jax.grad(loss, argnums=(0, 1)))(grid, poisoned)
-    wanted = jax.jit(jax.grad(loss, argnums=(0, 1)))(grid, positions)
+    gradients, wanted = (slopes_of_kept(grid, x, kept) for x in (poisoned, positions))
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-6), gradients, wanted)
 
 
 def test_it_learns_a_segmentation_of_the_box():
     """As in the warm-up of skinning weights: two halves of the box belong to two parts."""
     config = FeatureGridConfig(4, 4, 18, 9, features=2, hidden=16)
-    grid = init_feature_grid(jax.random.key(0), config, 2, BOUNDS)
-    located = locate(grid, some_positions(200).astype(jnp.float32))
-    first = np.asarray(some_positions(200))[:, 0] < 0.5
+    grid = initial(jax.random.key(0), config, 2)
+    located = located_in(grid, some_positions(200))
+    first = some_positions(200)[:, 0] < 0.5
 
     def loss(grid):
         chances = jax.nn.log_softmax(grid.at(located))
@@ -339,16 +365,20 @@ def test_it_learns_a_segmentation_of_the_box():
 
     optimizer = optax.adam(1e-2)
 
-    @jax.jit
     def step(carry, _):
         grid, state = carry
         value, gradient = jax.value_and_grad(loss)(grid)
         updates, state = optimizer.update(gradient, state)
         return (optax.apply_updates(grid, updates), state), value
 
-    (grid, _), losses = jax.lax.scan(step, (grid, optimizer.init(grid)), length=200)
+    @jax.jit
+    def learned(grid):
+        (grid, _), losses = jax.lax.scan(step, (grid, optimizer.init(grid)), length=200)
+        return grid, losses
+
+    grid, losses = learned(grid)
     assert losses[0] > 0.5
     assert losses[-1] < 0.01
-    others = some_positions(500, seed=1).astype(jnp.float32)
-    guessed = np.argmax(np.asarray(grid(others)), axis=1) == 0
-    assert (guessed == (np.asarray(others)[:, 0] < 0.5)).mean() > 0.9
+    others = some_positions(500, seed=1)
+    guessed = np.argmax(values_at(grid, others), axis=1) == 0
+    assert (guessed == (others[:, 0] < 0.5)).mean() > 0.9

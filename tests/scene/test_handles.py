@@ -1,5 +1,7 @@
 """Handles move Gaussians: rigidly for one handle, smoothly between several, and always to finite values."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -16,6 +18,14 @@ from gsjax.scene.handles import HandlePose, at_rest, blend_quats, skin, skin_mea
 
 BLENDS = ("quaternion", "polar", "dual")
 seeds = st.integers(0, 10_000)
+skinned = jax.jit(skin, static_argnums=4)
+matrices = jax.jit(quats_to_matrices)
+
+
+@partial(jax.jit, static_argnames="blend")
+def means_and_turns(gaussians, weights, quats, translations, centers, blend):
+    moved = skin(gaussians, weights, centers, HandlePose(quats, translations), blend)
+    return moved.means, quats_to_matrices(moved.quats)
 
 
 def made_up(seed, num=7, parts=3, most=2.0):
@@ -23,8 +33,8 @@ def made_up(seed, num=7, parts=3, most=2.0):
     rng = np.random.default_rng(seed)
     shapes = ((num, 3), (num, 4), (num, 3), (num,), (num, 1, 3))
     gaussians = Gaussians(*(jnp.asarray(rng.normal(size=shape)) for shape in shapes))
-    weights = jnp.asarray(rng.dirichlet(np.ones(parts), num))
-    centers = jnp.asarray(rng.normal(size=(parts, 3)))
+    weights = rng.dirichlet(np.ones(parts), num)
+    centers = rng.normal(size=(parts, 3))
     axes = rng.normal(size=(parts, 3))
     axes /= np.linalg.norm(axes, axis=1, keepdims=True)
     turns = Rotation.from_rotvec(axes * rng.uniform(0, most, (parts, 1))).as_quat(scalar_first=True)
@@ -37,7 +47,7 @@ def made_up(seed, num=7, parts=3, most=2.0):
 
 
 def rotated(gaussians):
-    return np.asarray(quats_to_matrices(gaussians.quats))
+    return np.asarray(matrices(gaussians.quats))
 
 
 def by_handle(p, means, centers, pose):
@@ -53,7 +63,7 @@ class TestLaws:
     def test_one_handle_alone_is_a_rigid_motion(self, blend, seed):
         gaussians, _, centers, pose = made_up(seed, most=3.1)
         p = seed % 3
-        moved = skin(gaussians, jnp.zeros((7, 3)).at[:, p].set(1.0), centers, pose, blend)
+        moved = skinned(gaussians, np.eye(3)[np.full(7, p)], centers, pose, blend)
         means, R = by_handle(p, np.asarray(gaussians.means), centers, pose)
         np.testing.assert_allclose(moved.means, means, atol=1e-12)
         np.testing.assert_allclose(rotated(moved), R @ rotated(gaussians), atol=1e-9)
@@ -62,23 +72,25 @@ class TestLaws:
     def test_handles_that_move_as_one_need_no_weights(self, blend, seed):
         """The same motion of the world, expressed about three centres."""
         gaussians, weights, centers, pose = made_up(seed, most=3.1)
-        R = quats_to_matrices(pose.quats[0])
-        together = pose.translations[0] + jnp.einsum("ij,pj->pi", R - jnp.eye(3), centers - centers[0])
-        alike = HandlePose(jnp.tile(pose.quats[0], (3, 1)), together)
-        moved = skin(gaussians, weights, centers, alike, blend)
+        quats, translations = np.asarray(pose.quats), np.asarray(pose.translations)
+        R = Rotation.from_quat(quats[0], scalar_first=True).as_matrix()
+        together = translations[0] + (centers - centers[0]) @ (R - np.eye(3)).T
+        alike = HandlePose(jnp.asarray(np.tile(quats[0], (3, 1))), jnp.asarray(together))
+        moved = skinned(gaussians, weights, centers, alike, blend)
         means, _ = by_handle(0, np.asarray(gaussians.means), centers, pose)
         np.testing.assert_allclose(moved.means, means, atol=1e-9)
 
     @given(seed=seeds)
     def test_signs_of_quaternions_and_the_order_of_handles_mean_nothing(self, blend, seed):
         gaussians, weights, centers, pose = made_up(seed)
-        expected = skin(gaussians, weights, centers, pose, blend)
-        flipped = HandlePose(pose.quats * jnp.array([[-2.0], [1.0], [-0.5]]), pose.translations)
+        expected = skinned(gaussians, weights, centers, pose, blend)
+        quats, translations = np.asarray(pose.quats), np.asarray(pose.translations)
+        flipped = HandlePose(jnp.asarray(quats * [[-2.0], [1.0], [-0.5]]), pose.translations)
         order = np.random.default_rng(seed).permutation(3)
-        shuffled = HandlePose(pose.quats[order], pose.translations[order])
+        shuffled = HandlePose(jnp.asarray(quats[order]), jnp.asarray(translations[order]))
         for moved in (
-            skin(gaussians, weights, centers, flipped, blend),
-            skin(gaussians, weights[:, order], centers[order], shuffled, blend),
+            skinned(gaussians, weights, centers, flipped, blend),
+            skinned(gaussians, weights[:, order], centers[order], shuffled, blend),
         ):
             np.testing.assert_allclose(moved.means, expected.means, atol=1e-9)
             np.testing.assert_allclose(rotated(moved), rotated(expected), atol=1e-9)
@@ -86,35 +98,31 @@ class TestLaws:
     @pytest.mark.parametrize("seed", range(3))
     def test_derivatives(self, blend, seed):
         gaussians, weights, centers, pose = made_up(seed, num=3, most=1.0)
-
-        def moved(*arguments):
-            weights, quats, translations, centers = map(jnp.asarray, arguments)
-            after = skin(gaussians, weights, centers, HandlePose(quats, translations), blend)
-            return after.means, quats_to_matrices(after.quats)
-
+        moved = partial(means_and_turns, gaussians, blend=blend)
         check_grads(moved, (weights, pose.quats, pose.translations, centers), order=1, modes=["fwd", "rev"])
 
     def test_a_batch_is_a_loop(self, blend):
         gaussians, weights, centers, _ = made_up(0)
         poses = [made_up(seed)[3] for seed in range(4)]
-        many = jax.tree.map(lambda *rows: jnp.stack(rows), *poses)
-        batch = jax.jit(jax.vmap(lambda pose: skin(gaussians, weights, centers, pose, blend)))(many)
+        many = jax.tree.map(lambda *rows: jnp.asarray(np.stack(rows)), *poses)
+        batch = jax.vmap(lambda pose: skinned(gaussians, weights, centers, pose, blend))(many)
+        batch = jax.device_get(batch)
         for i, pose in enumerate(poses):
-            one = skin(gaussians, weights, centers, pose, blend)
+            one = skinned(gaussians, weights, centers, pose, blend)
             np.testing.assert_allclose(batch.means[i], one.means, atol=1e-12)
             np.testing.assert_allclose(batch.quats[i], one.quats, atol=1e-12)
 
     def test_handles_that_look_opposite_ways_give_numbers(self, blend):
         """Half a turn apart and with equal weights, no rotation between them is preferred."""
         gaussians, _, centers, pose = made_up(1)
-        opposite = HandlePose(jnp.array([[1.0, 0, 0, 0], [0, 1.0, 0, 0], [0, 0, 0, 1.0]]), pose.translations)
-        weights = jnp.tile(jnp.array([0.5, 0.5, 0.0]), (7, 1))
+        opposite = np.eye(4)[[0, 1, 3]]
+        weights = np.tile([0.5, 0.5, 0.0], (7, 1))
 
         def total(quats):
-            after = skin(gaussians, weights, centers, HandlePose(quats, opposite.translations), blend)
-            return jnp.sum(after.means) + jnp.sum(quats_to_matrices(after.quats))
+            means, turned = means_and_turns(gaussians, weights, quats, pose.translations, centers, blend)
+            return jnp.sum(means) + jnp.sum(turned)
 
-        value, slope = jax.jit(jax.value_and_grad(total))(opposite.quats)
+        value, slope = jax.jit(jax.value_and_grad(total))(opposite)
         assert np.isfinite(value)
         assert np.isfinite(slope).all()
 
@@ -123,8 +131,8 @@ class TestLaws:
 @given(seeds)
 def test_polar_is_the_nearest_rotation(seed):
     gaussians, weights, centers, pose = made_up(seed, most=1.5)
-    moved = skin(gaussians, weights, centers, pose, "polar")
-    sums = np.einsum("np,pij->nij", weights, quats_to_matrices(pose.quats))
+    moved = skinned(gaussians, weights, centers, pose, "polar")
+    sums = np.einsum("np,pij->nij", weights, matrices(pose.quats))
     nearest = np.array([polar(one)[0] for one in sums])
     np.testing.assert_allclose(rotated(moved), nearest @ rotated(gaussians), atol=1e-7)
 
@@ -136,14 +144,16 @@ def test_between_two_turns_about_one_axis_all_blends_turn_about_it(seed, share):
     rng = np.random.default_rng(seed)
     axis, angle = Rotation.random(rng=rng).apply([0.0, 0.0, 1.0]), rng.uniform(0.2, 2.5)
     point = axis * rng.normal()
-    centers = jnp.asarray(np.stack([point, point]))
+    centers = np.stack([point, point])
     turned = Rotation.from_rotvec(angle * axis).as_quat(scalar_first=True)
-    pose = HandlePose(jnp.asarray(np.stack([np.array([1.0, 0, 0, 0]), turned])), jnp.zeros((2, 3)))
+    pose = HandlePose(
+        jnp.asarray(np.stack([np.array([1.0, 0, 0, 0]), turned])), jnp.asarray(np.zeros((2, 3)))
+    )
     gaussians = made_up(seed, num=4)[0]
-    weights = jnp.tile(jnp.array([1 - share, share]), (4, 1))
+    weights = np.tile([1 - share, share], (4, 1))
     vectors = [
         Rotation.from_matrix(
-            rotated(skin(gaussians, weights, centers, pose, blend))[0] @ rotated(gaussians)[0].T
+            rotated(skinned(gaussians, weights, centers, pose, blend))[0] @ rotated(gaussians)[0].T
         )
         for blend in BLENDS
     ]
@@ -156,29 +166,37 @@ def test_between_two_turns_about_one_axis_all_blends_turn_about_it(seed, share):
 
     before = distance(gaussians.means)
     np.testing.assert_allclose(
-        distance(skin(gaussians, weights, centers, pose, "dual").means), before, atol=1e-9
+        distance(skinned(gaussians, weights, centers, pose, "dual").means), before, atol=1e-9
     )
-    assert (distance(skin_means(gaussians.means, weights, centers, pose)) <= before + 1e-9).all()
+    assert (distance(jax.jit(skin_means)(gaussians.means, weights, centers, pose)) <= before + 1e-9).all()
 
 
 def test_at_rest_nothing_moves_and_nothing_else_changes():
     gaussians, weights, centers, _ = made_up(3)
-    for blend in BLENDS:
+
+    @partial(jax.jit, static_argnums=2)
+    def rest(weights, centers, blend):
         moved = skin(gaussians, weights, centers, at_rest(3), blend)
-        np.testing.assert_allclose(moved.means, gaussians.means, atol=1e-6)
-        np.testing.assert_allclose(rotated(moved), rotated(gaussians), atol=1e-6)
         assert moved.log_scales is gaussians.log_scales
         assert moved.sh0 is gaussians.sh0
+        return moved.means, quats_to_matrices(moved.quats)
+
+    for blend in BLENDS:
+        means, turned = rest(weights, centers, blend)
+        np.testing.assert_allclose(means, gaussians.means, atol=1e-6)
+        np.testing.assert_allclose(turned, rotated(gaussians), atol=1e-6)
 
 
 def test_a_handle_without_weight_changes_nothing_however_far_it_is():
     gaussians, weights, centers, pose = made_up(4)
-    none = jnp.concatenate([weights[:, :2] / weights[:, :2].sum(1, keepdims=True), jnp.zeros((7, 1))], axis=1)
-    far = HandlePose(pose.quats, pose.translations.at[2].set(1e6))
+    none = np.concatenate([weights[:, :2] / weights[:, :2].sum(1, keepdims=True), np.zeros((7, 1))], axis=1)
+    translations = np.array(pose.translations)
+    translations[2] = 1e6
+    far = HandlePose(pose.quats, jnp.asarray(translations))
     for blend in BLENDS:
         np.testing.assert_allclose(
-            skin(gaussians, none, centers, far, blend).means,
-            skin(gaussians, none, centers, pose, blend).means,
+            skinned(gaussians, none, centers, far, blend).means,
+            skinned(gaussians, none, centers, pose, blend).means,
             atol=1e-6,
         )
 
