@@ -12,6 +12,7 @@ from gsjax.data.photographs import Photographs
 from gsjax.engine.budget import Budget
 from gsjax.engine.drive import Drive, drive
 from gsjax.engine.ending import ended, exit_code, finish
+from gsjax.engine.fit.costs import affordable
 from gsjax.engine.fit.ending import Ending, some_of
 from gsjax.engine.fit.judge import Judge
 from gsjax.engine.fit.results import summarize
@@ -59,8 +60,8 @@ class Options(OfDataset):
     """Size of the pictures (width and height) relative to the original, for example 0.5. Default: the
     original, but at most 1,600 pixels a side. With --minutes, they are downscaled further if that pays."""
     fit: FitConfig = field(default_factory=FitConfig)
-    """Settings of the fit. With --minutes and no other setting, there are as many steps as there is time
-    for."""
+    """Settings of the fit. With --minutes and no other setting, the number of steps, the largest number of
+    Gaussians and the degree of their colours follow from what there is time for."""
 
 
 def run(options: Options) -> int:
@@ -87,25 +88,29 @@ def run(options: Options) -> int:
             raise ValueError("--until-psnr: nothing is held out to judge by; see --test-every")
         folder = RunFolder(options.out, overwrite=options.overwrite, resume=options.resume)
         settings = replace(options, dataset=located(options.dataset))
-        timed = options.fit == FitConfig(seed=options.fit.seed)  # with --minutes, they decide the steps
+        is_default = options.fit == FitConfig(seed=options.fit.seed)  # so that --minutes decide
         if options.resume:
-            differ = timed and (folder.setting("minutes") is None) != (options.minutes is None)
+            differ = is_default and (folder.setting("minutes") is None) != (options.minutes is None)
             may_change = [name for name in _MAY_CHANGE if not (differ and name == "minutes")]
             folder.check_config(settings, but=tuple(may_change))
         frames, progress = read_frames(photographs, console), Progress()
         fitted = [frames[i] for i in chosen]
-        config, cloud = start_from(photographs, fitted, options.fit, console)
-        if options.minutes is not None and timed:
-            config = replace(config, steps=_UNLIMITED)
+        width, height = photographs.sizes[photographs.sizes.prod(1).argmax()].tolist()
+        config = options.fit
+        if options.minutes is not None and is_default:
+            config = _affordable(config, (width, height), options.minutes, notes, console)
+        config, cloud = start_from(photographs, fitted, config, console)
         method = Fit(config)
         problem, run = method.start(fitted, cloud, photographs.background)
         if options.resume:
             run, progress = load_run(folder.resume, run, progress)
             budget.expect_more_than(progress.used_seconds)
             notes.add(f"Resumed after {run.step} steps of an earlier run.")
+            if is_default:  # the slots that an earlier run chose for its minutes are kept
+                config = replace(config, cap=run.params.gaussians.num)
+                method = Fit(config)
         folder.write_config(settings)  # from here on an earlier run is gone
         if options.minutes is not None:
-            width, height = photographs.sizes[photographs.sizes.prod(1).argmax()].tolist()
             sizes = Sizes(config, (width, height), budget, progress, notes, console)
             problem = problem._replace(shrink=sizes)
         board = TensorBoard(folder.path, progress.rows) if options.tensorboard else None
@@ -118,7 +123,7 @@ def run(options: Options) -> int:
         if isinstance(stopped, KeyboardInterrupt):
             console.print("stopping: the scene is scored and written; Ctrl-C again leaves out the scores")
         budget.hurried = stopped is not None
-        _note_oddities(options, progress, gaussians, stopped is None, notes)
+        _note_oddities(options, config, progress, gaussians, stopped is None, notes)
         found_frames = refined_frames(problem, run.params)
         write_cameras(folder, [photographs.names[i] for i in chosen], found_frames, run.params)
         gaussians, light = ending.pruned(gaussians, found_frames, config)
@@ -171,6 +176,20 @@ def _at_scale(photographs: Photographs, scale: float | None, notes: Notes, conso
     return scaled
 
 
+def _affordable(
+    config: FitConfig, size: tuple[int, int], minutes: float, notes: Notes, console: Console
+) -> FitConfig:
+    """The settings for these minutes, which are said."""
+    found, steps = affordable(config, size, minutes)
+    words = (
+        f"up to {found.cap:,} Gaussians with colours of degree {found.sh_degree}, as there should be time "
+        f"for {steps:,} steps"
+    )
+    console.print(words, soft_wrap=True)
+    notes.add(f"U{words[1:]} (--minutes).")
+    return replace(found, steps=_UNLIMITED)
+
+
 def _fitted(
     options: Options,
     method: Fit,
@@ -214,7 +233,12 @@ def _fitted(
 
 
 def _note_oddities(
-    options: Options, progress: Progress, gaussians: Gaussians, finished: bool, notes: Notes
+    options: Options,
+    config: FitConfig,
+    progress: Progress,
+    gaussians: Gaussians,
+    finished: bool,
+    notes: Notes,
 ) -> None:
     if progress.skipped:
         notes.add(f"{progress.skipped} steps produced non-finite numbers and were skipped.")
@@ -223,10 +247,10 @@ def _note_oddities(
         kept = jax.config.jax_enable_compilation_cache and jax.config.jax_compilation_cache_dir
         later = "; programs are kept, and the next fit of this size finds most of them" if kept else ""
         notes.warn(f"compiling took {compiling:.0f} s, of {given:.0f} given{later}")
-    if finished and gaussians.sh_degree < options.fit.sh_degree:
+    if finished and gaussians.sh_degree < config.sh_degree:
         notes.add(
             f"Colours are of degree {gaussians.sh_degree}: a degree is added every "
-            f"{options.fit.sh_every:,} steps (--fit.sh-every)."
+            f"{config.sh_every:,} steps (--fit.sh-every)."
         )
 
 

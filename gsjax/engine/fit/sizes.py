@@ -1,17 +1,15 @@
-"""The size of photographs in a fit of given minutes, by what steps cost on this machine."""
+"""The size of photographs in a fit of given minutes, by the measured pace of its steps."""
 
 from rich.console import Console
 
 from gsjax.engine.budget import Budget
+from gsjax.engine.fit.costs import LEAST_STEPS, last_shrink
 from gsjax.engine.messages import Notes
 from gsjax.engine.progress import Progress
 from gsjax.methods.fit import FitConfig
 
-_LEAST_STEPS = 150  # on photographs of a size, without which smaller ones give more
 _COMPILING_S = 5.0
-_LEAST_SIDE = 32  # pixels
 _DEARER = 3.5  # a step on photographs of twice the width and height; docs/choosing.md
-_STEP_S = (0.02, 6e-7, 2e-6)  # a step, and more for a pixel and for a Gaussian, on two cores of an AMD EPYC
 
 
 class Sizes:
@@ -59,7 +57,7 @@ class Sizes:
             self._times.pop(0)
             last = not self._times
             left = int((self._budget.steps_s - _COMPILING_S) * pace / _DEARER)
-            if left >= _LEAST_STEPS:
+            if left >= LEAST_STEPS:
                 self._now //= 2
                 self._progress.pace = 0.0  # which is not known at the new size
             elif last:
@@ -70,14 +68,7 @@ class Sizes:
         """The factor at the beginning: four times that of the largest size for which there should be time."""
         if not self._times:
             return 1
-        constant, a_pixel, a_gaussian = _STEP_S
-        width, height = self._size
-        last, least = 1, constant + a_gaussian * self._config.start.count
-        while (least + a_pixel * width * height / last**2) * _LEAST_STEPS > self._budget.steps_s / 2 and min(
-            self._size
-        ) >= 8 * last * _LEAST_SIDE:
-            last *= 2
-        return 4 * last
+        return 4 * last_shrink(self._config, self._size, self._budget.steps_s)
 
     def _say(self, left: int) -> None:
         width, height = self._size
@@ -86,4 +77,4 @@ class Sizes:
             f"{2 * height // self._now} there would be time for {left} steps"
         )
         self._console.print(words, soft_wrap=True)
-        self._notes.add(f"P{words[1:]}, and {_LEAST_STEPS} are needed to gain by it (--minutes).")
+        self._notes.add(f"P{words[1:]}, and {LEAST_STEPS} are needed to gain by it (--minutes).")

@@ -112,6 +112,30 @@ def test_a_run_from_photographs_to_a_report_and_one_that_was_stopped(gsjax_fit, 
     assert "nothing is left to resume" in " ".join(gsjax_fit(*QUICK, "--resume")[1].split())
 
 
+@pytest.mark.slow
+def test_what_minutes_decided_holds_when_a_run_is_resumed(gsjax_fit, tmp_path, monkeypatch):
+    add = Progress.add
+
+    def stopped(self, tick):
+        add(self, tick)
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as context:
+        context.setattr(Progress, "add", stopped)
+        code, said = gsjax_fit("--minutes", "0.2")
+    assert code == 130
+    words = "up to 5,000 Gaussians with colours of degree 0, as there should be time for"
+    assert words in " ".join(said.split())
+    code, said = gsjax_fit("--resume")
+    assert code == 2
+    assert "was started with minutes 0.2, now it is None" in " ".join(said.split())
+    code, said = gsjax_fit("--resume", "--minutes", "0.9")
+    assert code == 0, said
+    found = json.loads((tmp_path / "run" / "metrics.json").read_text())
+    assert found["steps"] > 1
+    assert found["num_gaussians"] <= 5_000
+
+
 @pytest.mark.skipif(os.name != "posix", reason="signals")
 def test_ctrl_c_in_the_middle_of_a_step_leaves_what_can_be_resumed(photographs, gsjax_fit, tmp_path):
     """A step gives away the buffers that it replaces, and most of the time one is being made."""
