@@ -106,7 +106,7 @@ def make_scene(case: Case) -> Scene:
 
 
 def cast(scene: Scene, dtype) -> Scene:
-    return {k: None if v is None else jnp.asarray(v, dtype) for k, v in scene.items()}
+    return {k: None if v is None else jax.device_put(np.asarray(v, dtype)) for k, v in scene.items()}
 
 
 def draw(scene: Scene, case: Case, **options: Any):

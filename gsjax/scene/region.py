@@ -1,5 +1,7 @@
 """Regions in which images may change: the tiles that Gaussians touch."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
@@ -11,6 +13,7 @@ TILE = 16
 """Edge of a tile in pixels; a multiple of the rasterizer's."""
 
 
+@partial(jax.jit, static_argnums=2, inline=True)
 def touched_tiles(
     positions: list[Float[Array, "m 3"]], frame: Frame, tile: int = TILE
 ) -> Bool[Array, "c rows columns"]:

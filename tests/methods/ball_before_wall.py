@@ -1,6 +1,6 @@
 """A ball of coloured Gaussians before a wall, as the tracker's refinement is given it."""
 
-import jax.numpy as jnp
+import jax
 import numpy as np
 
 from gsjax.geometry.cameras import Camera, intrinsics, look_at
@@ -10,6 +10,7 @@ from gsjax.methods.track.scene import TrackedScene
 from gsjax.scene.frame import Frame
 from gsjax.scene.gaussians import gaussians_from_activated
 from gsjax.scene.render import plan_render, render
+from tests.methods.made_up_parts import floats
 
 OBJECT, BACKGROUND = 150, 200
 
@@ -24,17 +25,17 @@ def batch_after(twist) -> RefineBatch:
     quats = np.broadcast_to([1.0, 0.0, 0.0, 0.0], (count, 4))
     scales = np.repeat([[0.015] * 3, [0.05] * 3], (OBJECT, BACKGROUND), axis=0)
     values = (np.r_[ball, wall], quats, scales, np.full(count, 0.9), rng.uniform(0, 1, (count, 3)))
-    gaussians = gaussians_from_activated(*(jnp.asarray(value, float) for value in values))
-    labels = jnp.asarray(np.repeat([1, 0], (OBJECT, BACKGROUND)), jnp.int32)
-    scene = TrackedScene(gaussians, jnp.zeros((OBJECT, 3)), labels, (0, 1), OBJECT)
+    gaussians = gaussians_from_activated(*(floats(value) for value in values))
+    labels = jax.device_put(np.repeat(np.int32([1, 0]), (OBJECT, BACKGROUND)))
+    scene = TrackedScene(gaussians, floats(np.zeros((OBJECT, 3))), labels, (0, 1), OBJECT)
     viewmats = np.stack([look_at(np.array(eye), np.zeros(3)) for eye in ((0.2, 0.0, 0.7), (-0.2, 0.1, 0.7))])
     Ks = np.broadcast_to(intrinsics(60.0, 64, 48), (2, 3, 3))
-    cameras = Camera(jnp.asarray(viewmats, float), jnp.asarray(Ks, float), 64, 48)
+    cameras = Camera(floats(viewmats), floats(Ks), 64, 48)
     pose = first_pose(scene)
-    centers = group_means(pose.means, labels[:OBJECT], 1)
-    motion = Motion(jnp.asarray([twist], float), jnp.zeros((OBJECT, 3)))
-    moved = place(scene, move(pose, motion, centers, labels[:OBJECT]))
+    centers = group_means(pose.means, scene.groups, 1)
+    motion = Motion(floats([twist]), floats(np.zeros((OBJECT, 3))))
+    moved = place(scene, move(pose, motion, centers, scene.groups))
     seen = render(moved, cameras)
     plan = plan_render(gaussians, cameras, headroom=3.0, derivative="forward")
-    everywhere = jnp.ones((2, 48, 64), bool)
+    everywhere = jax.device_put(np.ones((2, 48, 64), bool))
     return RefineBatch(scene, Frame(seen.colors, seen.depths, cameras), plan, pose, centers, everywhere)

@@ -2,7 +2,7 @@
 
 from dataclasses import replace
 
-import jax.numpy as jnp
+import jax
 import numpy as np
 
 from gsjax.methods.track import PRESETS
@@ -14,10 +14,12 @@ CARTON = 2
 SIZE = {"width": 160, "height": 120}
 
 
+@jax.jit
 def see(frame):
     return tone_images(frame, CONFIG.shading)
 
 
+@jax.jit
 def middle(points):
     """The mean of the points that count."""
     return (points.means * (points.seen[:, None] > 0)).sum((0, 2)) / (points.seen > 0).sum()
@@ -25,7 +27,10 @@ def middle(points):
 
 def gap(points, sight, config=CONFIG):
     """Disagreement of points where they are."""
-    return float(disagreement(jnp.zeros(6), points, jnp.zeros(3), sight, config))
+    return float(_disagreement(np.zeros(6, np.float32), points, np.zeros(3, np.float32), sight, config))
+
+
+_disagreement = jax.jit(disagreement, static_argnums=4)
 
 
 def error(points, means, then):

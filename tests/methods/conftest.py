@@ -4,7 +4,6 @@ from dataclasses import replace
 from functools import cache
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -61,11 +60,12 @@ def moved(table):
     the carton in the masks of frame 6)."""
     sequence, frames, _ = table(8, 2, **SIZE)
     labels = np.stack([sequence.mask(6, c) for c in range(2)])
-    labels = jnp.asarray(np.where(labels == CARTON, 1, 0), jnp.int32)
-    points = pixels_of_groups(see(frames[6]), labels, frames[6].depths, 1, CONFIG)
+    labels = jax.device_put(np.where(labels == CARTON, 1, 0).astype(np.int32))
+    pixels = jax.jit(pixels_of_groups, static_argnums=(3, 4))
+    points = pixels(see(frames[6]), labels, frames[6].depths, 1, CONFIG)
     k = sequence.truth.names.index("carton")
     motion = sequence.truth.poses[7, k] @ np.linalg.inv(sequence.truth.poses[6, k])
-    one = jax.tree.map(lambda a: a[0], points)
+    one = jax.tree.map(lambda a: np.asarray(a)[0], points)
     then = np.einsum("ij,cjp->cip", motion[:3, :3], np.asarray(one.means, np.float64)) + motion[:3, 3:]
     return one, middle(one), see(frames[7]), then, labels
 

@@ -16,27 +16,32 @@ CENTERS = np.array([[0.0, 0.0, 0.0], [0.4, 0.1, 0.2], [-0.5, 0.3, 0.0]])
 """Handles of a background, a lid and a drawer."""
 
 
+def floats(values):
+    """Values on the device, in JAX's present floating type, which numpy converts them to."""
+    return jax.device_put(np.asarray(values, jnp.result_type(float)))
+
+
 def scene_of(seed, num=7, parts=3):
     """A scene with soft weights."""
     rng = np.random.default_rng(seed)
     shapes = ((num, 3), (num, 4), (num, 3), (num,), (num, 1, 3))
-    gaussians = Gaussians(*(jnp.asarray(rng.normal(size=shape)) for shape in shapes))
-    weights = jnp.asarray(rng.dirichlet(np.ones(parts), num))
-    return PartScene(gaussians, weights, jnp.asarray(rng.normal(size=(parts, 3))))
+    gaussians = Gaussians(*(floats(rng.normal(size=shape)) for shape in shapes))
+    weights = floats(rng.dirichlet(np.ones(parts), num))
+    return PartScene(gaussians, weights, floats(rng.normal(size=(parts, 3))))
 
 
 def whole(scene, part):
     """The scene, all of it one part's."""
-    weights = jnp.zeros_like(scene.weights).at[:, part].set(1.0)
+    weights = floats(np.tile(np.arange(scene.weights.shape[1]) == part, (len(scene.weights), 1)))
     return PartScene(scene.gaussians, weights, scene.centers)
 
 
 def moment_of(seed, parts=3):
     """A moment in which everything has changed."""
     rng = np.random.default_rng(seed)
-    pose = HandlePose(jnp.asarray(rng.normal(size=(parts, 4))), jnp.asarray(rng.normal(size=(parts, 3))))
+    pose = HandlePose(floats(rng.normal(size=(parts, 4))), floats(rng.normal(size=(parts, 3))))
     opacities, scales = rng.uniform(0.1, 0.9, parts), rng.uniform(0.5, 2.0, parts)
-    return Moment(pose, jnp.asarray(opacities), jnp.asarray(scales))
+    return Moment(pose, floats(opacities), floats(scales))
 
 
 def trajectory(seed, moments=9, parts=4):
@@ -50,8 +55,8 @@ def trajectory(seed, moments=9, parts=4):
         turns[t] = [turn.as_quat(scalar_first=True) for turn in now]
     shifts = np.cumsum(rng.uniform(-0.1, 0.1, (moments, parts, 3)), axis=0)
     opacities, scales = rng.uniform(0.1, 0.9, (moments, parts)), rng.uniform(0.5, 2.0, (moments, parts))
-    poses = HandlePose(jnp.asarray(turns), jnp.asarray(shifts))
-    return Trajectory(STEP * jnp.arange(float(moments)), poses, jnp.asarray(opacities), jnp.asarray(scales))
+    poses = HandlePose(floats(turns), floats(shifts))
+    return Trajectory(floats(STEP * np.arange(moments)), poses, floats(opacities), floats(scales))
 
 
 def hinge(angles, axis=(0.0, 0.0, 1.0), point=(0.0, 0.0, 0.0)):
@@ -63,8 +68,8 @@ def jointed(joints, centers, times):
     motions = np.stack([joint.motions() for joint in joints], axis=1)
     turns = Rotation.from_matrix(motions[..., :3, :3].reshape(-1, 3, 3)).as_quat(scalar_first=True)
     shifts = np.einsum("tpij,pj->tpi", motions[..., :3, :3], centers) + motions[..., :3, 3] - centers
-    poses = HandlePose(jnp.asarray(turns.reshape(*motions.shape[:2], 4)), jnp.asarray(shifts))
-    return trajectory_of(jnp.asarray(times), poses)
+    poses = HandlePose(floats(turns.reshape(*motions.shape[:2], 4)), floats(shifts))
+    return trajectory_of(floats(times), poses)
 
 
 def motions(trajectory, centers, part):

@@ -6,7 +6,6 @@ from functools import cached_property
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -84,7 +83,7 @@ class MovingBoxes:
         eyes = 0.75 * np.stack([np.cos(angles), np.sin(angles), np.full(cameras, 0.8)], -1)
         viewmats = np.stack([look_at(eye, np.array([0, 0, 0.03])) for eye in eyes])
         Ks = np.tile(intrinsics(0.95 * WIDTH, WIDTH, HEIGHT), (cameras, 1, 1))
-        self.cameras = Camera(jnp.asarray(viewmats, jnp.float32), jnp.asarray(Ks, jnp.float32), WIDTH, HEIGHT)
+        self.cameras = Camera(*jax.device_put((np.float32(viewmats), np.float32(Ks))), WIDTH, HEIGHT)
 
     def at(self, t: int) -> Gaussians:
         """The scene at frame t."""
@@ -93,7 +92,7 @@ class MovingBoxes:
             motion, mine = box.motions()[t], self.bodies == k
             means[mine] = means[mine] @ motion[:3, :3].T + motion[:3, 3]
             quats[mine] = Rotation.from_matrix(motion[:3, :3]).as_quat(scalar_first=True)
-        places = jnp.asarray(means), jnp.asarray(quats)
+        places = jax.device_put((means, quats))
         return eqx.tree_at(lambda g: (g.means, g.quats), self.gaussians, places)
 
     @cached_property
@@ -107,7 +106,8 @@ class MovingBoxes:
         draw = jax.jit(lambda g: render(g, self.cameras, plan))
         drawn = [draw(self.at(t)) for t in range(self.num_frames)]
         assert not any(bool(d.meta.overflow.any()) for d in drawn)
-        return [Frame(jnp.round(d.colors.clip(0, 1) * 255) / 255, None, self.cameras) for d in drawn]
+        images = [np.round(np.clip(d.colors, 0, 1) * 255) / np.float32(255) for d in drawn]
+        return [Frame(jax.device_put(image), None, self.cameras) for image in images]
 
     def frame(self, t: int) -> Frame:
         return self._frames[t]
@@ -121,9 +121,9 @@ class MovingBoxes:
         Args:
             pieces: of each Gaussian.
         """
-        one_hot = jax.nn.one_hot(jnp.asarray(pieces), int(pieces.max()) + 1)
+        one_hot = jax.device_put(np.eye(int(pieces.max()) + 1, dtype=np.float32)[pieces])
         drawn = render(self.gaussians, self.cameras, self._plan, features=one_hot)
-        return np.asarray(drawn.features.argmax(-1), np.int32)
+        return np.asarray(drawn.features).argmax(-1).astype(np.int32)
 
 
 def linear(frames: int, end: Sequence[float], begin: int = 0) -> np.ndarray:

@@ -183,7 +183,7 @@ def test_a_field_has_weights_of_living_parts_only(kind):
     wanted = jnp.asarray(np.eye(4)[(np.asarray(means)[:, 0] > 0).astype(int)], jnp.float32)
     alive = jnp.array([True, True, False, False])
     config = PartsConfig(weights=kind, grid=FeatureGridConfig(4, 4, 16, 10, 2, 16))
-    field, located = jax.jit(new_field, static_argnums=(1, 3))(jax.random.key(0), config, means, 4)
+    field, located = new_field(jax.random.key(0), config, means, 4)
     field, losses = fit_field_to_weights(field, located, wanted, alive, 60)
     if kind == "grid":
         assert losses[-1] < 0.1 * losses[0]

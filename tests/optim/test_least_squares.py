@@ -35,11 +35,17 @@ def curve(params, batch, *, step, key):
 def points(noise=0.02, dtype=np.float32):
     x = np.linspace(0, 3, 30)
     y = 2 * np.exp(-0.7 * x) + noise * np.random.default_rng(0).normal(size=30)
-    return {"x": jnp.asarray(x, dtype), "y": jnp.asarray(y, dtype)}
+    return {"x": x.astype(dtype), "y": y.astype(dtype)}
 
 
 def start(dtype=np.float32):
     return {"a": jnp.asarray(1.0, dtype), "b": jnp.asarray(0.1, dtype)}
+
+
+def updated(step, params, batch):
+    """The first update."""
+    state = jax.jit(step.init)(params)
+    return jax.jit(step.update)(params, state, batch, step=0, key=None)
 
 
 def by_scipy(batch, **options):
@@ -81,7 +87,7 @@ def test_gauss_newton_is_the_normal_equations():
     batch = points()
     x, y = np.asarray(batch["x"], np.float64), np.asarray(batch["y"], np.float64)
     step = least_squares_step(curve, SOLVERS["GN"])
-    params, _, info = step.update(start(), step.init(start()), batch, step=0, key=None)
+    params, _, info = updated(step, start(), batch)
     e = np.exp(-0.1 * x)
     jacobian = np.stack([e, -x * e], axis=-1)
     move = np.linalg.solve(jacobian.T @ jacobian, -jacobian.T @ (e - y))
@@ -94,7 +100,7 @@ def test_damping_is_what_is_added_to_the_normal_equations(damping):
     batch = points()
     x, y = np.asarray(batch["x"], np.float64), np.asarray(batch["y"], np.float64)
     step = least_squares_step(curve, SOLVERS["LM"], damping=damping)
-    params, _, info = step.update(start(), step.init(start()), batch, step=0, key=None)
+    params, _, info = updated(step, start(), batch)
     e = np.exp(-0.1 * x)
     jacobian = np.stack([e, -x * e], axis=-1)
     move = np.linalg.solve(jacobian.T @ jacobian + damping * np.eye(2), -jacobian.T @ (e - y))
@@ -132,7 +138,7 @@ def test_the_default_solver_ends_where_rounding_rejects_moves():
 
 def test_huber_is_scipys_and_forgives_an_outlier():
     batch = points(noise=0.01)
-    batch["y"] = batch["y"].at[3].add(4.0)
+    batch["y"][3] += 4
 
     def robust(params, batch, *, step, key):
         values, aux = curve(params, batch, step=step, key=key)
@@ -148,8 +154,10 @@ def test_huber_is_scipys_and_forgives_an_outlier():
 
 
 def test_huber_has_its_slope_on_both_sides_of_delta_and_leaves_infinity():
-    r = jnp.array([0.0, 0.1, 0.2, 0.2001, -3.0, -0.1, jnp.inf])
-    values, slopes = jax.jvp(lambda r: huber(r, 0.2), (r,), (jnp.ones(7),))
+    r = np.float32([0.0, 0.1, 0.2, 0.2001, -3.0, -0.1, np.inf])
+    along = np.ones(7, np.float32)
+    pushed = jax.jit(lambda r: jax.jvp(lambda r: huber(r, 0.2), (r,), (along,)))
+    values, slopes = jax.device_get(pushed(r))
     rho = np.where(np.abs(r) <= 0.2, 0.5 * r**2, 0.2 * (np.abs(r) - 0.1))
     np.testing.assert_allclose(0.5 * values**2, rho, rtol=1e-5)
     np.testing.assert_allclose(slopes[:4], 1.0, rtol=1e-3)
@@ -158,11 +166,12 @@ def test_huber_has_its_slope_on_both_sides_of_delta_and_leaves_infinity():
 
 @pytest.mark.parametrize("name", SOLVERS)
 def test_a_start_that_is_not_finite_or_overflows_is_kept_and_reported(name):
-    for bad in ({"y": points()["y"].at[0].set(jnp.nan)}, {"limit": jnp.array(0.0)}):
-        batch = points() | {"limit": jnp.array(jnp.inf)} | bad
-        step = least_squares_step(curve, SOLVERS[name])
-        state = step.init(start())
-        params, new_state, info = step.update(start(), state, batch, step=0, key=None)
+    broken = np.where(np.arange(30) == 0, np.float32(np.nan), points()["y"])
+    step = least_squares_step(curve, SOLVERS[name])
+    state, update = jax.jit(step.init)(start()), jax.jit(step.update)
+    for bad in ({"y": broken}, {"limit": np.float32(0)}):
+        batch = points() | {"limit": np.float32(np.inf)} | bad
+        params, new_state, info = update(start(), state, batch, step=0, key=None)
         solved, solved_info = solve(curve, start(), batch, solver=SOLVERS[name], max_steps=5)
         assert info["skipped"]
         assert solved_info["skipped"]
@@ -173,9 +182,9 @@ def test_a_start_that_is_not_finite_or_overflows_is_kept_and_reported(name):
 
 
 def test_a_move_into_overflow_is_rejected_reported_and_shortened():
-    batch = points() | {"limit": jnp.array(0.6)}  # the curve's own b is 0.7
+    batch = points() | {"limit": np.float32(0.6)}  # the curve's own b is 0.7
     step = least_squares_step(curve, SOLVERS["LM"], damping=0.1)
-    params, infos = scanned(step, start(), batch, 30)
+    params, infos = jax.device_get(scanned(step, start(), batch, 30))
     assert 0.5 < params["b"] <= 0.6
     assert falls(infos["loss"])
     rejected = ~infos["accepted"]
@@ -190,8 +199,9 @@ def test_a_move_into_overflow_is_rejected_reported_and_shortened():
 
 
 def test_gauss_newton_does_not_move_into_overflow():
-    batch = points() | {"limit": jnp.array(0.3)}
-    params, infos = scanned(least_squares_step(curve, SOLVERS["GN"]), start(), batch, 3)
+    batch = points() | {"limit": np.float32(0.3)}
+    step = least_squares_step(curve, SOLVERS["GN"])
+    params, infos = jax.device_get(scanned(step, start(), batch, 3))
     jax.tree.map(np.testing.assert_array_equal, params, start())
     assert not infos["accepted"].any()
     assert infos["overflow"].any(-1).all()
@@ -199,10 +209,10 @@ def test_gauss_newton_does_not_move_into_overflow():
 
 def test_a_long_wait_at_the_optimum_does_not_lock_the_damping():
     step = least_squares_step(curve, SOLVERS["LM"])
-    params, state = start(), step.init(start())
+    params, state, update = start(), jax.jit(step.init)(start()), jax.jit(step.update)
     for noise in (0.02, 0.0):  # a new frame, with the old state
         for i in range(60):
-            params, state, _ = jax.jit(step.update)(params, state, points(noise), step=i, key=None)
+            params, state, _ = update(params, state, points(noise), step=i, key=None)
     np.testing.assert_allclose([params["a"], params["b"]], [2.0, 0.7], atol=1e-4)
     assert all(1e-7 < a < 1e7 for a in jax.tree.leaves(state))
 
@@ -226,13 +236,14 @@ def test_many_frames_compile_once():
 
 def test_vmap_is_the_loop():
     batches = [points(noise) for noise in (0.0, 0.02, 0.05)]
-    many = jax.tree.map(lambda *a: jnp.stack(a), *batches)
-    solved, info = jax.vmap(lambda b: solve(curve, start(), b))(many)
-    stepped, _ = jax.vmap(lambda b: scanned(least_squares_step(curve), start(), b, 4))(many)
+    many = jax.tree.map(lambda *a: np.stack(a), *batches)
+    step = least_squares_step(curve)
+    together = jax.jit(jax.vmap(lambda b: (solve(curve, start(), b), scanned(step, start(), b, 4))))
+    (solved, info), (stepped, _) = jax.device_get(together(many))
     for i, batch in enumerate(batches):
         alone, _ = solve(curve, start(), batch)
         jax.tree.map(lambda a, b, i=i: np.testing.assert_allclose(a[i], b, rtol=1e-5), solved, alone)
-        alone, _ = scanned(least_squares_step(curve), start(), batch, 4)
+        alone, _ = scanned(step, start(), batch, 4)
         jax.tree.map(lambda a, b, i=i: np.testing.assert_allclose(a[i], b, rtol=1e-5), stepped, alone)
     assert info["converged"].all()
 
@@ -274,12 +285,12 @@ def test_a_start_that_is_not_a_number_is_reported_even_if_residuals_are_finite()
     def residual(x, batch, *, step, key):
         return jnp.where(jnp.isfinite(x), x, 1.0), {}
 
-    bad = jnp.array([jnp.nan, 1.0])
+    bad = np.float32([np.nan, 1.0])
     _, info = solve(residual, bad, None)
     assert info["skipped"]
     assert not info["converged"]
     step = least_squares_step(residual)
-    _, _, info = step.update(bad, step.init(bad), None, step=0, key=None)
+    _, _, info = updated(step, bad, None)
     assert info["skipped"]
     assert not info["accepted"]
 
@@ -299,17 +310,19 @@ def test_observations_have_the_form_of_images():
 
 def test_reject_overflow_and_difference():
     residual = {"a": jnp.ones((2, 3)), "b": jnp.zeros(2)}
-    kept = reject_overflow(residual, jnp.array([False, False]))
+    rejecting = jax.jit(reject_overflow)
+    kept = rejecting(residual, np.array([False, False]))
     jax.tree.map(np.testing.assert_array_equal, kept, residual)
-    lost = reject_overflow(residual, jnp.array([False, True]))
-    assert all(jnp.isposinf(a).all() for a in jax.tree.leaves(lost))
+    lost = rejecting(residual, np.array([False, True]))
+    assert all(np.isposinf(a).all() for a in jax.tree.leaves(lost))
 
-    observed = jnp.array([1.0, jnp.nan, jnp.inf, 0.5])
-    rendered = jnp.array([2.0, 3.0, 4.0, 0.25])
-    values, ignored = difference(rendered, observed)
+    observed = np.float32([1.0, np.nan, np.inf, 0.5])
+    rendered = np.float32([2.0, 3.0, 4.0, 0.25])
+    apart = jax.jit(difference)
+    values, ignored = apart(rendered, observed)
     np.testing.assert_array_equal(values, [1.0, 0.0, 0.0, -0.25])
     assert ignored == 2
-    slopes = jax.grad(lambda r: difference(r, observed)[0].sum())(rendered)
+    slopes = jax.jit(jax.grad(lambda r: apart(r, observed)[0].sum()))(rendered)
     np.testing.assert_array_equal(slopes, [1.0, 0.0, 0.0, 1.0])
 
 
@@ -320,16 +333,16 @@ def test_groups_move_in_their_own_frame_and_arrays_are_themselves():
     pose = jaxlie.SE3.exp(jnp.array([0.3, -0.2, 0.5, 0.4, 0.1, -0.6]))
     poses = jax.tree.map(lambda a: jnp.stack([a, a]), pose)
     params = {"pose": pose, "poses": poses, "K": jnp.array([1.0, 2.0])}
-    zero = to_coordinates(params)
+    zero, moved = jax.jit(to_coordinates)(params), jax.jit(from_coordinates)
     assert (zero["pose"].shape, zero["poses"].shape) == ((6,), (2, 6))
-    same = from_coordinates(params, zero)
+    same = moved(params, zero)
     np.testing.assert_allclose(same["pose"].as_matrix(), pose.as_matrix(), atol=1e-6)
     np.testing.assert_array_equal(same["K"], params["K"])
 
-    forward = from_coordinates(params, zero | {"pose": jnp.array([0.0, 0, 2, 0, 0, 0])})["pose"]
+    forward = moved(params, zero | {"pose": np.float32([0.0, 0, 2, 0, 0, 0])})["pose"]
     ahead = pose.translation() + 2 * pose.rotation().as_matrix()[:, 2]
     np.testing.assert_allclose(forward.translation(), ahead, atol=1e-6)
-    turned = from_coordinates(params, zero | {"pose": jnp.array([0.0, 0, 0, 0.1, 0, 0])})["pose"]
+    turned = moved(params, zero | {"pose": np.float32([0.0, 0, 0, 0.1, 0, 0])})["pose"]
     np.testing.assert_array_equal(turned.translation(), pose.translation())
 
 

@@ -10,6 +10,17 @@ import pytest
 from gsjax.rasterize.frozen import freeze_views, padded_view, paint, strip_of
 from gsjax.rasterize.rasterization import rasterization
 
+painted = jax.jit(paint, static_argnums=2)
+
+
+def values_of(scene, seed, *shape):
+    count = len(scene["means"])
+    return np.float32(np.random.default_rng(seed).normal(size=(*shape[:-1], count, shape[-1])))
+
+
+def view_of(views, i):
+    return jax.tree.map(lambda a: np.asarray(a)[i], views)
+
 
 def drawn(scene, values, **options):
     """Image and alphas of the rasterizer."""
@@ -27,34 +38,34 @@ def frozen(small, geometry):
 @pytest.mark.parametrize("channels", [1, 3, 20])
 def test_what_is_painted_is_what_the_rasterizer_draws(frozen, channels):
     scene, views, plan = frozen
-    values = jnp.asarray(np.random.default_rng(0).normal(size=(len(scene["means"]), channels)), jnp.float32)
-    colors, alphas = drawn(scene, values)
+    values = values_of(scene, 0, channels)
+    colors, alphas = drawn(scene, jnp.asarray(values))
     for c in range(len(colors)):
-        image, opacity = paint(jax.tree.map(lambda a, c=c: a[c], views), values, plan)
+        image, opacity = painted(view_of(views, c), values, plan)
         np.testing.assert_allclose(image, colors[c], atol=2e-5)
         np.testing.assert_allclose(opacity, alphas[c], atol=2e-5)
 
 
 def test_the_padding_of_a_view_is_not_seen(frozen):
     scene, views, plan = frozen
-    view = jax.tree.map(lambda a: a[1], views)
+    view = view_of(views, 0)
     seen, pairs = len(view.rows) + 7, len(view.ids) + 50
-    longer = jax.tree.map(jnp.asarray, padded_view(view, seen, pairs))
+    longer = padded_view(view, seen, pairs)
     assert {len(a) for a in (longer.rows, longer.means2d, longer.conics, longer.opacities)} == {seen}
     assert len(longer.ids) == pairs
-    values = jnp.asarray(np.random.default_rng(4).normal(size=(len(scene["means"]), 3)), jnp.float32)
-    for one, other in zip(paint(longer, values, plan), paint(view, values, plan), strict=True):
+    values = values_of(scene, 4, 3)
+    for one, other in zip(painted(longer, values, plan), painted(view, values, plan), strict=True):
         np.testing.assert_array_equal(one, other)
 
 
 @pytest.mark.parametrize("rows", [1, 2, 3, 5])
 def test_strips_below_each_other_are_the_image(frozen, rows):
     scene, views, plan = frozen
-    view = jax.tree.map(lambda a: a[0], views)
-    values = jnp.asarray(np.random.default_rng(1).normal(size=(len(scene["means"]), 12)), jnp.float32)
-    whole, _ = paint(view, values, plan)
-    cut = jax.jit(lambda i: paint(*_with(strip_of(view, plan, i, rows), values))[0])
-    strips = [cut(jnp.int32(i)) for i in range(0, plan.tiles_y, rows)]
+    view = view_of(views, 0)
+    values = values_of(scene, 1, 12)
+    whole, _ = painted(view, values, plan)
+    cut = jax.jit(lambda view, values, i: paint(*_with(strip_of(view, plan, i, rows), values))[0])
+    strips = [np.asarray(cut(view, values, np.int32(i))) for i in range(0, plan.tiles_y, rows)]
     assert strips[0].shape == (rows * plan.tile_size, 33, 12)
     together = np.concatenate(strips)
     np.testing.assert_allclose(together[:17], whole, atol=1e-5)
@@ -68,14 +79,11 @@ def _with(strip, values):
 
 def test_slopes_by_the_values_are_those_of_the_whole_rasterizer_and_nothing_else_has_any(frozen):
     scene, views, plan = frozen
-    view = jax.tree.map(lambda a: a[0], views)
+    view = view_of(views, 0)
     for channels in (3, 20):
-        random = np.random.default_rng(2)
-        values, weights = (
-            jnp.asarray(random.normal(size=shape), jnp.float32)
-            for shape in ((len(scene["means"]), channels), (17, 33, channels))
-        )
-        slope = jax.jit(jax.grad(lambda v, w=weights: (paint(view, v, plan)[0] * w).sum()))(values)
+        values = values_of(scene, 2, channels)
+        weights = np.float32(np.random.default_rng(3).normal(size=(17, 33, channels)))
+        slope = jax.jit(jax.grad(lambda v, w=weights: (painted(view, v, plan)[0] * w).sum()))(values)
 
         def whole(scene, values, w=weights):
             shapes = {k: scene[k] for k in ("means", "quats", "scales", "opacities", "viewmats", "Ks")}
@@ -86,32 +94,37 @@ def test_slopes_by_the_values_are_those_of_the_whole_rasterizer_and_nothing_else
         both = jax.jit(jax.grad(whole, argnums=(0, 1), allow_int=True))(scene, values)[1]
         np.testing.assert_allclose(slope, both, atol=2e-4)
         np.testing.assert_allclose(jax.jit(jax.grad(whole, argnums=1))(scene, values), both, atol=2e-4)
-        still = jax.jit(jax.grad(lambda view, v=values: paint(view, v, plan)[0].sum(), allow_int=True))(view)
+        still = jax.jit(jax.grad(lambda view, v=values: painted(view, v, plan)[0].sum(), allow_int=True))(
+            view
+        )
         np.testing.assert_array_equal(still.means2d, 0)
 
 
 def test_a_batch_of_values_is_a_loop_and_its_slopes_too(frozen):
     scene, views, plan = frozen
-    view = jax.tree.map(lambda a: a[0], views)
-    values = jnp.asarray(np.random.default_rng(3).normal(size=(3, len(scene["means"]), 2)), jnp.float32)
+    view = view_of(views, 0)
+    values = values_of(scene, 3, 3, 2)
 
-    def value(v):
-        return (paint(view, v, plan)[0] ** 2).sum()
+    @jax.jit
+    @jax.value_and_grad
+    def value_and_slope(v):
+        return (painted(view, v, plan)[0] ** 2).sum()
 
-    np.testing.assert_allclose(jax.vmap(value)(values), [value(v) for v in values], rtol=1e-5)
-    slopes = jax.vmap(jax.grad(value))(values)
-    np.testing.assert_allclose(
-        slopes, np.stack([jax.jit(jax.grad(value))(v) for v in values]), rtol=1e-4, atol=1e-4
-    )
+    together, slopes = jax.vmap(value_and_slope)(values)
+    alone, slopes_alone = zip(*map(value_and_slope, values), strict=True)
+    np.testing.assert_allclose(together, alone, rtol=1e-5)
+    np.testing.assert_allclose(slopes, np.stack(slopes_alone), rtol=1e-4, atol=1e-4)
 
 
 def test_what_cannot_be_drawn_is_in_no_list(small, geometry):
     _, scene = small(4)
-    sick = dict(scene, means=scene["means"].at[::3].set(jnp.nan))
+    means = np.array(scene["means"])
+    means[::3] = np.nan
+    sick = dict(scene, means=jnp.asarray(means))
     views, plan = freeze_views(*geometry(sick), 33, 17)
-    view = jax.tree.map(lambda a: a[0], views)
-    values = jnp.where(jnp.arange(len(sick["means"]))[:, None] % 3 == 0, jnp.nan, 1.0)
-    assert np.isfinite(paint(view, values, plan)[0]).all()
+    view = view_of(views, 0)
+    values = np.where(np.arange(len(means))[:, None] % 3 == 0, np.float32(np.nan), np.float32(1))
+    assert np.isfinite(painted(view, values, plan)[0]).all()
     listed = np.concatenate(
         [np.asarray(view.ids)[a : a + n] for a, n in zip(view.starts, view.counts, strict=True)]
     )
@@ -120,8 +133,8 @@ def test_what_cannot_be_drawn_is_in_no_list(small, geometry):
 
 def test_a_view_that_sees_nothing_is_empty(small, geometry):
     _, scene = small(5)
-    away = dict(scene, means=scene["means"] + np.float32(1e6))
+    away = dict(scene, means=jnp.asarray(np.asarray(scene["means"]) + np.float32(1e6)))
     views, plan = freeze_views(*geometry(away), 33, 17)
-    image, alphas = paint(jax.tree.map(lambda a: a[0], views), jnp.ones((len(away["means"]), 2)), plan)
+    image, alphas = painted(view_of(views, 0), np.ones((len(away["means"]), 2), np.float32), plan)
     np.testing.assert_array_equal(image, 0)
     np.testing.assert_array_equal(alphas, 0)

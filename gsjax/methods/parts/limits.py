@@ -33,6 +33,7 @@ class Beyond(NamedTuple):
     radians: Float[Array, "T P"]
 
 
+@jax.jit
 def beyond_captured(captured: Layer, edited: Trajectory) -> Beyond:
     """How far parts leave their observed motion.
 

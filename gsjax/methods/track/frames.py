@@ -1,8 +1,10 @@
 """Preparation of frames: only the tracked cameras, reduced in size, without pixels that are not finite."""
 
 from dataclasses import dataclass
+from functools import partial
 
 import equinox as eqx
+import jax
 from jaxtyping import Array, Int
 
 from gsjax.geometry.cameras import NEAR
@@ -31,6 +33,7 @@ def shape_of(frame: Frame) -> FrameShape:
     return FrameShape(len(frame.images), frame.cameras.width, frame.cameras.height, frame.cameras.near)
 
 
+@partial(jax.jit, static_argnums=1, inline=True)
 def prepared(frame: Frame, config: TrackConfig) -> tuple[Frame, Int[Array, ""]]:
     """The frame of `config.cameras`, with images reduced by `config.shrink`, and the number of its pixels
     that were not finite.

@@ -6,6 +6,7 @@ front of it or all behind it, the second way is exact, but for what `plan_moving
 to whichever is nearer.
 """
 
+from functools import partial
 from typing import NamedTuple
 
 import equinox as eqx
@@ -70,17 +71,20 @@ def shown_by(rendered: Rendered) -> Shown:
     return Shown(labels.astype(jnp.int32), rendered.depths, covered)
 
 
+@partial(jax.jit, inline=True)
 def background_of(scene: TrackedScene) -> Gaussians:
     """The Gaussians of the background."""
     return jax.tree.map(lambda a: a[scene.num_moving :], scene.gaussians)
 
 
+@partial(jax.jit, inline=True)
 def moving_of(scene: TrackedScene, pose: Pose) -> Gaussians:
     """The moving Gaussians at `pose`."""
     moving = jax.tree.map(lambda a: a[: scene.num_moving], scene.gaussians)
     return eqx.tree_at(lambda g: (g.means, g.quats), moving, (pose.means, pose.quats))
 
 
+@partial(jax.jit, static_argnums=1, inline=True)
 def thinned(gaussians: Gaussians, coarseness: int) -> Gaussians:
     """Every coarseness^2-th Gaussian, `coarseness` times as large: the same surface for smaller images."""
     some = jax.tree.map(lambda a: a[:: coarseness**2], gaussians)

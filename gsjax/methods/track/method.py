@@ -92,8 +92,8 @@ def matching_reduction(scene: TrackedScene, frame: Frame, config: TrackConfig) -
     """Factor by which images of all cameras shrink for matching, so that the second largest object fits the
     template: the largest is usually a robot, far larger than what it handles. On the host."""
     frame, _ = prepared(frame, config)
-    groups = np.asarray(scene.groups)
-    means = np.asarray(scene.gaussians.means[: scene.num_moving], np.float64)
+    groups = np.asarray(scene.labels)[: scene.num_moving]
+    means = np.asarray(scene.gaussians.means, np.float64)[: scene.num_moving]
     sizes = []
     for viewmat, K in zip(np.asarray(frame.cameras.viewmat), np.asarray(frame.cameras.K), strict=True):
         local = means @ viewmat[:3, :3].T + viewmat[:3, 3]

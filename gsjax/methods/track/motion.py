@@ -33,6 +33,7 @@ class Motion(eqx.Module):
     delta: Float[Array, "m 3"]
 
 
+@partial(jax.jit, static_argnums=2, inline=True)
 def group_means(
     values: Float[Array, "m *d"], groups: Int[Array, "m"], num_groups: int
 ) -> Float[Array, "k *d"]:
@@ -42,6 +43,7 @@ def group_means(
     return total / jnp.maximum(count, 1).reshape(-1, *[1] * (values.ndim - 1))
 
 
+@partial(jax.jit, inline=True)
 def move(pose: Pose, motion: Motion, centers: Float[Array, "k 3"], groups: Int[Array, "m"]) -> Pose:
     """The pose after each group is rotated about its center, metres, and translated, and each Gaussian is
     displaced; `groups` has the group of each Gaussian, 1..K."""

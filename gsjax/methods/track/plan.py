@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import jax
+import numpy as np
 from jaxtyping import Array, Bool, Int
 
 from gsjax.methods.track.config import TrackConfig
@@ -73,6 +74,6 @@ def plan_tracker(scene: TrackedScene, pose: Pose, frame: Frame, config: TrackCon
     full = plan_render(place(scene, pose), frame.cameras, headroom=headroom)
     rendered = render(place(scene, pose), frame.cameras, full)
     near = near_background(scene, rendered, touched_tiles([pose.means], frame))
-    num_near = rung(int(near.sum()) * headroom)
+    num_near = rung(np.count_nonzero(near) * headroom)
     around = near_scene(scene, near, num_near)
     return TrackPlan(full, plan_render(place(around, pose), frame.cameras, headroom=headroom), num_near)

@@ -1,5 +1,7 @@
 """The refined region: tiles that moving Gaussians touch, and the background Gaussians that reach them."""
 
+from functools import partial
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -11,6 +13,7 @@ from gsjax.scene.region import TILE
 from gsjax.scene.render import Rendered
 
 
+@partial(jax.jit, inline=True)
 def near_background(
     scene: TrackedScene, rendered: Rendered, tiles: Bool[Array, "c rows columns"]
 ) -> Bool[Array, "background"]:
@@ -33,6 +36,7 @@ def near_background(
     return jax.vmap(one)(means, radii, tiles).any(0)
 
 
+@partial(jax.jit, static_argnums=2, inline=True)
 def near_scene(scene: TrackedScene, near: Bool[Array, "background"], num_near: int) -> TrackedScene:
     """The scene with only the near Gaussians of the background, in `num_near` rows, of which surplus ones are
     invisible."""

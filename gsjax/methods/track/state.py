@@ -1,7 +1,9 @@
 """Parameters, state and batch of the tracker's step."""
 
+from functools import partial
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
@@ -87,6 +89,7 @@ class TrackBatch(NamedTuple):
     everywhere: Int[Array, ""] | None = None
 
 
+@partial(jax.jit, static_argnums=(1, 2), inline=True)
 def blank_state(params: Tracked, config: TrackConfig, shape: FrameShape) -> TrackState:
     """The state of a tracker that has seen no frame yet: no pixel shows any group, and nothing was drawn.
 

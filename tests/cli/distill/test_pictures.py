@@ -26,26 +26,39 @@ from gsjax.scene.gaussians import gaussians_from_activated
 from gsjax.viz.colors import colorize_features, fit_pca_colors
 from gsjax.viz.viewer.drawing import Drawer
 
+painted = jax.jit(paint)
+features_of_field = jax.jit(rendered_features)
+
+
+def some_of(scene, every):
+    """Every so many of a scene's Gaussians."""
+    return jax.tree.map(lambda a: jnp.asarray(np.asarray(a)[::every]), read_ply(scene)[0])
+
+
+def ahead(distance, K, width, height):
+    """A camera that looks along z, so far before the origin."""
+    pose = np.eye(4, dtype=np.float32)
+    pose[2, 3] = distance
+    return Camera(jnp.asarray(pose), jnp.asarray(K, jnp.float32), width, height)
+
 
 @pytest.mark.parametrize("encoding", ["grid", "table"])
 def test_a_picture_of_features_needs_three_numbers_a_pixel(scene, encoding):
-    gaussians = read_ply(scene)[0]
-    gaussians = jax.tree.map(lambda a: jnp.asarray(a[::40]), gaussians)
+    gaussians = some_of(scene, 40)
     grid = FeatureGridConfig(levels=2, most_resolution=16, log2_entries=8, hidden=8)
     field, located = init_field(
         jax.random.key(0), DistillConfig(channels=6, encoding=encoding, grid=grid), gaussians.means, 4
     )
-    K = jnp.array([[40.0, 0, 20], [0, 40.0, 16], [0, 0, 1]])
-    back = jnp.eye(4).at[2, 3].set(3.0)
-    cameras = [Camera(back, K, 40, 32), Camera(back.at[2, 3].set(2.0), K, 40, 32)]
+    K = np.array([[40, 0, 20], [0, 40, 16], [0, 0, 1]])
+    cameras = [ahead(distance, K, 40, 32) for distance in (3, 2)]
     colors, pca = feature_colors(field, located)
-    parts = rendered_features(field, located)
+    parts = features_of_field(field, located)
     ones = jnp.ones(len(parts.values))
     known = fit_pca_colors(np.asarray(parts.channels_of(parts.joined(parts.values, ones))))
     wanted = frozen_views(gaussians, cameras)
     kinds = set()
     for frozen, (view, plan) in zip(one_by_one(gaussians, cameras, "classic"), wanted, strict=True):
-        image, alphas = paint(view, parts.values, plan)
+        image, alphas = painted(view, parts.values, plan)
         channels = np.asarray(parts.channels_of(parts.joined(image, alphas)))
         alphas = np.asarray(alphas)[..., None]
         assert (alphas > 0.5).any()
@@ -57,13 +70,13 @@ def test_a_picture_of_features_needs_three_numbers_a_pixel(scene, encoding):
 
 
 def test_classes_of_a_picture_are_found_strip_by_strip(scene, monkeypatch):
-    gaussians = jax.tree.map(lambda a: jnp.asarray(a[::20]), read_ply(scene)[0])
+    gaussians = some_of(scene, 20)
     grid = FeatureGridConfig(levels=2, most_resolution=32, log2_entries=8, hidden=8)
     field, located = init_field(jax.random.key(0), DistillConfig(channels=6, grid=grid), gaussians.means, 4)
     field = eqx.tree_at(lambda f: f.encoding.table, field, 1e5 * field.encoding.table)
     codes, rows = np.random.default_rng(0).normal(size=(5, 4)).astype(np.float32), []
-    K = jnp.array([[40.0, 0, 20], [0, 40.0, 30], [0, 0, 1]])
-    frozen = frozen_views(gaussians, [Camera(jnp.eye(4).at[2, 3].set(3.0), K, 40, 60)])[0]
+    K = np.array([[40, 0, 20], [0, 40, 30], [0, 0, 1]])
+    frozen = frozen_views(gaussians, [ahead(3, K, 40, 60)])[0]
 
     def recorded(view, plan, first, count):
         rows.append(count)
@@ -73,8 +86,8 @@ def test_classes_of_a_picture_are_found_strip_by_strip(scene, monkeypatch):
     asked = (field, located, frozen, codes, classes_of(field, located, codes))
     whole, strips = class_maps(*asked), class_maps(*asked, strip_megabytes=0.1)
     assert rows == [frozen[1].tiles_y, 3] == [8, 3]
-    parts = rendered_features(field, located, frozen[0].rows)
-    cosines, alphas = jax.jit(lambda: pixel_cosines(field, parts, *frozen, jnp.asarray(codes)))()
+    parts = features_of_field(field, located, frozen[0].rows)
+    cosines, alphas = jax.device_get(jax.jit(pixel_cosines)(field, parts, *frozen, codes))
     np.testing.assert_array_equal(whole[0], np.where(alphas > 0.5, cosines.argmax(-1), -1))
     for one, other in zip(whole, strips, strict=True):
         np.testing.assert_array_equal(one, other)
