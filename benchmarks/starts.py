@@ -12,10 +12,11 @@ import runpy
 import subprocess
 import sys
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from time import perf_counter, time
 from typing import Any
+from urllib.request import urlopen
 
 from rich.console import Console
 from rich.table import Table
@@ -45,8 +46,10 @@ COMMANDS: dict[str, tuple[str, ...]] = {
               "--parts.refine.iterations", "0"),
     "distill": ("distill", "{fit}", "--distill.iterations", "10"),
     "deform": ("deform", _TISSUE, "--deform.iterations", "10"),
+    "view": ("view", "{fit}"),
 }  # fmt: skip
-"""Each command on a small built-in scene; {fit} is the folder of the run of `fit`."""
+"""Each command on a small built-in scene; {fit} is the folder of the run of `fit`. The first result of `view`
+is its page, with which it ends."""
 
 
 def watch(record: Path, begun: float, arguments: Sequence[str]) -> int:
@@ -76,18 +79,35 @@ def watch(record: Path, begun: float, arguments: Sequence[str]) -> int:
     jax.monitoring.register_event_duration_secs_listener(ended)
     jax.monitoring.register_event_listener(hit)
     ready = time() - begun
+    if arguments[0] == "view":
+        _end_with_its_page(lambda: updates.append(time() - begun))
     sys.argv = ["gsjax", *arguments]
     try:
         runpy.run_module("gsjax.cli", run_name="__main__")
         code = 0
     except SystemExit as left:
         code = left.code if isinstance(left.code, int) else 1
+    if arguments[0] == "view" and code == 130:  # Ctrl-C is how it ends
+        code = 0
     found = {"imported_s": ready, "first_s": updates[0] if updates else None, "total_s": time() - begun}
     found |= {f"{stage}_s": _union([s[2:] for s in spans if s[0] == stage]) for stage in _STAGES.values()}
     compiled = [span for span in spans if span[0] == "compiling"]
     found |= {"programs": len(compiled), "cache_hits": hits[0], "updates": len(updates)}
     write_json(record, found | {"by_program": _by_program(spans), "exit_code": code})
     return code
+
+
+def _end_with_its_page(served: Callable[[], None]) -> None:
+    """Let a viewer end, as by Ctrl-C, once a browser could have its page."""
+    from gsjax.viz.viewer import Viewer
+
+    def wait(viewer: Viewer) -> None:
+        with urlopen(viewer.url) as page:
+            page.read()
+        served()
+        raise KeyboardInterrupt
+
+    Viewer.wait = wait
 
 
 def _union(spans: list[tuple[float, float]]) -> float:
@@ -117,7 +137,7 @@ def measure(name: str, out: Path, cache: Path, label: str) -> dict[str, Any]:
     fit = out / "runs" / f"fit-{label}"
     arguments = [part.format(fit=fit) for part in COMMANDS[name]]
     run, record = out / "runs" / f"{name}-{label}", out / f"{name}-{label}.json"
-    words = [*arguments, "--out", str(run), "--overwrite"]
+    words = [*arguments, *([] if name == "view" else ["--out", str(run), "--overwrite"])]
     environment = {k: v for k, v in os.environ.items() if k != "JAX_COMPILATION_CACHE_DIR"}
     environment["XDG_CACHE_HOME"] = str(cache)
     command = [sys.executable, "-m", "benchmarks.starts", str(record), str(time()), *words]
@@ -154,8 +174,8 @@ def run(options: Options) -> int:
     if unknown := [name for name in options.only if name not in COMMANDS]:
         raise ValueError(f"--only: expected commands of {', '.join(COMMANDS)}, found {unknown[0]}")
     names = [name for name in COMMANDS if name in (options.only or COMMANDS)]
-    if "distill" in names and "fit" not in names:
-        names.insert(names.index("distill"), "fit")  # whose scene it learns on
+    if "fit" not in names and (of_its_scene := [name for name in names if "{fit}" in COMMANDS[name]]):
+        names.insert(names.index(of_its_scene[0]), "fit")
     out, console = (options.out or PART).absolute(), Console(width=None if sys.stdout.isatty() else 120)
     out.mkdir(parents=True, exist_ok=True)
     records: dict[str, dict[str, dict[str, Any]]] = {}
