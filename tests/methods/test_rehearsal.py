@@ -7,36 +7,33 @@ import pytest
 
 from gsjax.engine.track.rehearsal import Rehearsal
 from gsjax.engine.track.tracking import track
-from gsjax.methods.track import TrackConfig
-
-CONFIG = TrackConfig()
 
 
 @pytest.fixture(scope="module")
-def rehearsed(table, started):
+def rehearsed(table, started, quick):
     """The first frames, and a rehearsal on the scene that they show."""
     _, frames, _ = table()
-    rehearsal = Rehearsal(frames[0], CONFIG)
+    rehearsal = Rehearsal(frames[0], quick)
     rehearsal.begin(started)
     return frames, rehearsal
 
 
-def test_poses_are_those_without_a_rehearsal_and_nothing_is_compiled(rehearsed, started):
+def test_poses_are_those_without_a_rehearsal_and_nothing_is_compiled(rehearsed, started, quick):
     frames, rehearsal = rehearsed
     assert rehearsal.tick() is not None
-    (with_one,) = track(started, frames[0], frames[1:2], CONFIG, like=rehearsal.tick)
+    (with_one,) = track(started, frames[0], frames[1:2], quick, like=rehearsal.tick)
     assert with_one.compile_seconds == 0
-    (without,) = track(started, frames[0], frames[1:2], CONFIG)
+    (without,) = track(started, frames[0], frames[1:2], quick)
     for one, other in zip(*map(jax.tree.leaves, (with_one.result.pose, without.result.pose)), strict=True):
         np.testing.assert_array_equal(one, other)
 
 
-def test_one_that_fails_or_is_not_needed_is_done_without(started, rehearsed):
+def test_one_that_fails_or_is_not_needed_is_done_without(started, rehearsed, quick):
     frames, _ = rehearsed
-    assert Rehearsal(frames[0], CONFIG).tick() is None
-    unneeded = Rehearsal(frames[0], CONFIG, needed=False)
+    assert Rehearsal(frames[0], quick).tick() is None
+    unneeded = Rehearsal(frames[0], quick, needed=False)
     unneeded.begin(started)
     assert unneeded.tick() is None
-    failing = Rehearsal(eqx.tree_at(lambda f: f.images, frames[0], frames[0].images[:1]), CONFIG)
+    failing = Rehearsal(eqx.tree_at(lambda f: f.images, frames[0], frames[0].images[:1]), quick)
     failing.begin(started)
     assert failing.tick() is None

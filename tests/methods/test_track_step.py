@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from gsjax.methods.track import PLAN, PRESETS, AlignConfig, Track, TrackBatch
+from gsjax.methods.track.frames import prepared
 from gsjax.methods.track.grow import empty_slots
 
 # Looks nowhere but where things were, which compiles fast, and for all groups, so that rounding chooses none.
@@ -115,14 +116,24 @@ def test_a_frame_that_cannot_be_read_changes_nothing(table, begun, what):
     assert_same((params, state), (run.params, run.state))
 
 
-def test_bytes_are_seen_as_floats_are(table, begun):
-    _, frames, _ = table()
+@pytest.fixture(scope="module")
+def in_bytes_and_floats(table):
+    """The second frame with images of bytes, and the same images as floats."""
+    frame = table()[1][1]
+    images = np.asarray(255 * frame.images).round().astype(np.uint8)
+    return [replace(frame, images=kind) for kind in (images, np.float32(images) / 255)]
+
+
+def test_bytes_are_prepared_as_floats_are(in_bytes_and_floats):
+    one, other = (prepared(frame, CONFIG)[0] for frame in in_bytes_and_floats)
+    np.testing.assert_allclose(one.images, other.images, rtol=1e-6)
+
+
+@pytest.mark.slow
+def test_bytes_are_seen_as_floats_are(in_bytes_and_floats, begun):
     _, update, run = begun
-    images = np.asarray(255 * frames[1].images).round().astype(np.uint8)
-    as_bytes = replace(frames[1], images=images)
-    as_floats = replace(frames[1], images=np.float32(images) / 255)
     plan = run.plans[PLAN]
-    found = [update(run.params, run.state, TrackBatch(f, plan))[0] for f in (as_bytes, as_floats)]
+    found = [update(run.params, run.state, TrackBatch(f, plan))[0] for f in in_bytes_and_floats]
     np.testing.assert_allclose(found[0].pose.means, found[1].pose.means, atol=1e-5)
 
 

@@ -7,7 +7,7 @@ from gsjax.methods.fit import FitConfig
 
 LEAST_STEPS = 150
 """Steps on photographs of a size, without which smaller ones give more."""
-_STEP_S = (0.02, 6e-7, 2e-6)  # a step, and more for a pixel and for a slot, on two cores of an AMD EPYC
+_STEP_S = (0.01, 2.5e-7, 7.5e-7)  # a step, and more for a pixel and a slot, on two cores of an AMD EPYC
 _STEPS = 0.6  # of the minutes: steps, without reading, matching, compiling, scores and the report
 _LEAST_SIDE = 32  # pixels
 _SLOTS_A_STEP = 10  # as in the presets; docs/choosing.md
@@ -37,7 +37,7 @@ def affordable(config: FitConfig, size: tuple[int, int], minutes: float) -> tupl
 
 
 def last_shrink(config: FitConfig, size: tuple[int, int], seconds: float) -> int:
-    """The factor by which photographs are downscaled at the end: that of the largest for which half of the
+    """The factor by which photographs are downscaled at the end: that of the largest for which a fifth of the
     time should be enough for 150 steps.
 
     Args:
@@ -48,7 +48,7 @@ def last_shrink(config: FitConfig, size: tuple[int, int], seconds: float) -> int
     width, height = size
     factor = 1
     while (
-        step_seconds(width * height / factor**2, config.start.count) * LEAST_STEPS > seconds / 2
+        step_seconds(width * height / factor**2, config.start.count) * LEAST_STEPS > seconds / 5
         and min(size) >= 8 * factor * _LEAST_SIDE
     ):
         factor *= 2

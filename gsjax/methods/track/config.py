@@ -78,9 +78,9 @@ class AlignConfig:
     """Rotation of a group at which its keyframe, whose weight has then faded to 0, is replaced, radians."""
     max_thickness: float = 0.06
     """Measured depth that differs from the model's by more than this belongs to another object, metres."""
-    shading: float = 0.6
-    """Weight of brightness relative to chroma, 0 to 1. Its print shows how a round thing spins; but shading
-    changes as objects turn."""
+    shading: float = 0.3
+    """Weight of brightness relative to chroma, 0 to 1; low, because shading changes as objects turn. With 0.6
+    a printed can that spins is followed more closely, but not found again where it is darker."""
     widen: float = 2.0
     """Factor on both scales while the start may be far off."""
     reach: float = 0.045
