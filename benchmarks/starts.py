@@ -8,6 +8,7 @@ Every command runs in a process of its own: first with an empty cache of compile
 
 import json
 import os
+import runpy
 import subprocess
 import sys
 import tempfile
@@ -61,8 +62,6 @@ def watch(record: Path, begun: float, arguments: Sequence[str]) -> int:
     """
     import jax
 
-    from gsjax.cli import main
-
     spans: list[tuple[str, str, float, float]] = []
     updates: list[float] = []
     hits = [0]
@@ -82,7 +81,12 @@ def watch(record: Path, begun: float, arguments: Sequence[str]) -> int:
     ready = time() - begun
     if arguments[0] == "view":
         _end_with_its_page(lambda: updates.append(time() - begun))
-    code = main(arguments)
+    sys.argv = ["gsjax", *arguments]
+    try:
+        runpy.run_module("gsjax.cli", run_name="__main__")
+        code = 0
+    except SystemExit as left:
+        code = left.code if isinstance(left.code, int) else 1
     if arguments[0] == "view" and code == 130:  # Ctrl-C is how it ends
         code = 0
     found = {"imported_s": ready, "first_s": updates[0] if updates else None, "total_s": time() - begun}

@@ -10,7 +10,7 @@ LEAST_STEPS = 150
 _STEP_S = (0.01, 2.5e-7, 7.5e-7)  # a step, and more for a pixel and a slot, on two cores of an AMD EPYC
 _STEPS = 0.6  # of the minutes: steps, without reading, matching, compiling, scores and the report
 _LEAST_SIDE = 32  # pixels
-_SLOTS_A_STEP = 10  # as in the presets; docs/choosing.md
+_SLOTS_A_STEP = 20  # docs/choosing.md
 _LEAST_SLOTS, _MOST_SLOTS = 5_000, 1_000_000
 
 
@@ -18,7 +18,8 @@ def affordable(config: FitConfig, size: tuple[int, int], minutes: float) -> tupl
     """The settings with as many slots for Gaussians, and spherical harmonics of such a degree, as pay in
     these minutes; and how many steps there should be.
 
-    Ten slots a step are what the presets have. A degree pays if it is unlocked in the first half.
+    Twenty slots a step are near the best of two scenes (docs/choosing.md). A degree pays if it is unlocked in
+    the first half.
 
     Args:
         config: of a fit, with its default settings.
