@@ -3,6 +3,7 @@
 Commands are imported when they are called, so that `gsjax --help` is fast.
 """
 
+import gc
 import os
 import sys
 from collections.abc import Sequence
@@ -50,6 +51,9 @@ def entry() -> None:
     """The program. After Ctrl-C or an error it exits without waiting for XLA, which may still be compiling in
     a thread and would crash as Python shuts down. If its output is closed (`gsjax track --help | head`), it
     ends quietly, with the code of a program that SIGPIPE ended."""
+    # JAX's traces are many objects that live on: looking through them again and again, and once more at the
+    # exit, takes a second of a short run.
+    gc.set_threshold(100_000, 50, 50)
     try:
         try:
             code = main()
@@ -62,6 +66,7 @@ def entry() -> None:
         sys.stdout.flush()
         sys.stderr.flush()
         os._exit(code)
+    gc.freeze()
     sys.exit(code)
 
 

@@ -5,6 +5,7 @@ from collections.abc import Callable, Mapping
 from collections.abc import Sequence as Indices
 from dataclasses import dataclass, field, replace
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int, UInt8
@@ -187,15 +188,15 @@ class Sequence:
         """
         cameras = range(self.num_cameras)
         dtype = jnp.result_type(float)
-        images = np.stack([self.image(t, c) for c in cameras])
+        images = np.stack([self.image(t, c) for c in cameras]).astype(dtype) / dtype.type(255)
         depths = None
         if self.has_depth:
             invalid = np.zeros((self.height, self.width), np.float32)
             loaded = [self.depth(t, c) for c in cameras]
-            depths = jnp.asarray(np.stack([invalid if d is None else d for d in loaded]), dtype)
-        viewmats, Ks = jnp.asarray(self.viewmats[t], dtype), jnp.asarray(self.Ks[t], dtype)
-        camera = Camera(viewmats, Ks, self.width, self.height, self.near)
-        return Frame(jnp.asarray(images, dtype) / 255, depths, camera)
+            depths = np.stack([invalid if d is None else d for d in loaded]).astype(dtype)
+        poses = np.asarray(self.viewmats[t], dtype), np.asarray(self.Ks[t], dtype)
+        images, depths, poses = jax.device_put((images, depths, poses))
+        return Frame(images, depths, Camera(*poses, self.width, self.height, self.near))
 
     def flow(self, t: int, c: int) -> Float[np.ndarray, "height width 2"] | None:
         """Displacement (x, y) of each pixel from frame `t` to t + 1, pixels; NaN = unknown, None = no flow.

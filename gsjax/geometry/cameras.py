@@ -80,8 +80,8 @@ def intrinsics(
 def on_device(camera: Camera) -> Camera:
     """The camera in JAX arrays of the default float type."""
     dtype = jnp.result_type(float)
-    viewmat, K = (jnp.asarray(a, dtype) for a in (camera.viewmat, camera.K))
-    return Camera(viewmat, K, camera.width, camera.height, camera.near)
+    viewmat, K = (np.asarray(a, dtype) for a in (camera.viewmat, camera.K))
+    return Camera(*jax.device_put((viewmat, K)), camera.width, camera.height, camera.near)
 
 
 def resized(camera: Camera, scale: float, width: int, height: int) -> Camera:

@@ -72,6 +72,13 @@ def gradient_step(
     return Step(optimizer.init, update)
 
 
+@jax.jit
+def copied(tree: PyTree) -> PyTree:
+    """The same arrays in buffers of their own, for what must survive a step that donates those of its
+    inputs."""
+    return jax.tree.map(jnp.copy, tree)
+
+
 def all_finite(tree: PyTree) -> Bool[Array, ""]:
     """Whether every number of a pytree is finite."""
     return jnp.stack([jnp.isfinite(leaf).all() for leaf in jax.tree.leaves(tree)]).all()

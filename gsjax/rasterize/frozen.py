@@ -66,13 +66,14 @@ def freeze_views(
     """
     scene = (means, quats, scales, opacities)
     plan = _plan(*scene, viewmats, Ks, width, height, headroom=1.0, **options)
-    frozen = [_freeze(*scene, viewmat, K, plan) for viewmat, K in zip(viewmats, Ks, strict=True)]
+    views = zip(np.asarray(viewmats), np.asarray(Ks), strict=True)
+    frozen = [_freeze(*scene, *view, plan) for view in views]
     if any(bool(overflow) for _, overflow in frozen):
         raise RuntimeError("the plan made for these views is too small for them; please report this as a bug")
     shown = [_shown(jax.device_get(view)) for view, _ in frozen]
     seen, pairs = (max(1, *(len(getattr(view, name)) for view in shown)) for name in ("rows", "ids"))
     views = [padded_view(view, seen, pairs) for view in shown]
-    return jax.tree.map(lambda *leaves: jnp.asarray(np.stack(leaves)), *views), plan
+    return jax.device_put(jax.tree.map(lambda *leaves: np.stack(leaves), *views)), plan
 
 
 def padded_view(view: FrozenView, seen: int, pairs: int) -> FrozenView:
@@ -118,6 +119,7 @@ def strip_of(view: FrozenView, plan: Plan, first: Int[Array, ""] | int, rows: in
     return part, dataclasses.replace(plan, height=rows * plan.tile_size)
 
 
+@partial(jax.jit, static_argnames="plan", inline=True)
 def paint(
     view: FrozenView, values: Float[Array, "n d"], plan: Plan
 ) -> tuple[Float[Array, "height width d"], Float[Array, "height width"]]:
@@ -129,6 +131,7 @@ def paint(
     return paint_shown(view, values[view.rows], plan)
 
 
+@partial(jax.jit, static_argnames="plan", inline=True)
 def paint_shown(
     view: FrozenView, values: Float[Array, "seen d"], plan: Plan
 ) -> tuple[Float[Array, "height width d"], Float[Array, "height width"]]:

@@ -185,7 +185,7 @@ def plan(
     """
     bare = resolve(None, width, height, _options(locals()))
     bases = () if bare.sh_degree is None else (num_sh_bases(bare.sh_degree),)
-    colors = jnp.zeros((*np.shape(means)[:-1], *bases, 1))
+    colors = np.zeros((*np.shape(means)[:-1], *bases, 1), jnp.result_type(float))
     gaussians = (means, quats, scales, opacities, colors)
     views, _ = check_inputs(bare, *gaussians, viewmats, Ks, None, None, roi, None, None)
     return planned_for(views, bare, headroom)

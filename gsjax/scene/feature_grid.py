@@ -133,12 +133,14 @@ class FeatureGrid(eqx.Module):
         """
         return self.at(locate(self, positions))
 
+    @partial(jax.jit, inline=True)
     def at(self, located: Located) -> Float[Array, "N outputs"]:
         """Outputs at positions located by `locate`, which has to run only once for fixed positions."""
         values = jax.vmap(self.layers[-1])(self.hidden_at(located))
         # Only here: inside the network, a NaN would reach the gradient even if that row is not used.
         return jnp.where(located.valid[:, None], values, jnp.nan)
 
+    @partial(jax.jit, inline=True)
     def hidden_at(self, located: Located) -> Float[Array, "N hidden"]:
         """Inputs of the last layer, which is linear: these can be summed with weights instead of outputs."""
         values = self.encode(located)
@@ -175,15 +177,25 @@ def init_feature_grid(
             f"bounds: expected [2, 3], least and largest coordinates, found {box.tolist()}; the largest must "
             "be larger, also in float32: give a flat scene a margin"
         )
+    low, high = box.tolist()
+    table, layers = _random(key, config, outputs)
+    return FeatureGrid(table, layers, config, (tuple(low), tuple(high)))
+
+
+@partial(jax.jit, static_argnums=(1, 2), inline=True)
+def _random(
+    key: PRNGKeyArray, config: FeatureGridConfig, outputs: int
+) -> tuple[Float[Array, "entries F"], tuple[eqx.nn.Linear, ...]]:
+    """Random features and layers."""
     key, *keys = jax.random.split(key, config.depth + 2)
     shape = (sum(config.entries), config.features)
     table = jax.random.uniform(key, shape, minval=-_FIRST_FEATURES, maxval=_FIRST_FEATURES)
     widths = (config.levels * config.features, *[config.hidden] * config.depth, outputs)
     layers = [eqx.nn.Linear(*pair, key=one) for *pair, one in zip(widths[:-1], widths[1:], keys, strict=True)]
-    low, high = box.tolist()
-    return FeatureGrid(table, tuple(layers), config, (tuple(low), tuple(high)))
+    return table, tuple(layers)
 
 
+@partial(jax.jit, inline=True)
 def locate(grid: FeatureGrid, positions: Float[Array, "N 3"]) -> Located:
     """Locate positions, in metres, in the grid; those outside the box are clamped to its surface.
 

@@ -1,5 +1,6 @@
 """What a set of cameras saw at one moment: the one observation that every loss and method takes."""
 
+from functools import partial
 from typing import TypeVar
 
 import equinox as eqx
@@ -49,7 +50,7 @@ class Frame(eqx.Module):
         return np.where(known, depths, 0)
 
 
-def of_cameras(frame: Frame, which: slice | Int[np.ndarray, "k"]) -> Frame:
+def of_cameras(frame: Frame, which: slice | Int[Array | np.ndarray, "k"]) -> Frame:
     """The frame as some of its cameras saw it."""
     images, depths, cameras, masks = jax.tree.map(
         lambda a: a[which], (frame.images, frame.depths, frame.cameras, frame.masks)
@@ -59,8 +60,17 @@ def of_cameras(frame: Frame, which: slice | Int[np.ndarray, "k"]) -> Frame:
 
 def one_camera(seen: Seen, c: int) -> Seen:
     """Camera `c` alone of a frame, or of a batch of cameras; the camera axis stays."""
-    only = slice(c, c + 1)
-    return of_cameras(seen, only) if isinstance(seen, Frame) else jax.tree.map(lambda a: a[only], seen)
+    on_host = all(isinstance(leaf, np.ndarray) for leaf in jax.tree.leaves(seen))
+    return _chosen(seen, np.array([c])) if on_host else _one_on_device(seen, c)
+
+
+@partial(jax.jit, inline=True)
+def _one_on_device(seen: Seen, c: Int[Array, ""] | int) -> Seen:
+    return _chosen(seen, jnp.reshape(c, 1))
+
+
+def _chosen(seen: Seen, which: Int[Array | np.ndarray, "k"]) -> Seen:
+    return of_cameras(seen, which) if isinstance(seen, Frame) else jax.tree.map(lambda a: a[which], seen)
 
 
 def part_of(frame: Frame, cameras: tuple[int, ...] = (), shrink: int = 1) -> Frame:

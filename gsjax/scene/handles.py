@@ -40,6 +40,7 @@ class HandlePose(eqx.Module):
     translations: Float[Array, "*t P 3"]
 
 
+@partial(jax.jit, static_argnums=0, inline=True)
 def at_rest(num: int) -> HandlePose:
     """The pose of `num` handles that have not moved."""
     return HandlePose(jnp.zeros((num, 4)).at[:, 0].set(1.0), jnp.zeros((num, 3)))
@@ -61,15 +62,28 @@ def skin(
         pose: poses of the handles.
         blend: how rotations are blended.
     """
+    moved = _skinned(gaussians.means, gaussians.quats, weights, centers, pose, blend)
+    return eqx.tree_at(lambda g: (g.means, g.quats), gaussians, moved)
+
+
+@partial(jax.jit, static_argnames="blend", inline=True)
+def _skinned(
+    means: Float[Array, "N 3"],
+    quats: Float[Array, "N 4"],
+    weights: Float[Array, "N P"],
+    centers: Float[Array, "P 3"],
+    pose: HandlePose,
+    blend: Blend,
+) -> tuple[Float[Array, "N 3"], Float[Array, "N 4"]]:
     if blend == "dual":
-        turns, means = _dual(gaussians.means, weights, centers, pose)
+        turns, means = _dual(means, weights, centers, pose)
     else:
         turns = blend_quats(weights, pose.quats) if blend == "quaternion" else _polar(weights, pose.quats)
-        means = skin_means(gaussians.means, weights, centers, pose)
-    quats = multiply_quats(turns, normalize_quats(gaussians.quats))
-    return eqx.tree_at(lambda g: (g.means, g.quats), gaussians, (means, quats))
+        means = skin_means(means, weights, centers, pose)
+    return means, multiply_quats(turns, normalize_quats(quats))
 
 
+@partial(jax.jit, inline=True)
 def rigid_motions(
     centers: Float[Array, "P 3"], pose: HandlePose
 ) -> tuple[Float[Array, "P 3 3"], Float[Array, "P 3"]]:
@@ -78,6 +92,7 @@ def rigid_motions(
     return rotations, centers + pose.translations - jnp.einsum("pij,pj->pi", rotations, centers)
 
 
+@partial(jax.jit, inline=True)
 def skin_means(
     means: Float[Array, "N 3"],
     weights: Float[Array, "N P"],

@@ -170,4 +170,5 @@ def valid_depth(depth: np.ndarray) -> np.ndarray:
 
 def on_host(function, *arrays):
     """Call a function of geometry.cameras with numpy arrays and return numpy arrays, in JAX's precision."""
-    return jax.tree.map(np.asarray, function(*(jnp.asarray(array, float) for array in arrays)))
+    dtype = jnp.result_type(float)
+    return jax.device_get(function(*jax.device_put([np.asarray(array, dtype) for array in arrays])))

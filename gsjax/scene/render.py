@@ -1,5 +1,6 @@
 """Rendering a scene in cameras: the one place where activated Gaussians are passed to the rasterizer."""
 
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -91,7 +92,13 @@ def render(
         roi=roi,
         means2d_offset=means2d_offset,
     )
-    if visibility is not None:
+    return _rendered(images, alphas, meta, visibility is not None)
+
+
+@partial(jax.jit, static_argnums=3, inline=True)
+def _rendered(images: Array, alphas: Array, meta: Meta, each_alone: bool) -> Rendered:
+    """What was rasterized; with `each_alone`, each camera as a scene of its own, whose axis goes."""
+    if each_alone:
         images, alphas, meta = jax.tree.map(lambda a: a[:, 0], (images, alphas, meta))
     return Rendered(images[..., :3], images[..., 3], alphas[..., 0], meta.features, meta)
 

@@ -173,30 +173,34 @@ def render_flow(scene: Scene, t: int, u: int, c: int, hits: Hits) -> Float[np.nd
 
 def _radiance(scene: Scene, t: int, hits: Hits, lamp: np.ndarray) -> Float[np.ndarray, "3 height width"]:
     """Linear RGB radiance from the surfaces towards the camera."""
-    flat_index, points = hits.primitive.ravel(), hits.points().reshape(3, -1)
-    normal, reflectance = np.zeros_like(points), np.zeros_like(points)
-    solids = scene.solids(t)
-    for i in np.unique(flat_index[flat_index >= 0]):
-        here = np.flatnonzero(flat_index == i)
-        primitive, pose = solids[i]
-        local = _to_local(pose, points[:, here])
-        normal[:, here] = pose[:3, :3] @ normals(primitive, local)
-        reflectance[:, here] = albedo(primitive.texture, at_rest(primitive, local))
+    solids, index = scene.solids(t), hits.primitive.ravel()
+    order = np.argsort(index, kind="stable")  # the pixels of one primitive side by side, misses first
+    ends = np.cumsum(np.bincount(index + 1, minlength=len(solids) + 1))
+    order, ends = order[ends[0] :], ends - ends[0]
+    points = hits.points().reshape(3, -1)[:, order]
+    normal, reflectance = np.empty_like(points), np.empty_like(points)
+    for (primitive, pose), begin, end in zip(solids, ends, ends[1:], strict=False):
+        if begin < end:
+            here = slice(begin, end)
+            local = _to_local(pose, points[:, here])
+            normal[:, here] = pose[:3, :3] @ normals(primitive, local)
+            reflectance[:, here] = albedo(primitive.texture, at_rest(primitive, local))
     to_lamp = lamp[:, None] - points
-    cosine = np.einsum("ij,ij->j", normal, to_lamp) / np.linalg.norm(to_lamp, axis=0)
+    cosine = _dot(normal, to_lamp) / np.sqrt(_dot(to_lamp, to_lamp))
     lit = np.flatnonzero(cosine > 0)
     direct = np.zeros_like(cosine)
     direct[lit] = cosine[lit] * ~_shadowed(solids, lamp, points[:, lit])
     sky = 0.75 + 0.25 * normal[2]
     light = np.array(scene.light.color)[:, None] * direct + np.array(scene.light.ambient)[:, None] * sky
-    return (reflectance * light).reshape(3, scene.height, scene.width)
+    radiance = np.zeros((3, len(index)))
+    radiance[:, order] = reflectance * light
+    return radiance.reshape(3, scene.height, scene.width)
 
 
 def _shadowed(solids: list[tuple[Primitive, np.ndarray]], lamp: np.ndarray, points: np.ndarray) -> np.ndarray:
     """Whether some solid stands between the lamp and each point."""
     rays = points - lamp[:, None]
-    lengths = np.linalg.norm(rays, axis=0)
-    unit = rays / lengths
+    lengths = np.sqrt(_dot(rays, rays))
     dark = np.zeros(len(lengths), bool)
     for primitive, pose in solids:
         if primitive.shape in ("plane", "sheet"):  # there is nothing below to be shadowed
@@ -205,11 +209,16 @@ def _shadowed(solids: list[tuple[Primitive, np.ndarray]], lamp: np.ndarray, poin
         center, radius = pose[:3, 3] - lamp, np.linalg.norm(primitive.half_extents)
         distance = np.linalg.norm(center)
         cosine = np.sqrt(np.maximum(1 - (radius / distance) ** 2, 0.0)) if distance > radius else -1.0
-        near = ((center / distance) @ unit >= cosine) & (lengths > distance - radius) & ~dark
-        here = np.flatnonzero(near)
+        here = np.flatnonzero((center / distance) @ rays >= cosine * lengths)
+        here = here[(lengths[here] > distance - radius) & ~dark[here]]
         entry = intersect(primitive, _to_local(pose, lamp), pose[:3, :3].T @ rays[:, here])
         dark[here] = entry < 1 - _SHADOW_MARGIN
     return dark
+
+
+def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Dot products of columns, [3,N]."""
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 def _window(

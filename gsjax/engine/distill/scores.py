@@ -155,7 +155,7 @@ def one_by_one(gaussians: Gaussians, cameras: Iterable[Camera], rasterize_mode: 
         needed = (plan.capacity, rung(len(view.rows)), rung(len(view.ids)))
         before = largest.get((plan.width, plan.height), needed)
         capacity, seen, pairs = largest[plan.width, plan.height] = tuple(map(max, needed, before))
-        view = jax.tree.map(jnp.asarray, padded_view(view, seen, pairs))
+        view = jax.device_put(padded_view(view, seen, pairs))
         yield view, replace(plan, capacity=capacity)
 
 

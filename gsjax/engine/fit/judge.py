@@ -99,7 +99,7 @@ class Judge:
         at = Camera(camera.viewmat, camera.K, *size, camera.near)
         drawn, self.plans[size] = self.draw(gaussians, at, self.plans.get(size))
         colors, depths, alphas = (
-            np.asarray(a[0, : camera.height, : camera.width])
+            np.asarray(a)[0, : camera.height, : camera.width]
             for a in (drawn.colors, drawn.depths, drawn.alphas)
         )
         image, truth = np.clip(colors, 0, 1), frame.images[0] / 255

@@ -22,7 +22,7 @@ from gsjax.methods.deform.start import can_start_from, known_depth, start_gaussi
 from gsjax.methods.deform.update import Batch, DeformingScene, Moving, deform_step
 from gsjax.methods.sampling import shuffled_index
 from gsjax.optim.method import Run
-from gsjax.optim.step import Step
+from gsjax.optim.step import Step, copied
 from gsjax.rasterize.plan import HEADROOM
 from gsjax.scene.deformation import init_deformation
 from gsjax.scene.frame import Frame
@@ -144,7 +144,7 @@ class Deform:
         problem = Problem(frames, lesson, seen, ids, codebook, first, radius, bounds, timeline)
         cameras = jax.tree.map(lambda *arrays: jnp.concatenate(arrays), *(frame.cameras for frame in seen))
         plans = {PLAN: plan_render(scene.gaussians, cameras, headroom=HEADROOM)}
-        return problem, Run(scene, self.step.init(scene), plans=plans, kept=Kept())
+        return problem, Run(scene, jax.jit(self.step.init)(scene), plans=plans, kept=Kept())
 
     @property
     def step(self) -> Step:
@@ -164,7 +164,7 @@ class Deform:
         )
         if step == config.warmup and run.params.field is None:
             scene, moving = with_field(config, problem, run.params)
-            run = run.having(params=scene, state=self.step.init(scene), kept=Kept(moving))
+            run = run.having(params=scene, state=jax.jit(self.step.init)(scene), kept=Kept(moving))
         moving, graphs = run.kept
         if step == gate and config.moving_share < 1 and moving is None:
             moving = _farthest_moved(run.params, problem.seen, config.moving_share)
@@ -272,7 +272,7 @@ def _first_scene(gaussians: Gaussians, config: DeformConfig, frames: int, is_tau
     if not gaussians.num:
         raise ValueError("gaussians: expected at least one that is valid, found none")
     twists = jnp.zeros((frames, 6)) if config.refine_poses else None
-    scene = DeformingScene(jax.tree.map(jnp.array, gaussians), None, twists)
+    scene = DeformingScene(copied(gaussians), None, twists)
     if not is_taught:
         return scene
     features = jnp.zeros((gaussians.num, config.channels))

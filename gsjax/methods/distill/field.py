@@ -10,6 +10,7 @@ so h with 128 channels (by default) is rendered instead of f with 256. The resul
 everything that is linear in F'.
 """
 
+from functools import partial
 from typing import NamedTuple
 
 import equinox as eqx
@@ -113,6 +114,7 @@ def _box(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "2 3"]:
     return np.stack([np.maximum(points.min(0), low - room), np.minimum(points.max(0), high + room)])
 
 
+@partial(jax.jit, inline=True)
 def rendered_features(
     field: FeatureField, located: Located | None, rows: Int[Array, "some"] | None = None
 ) -> RenderedFeatures:
@@ -134,6 +136,7 @@ def rendered_features(
     return RenderedFeatures(field.encoding.hidden_at(located), head)
 
 
+@partial(jax.jit, inline=True)
 def features_of(field: FeatureField, located: Located | None) -> Float[Array, "n channels"]:
     """The feature f of each Gaussian."""
     return field.encoding.at(located) if isinstance(field.encoding, FeatureGrid) else field.encoding
@@ -151,8 +154,9 @@ def active_table(
         return field, None, None
     assert located is not None
     rows, place = np.unique(np.asarray(located.indices), return_inverse=True)
-    grid = eqx.tree_at(lambda g: g.table, field.encoding, field.encoding.table[rows])
-    indices = jnp.asarray(place.reshape(located.indices.shape), jnp.int32)
+    table, indices = np.asarray(field.encoding.table)[rows], place.reshape(located.indices.shape)
+    table, indices = jax.device_put((table, indices.astype(np.int32)))
+    grid = eqx.tree_at(lambda g: g.table, field.encoding, table)
     return FeatureField(grid, field.lift), located._replace(indices=indices), rows
 
 
@@ -161,5 +165,6 @@ def full_table(field: FeatureField, rows: Int[np.ndarray, "active"] | None) -> F
     if rows is None or not isinstance(field.encoding, FeatureGrid):
         return field
     table = field.encoding.table
-    full = jnp.zeros((sum(field.encoding.config.entries), table.shape[1]), table.dtype).at[rows].set(table)
-    return eqx.tree_at(lambda f: f.encoding.table, field, full)
+    full = np.zeros((sum(field.encoding.config.entries), table.shape[1]), table.dtype)
+    full[rows] = table
+    return eqx.tree_at(lambda f: f.encoding.table, field, jax.device_put(full))

@@ -85,7 +85,7 @@ class Distill:
         ]
         about = {"num_gaussians": gaussians.num, "rasterize_mode": rasterize_mode} | dict(scene or {})
         problem = Problem(views, rows, jnp.asarray(gaussians.means), source, about)
-        return problem, Run(found, self.step.init(found))
+        return problem, Run(found, jax.jit(self.step.init)(found))
 
     @property
     def step(self) -> Step:
@@ -122,9 +122,8 @@ def view_batch(
         frozen: the scene in the view's camera, and its plan.
     """
     (view, plan), (ids, codebook) = frozen, view_codebook(teacher, v, rows)
-    codebook = None if codebook is None else jnp.asarray(codebook)
     pixels = None if teacher.maps is None else teacher.maps[v]
-    return Batch(view, located, jnp.asarray(ids), codebook, pixels, plan)
+    return Batch(view, located, *jax.device_put((ids, codebook)), pixels, plan)
 
 
 def frozen_views(
@@ -142,12 +141,12 @@ def frozen_views(
     for width, height, near in sizes:
         which = [v for v, c in enumerate(cameras) if (c.width, c.height, c.near) == (width, height, near)]
         scene = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities)
-        viewmats, Ks = (jnp.stack([getattr(cameras[v], n) for v in which]) for n in ("viewmat", "K"))
-        views, plan = freeze_views(
-            *scene, viewmats, Ks, width, height, near_plane=near, rasterize_mode=rasterize_mode
-        )
+        viewmats, Ks = (np.stack([getattr(cameras[v], n) for v in which]) for n in ("viewmat", "K"))
+        seen_from = (*jax.device_put((viewmats, Ks)), width, height)
+        views, plan = freeze_views(*scene, *seen_from, near_plane=near, rasterize_mode=rasterize_mode)
+        views = jax.device_get(views)
         for place, v in enumerate(which):
-            found[v] = (jax.tree.map(lambda a, place=place: a[place], views), plan)
+            found[v] = (jax.device_put(jax.tree.map(lambda a, place=place: a[place], views)), plan)
     return [found[v] for v in range(len(cameras))]
 
 

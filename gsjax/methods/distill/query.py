@@ -7,6 +7,8 @@ field's channels by an inverse of the convolution, is there for comparison (`bac
 `gsjax.methods.query` turns cosines into scores against negatives.
 """
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
@@ -19,6 +21,7 @@ from gsjax.scene.feature_grid import Located
 _LEAST_NORM = 1e-12
 
 
+@partial(jax.jit, inline=True)
 def gaussian_cosines(
     field: FeatureField, located: Located | None, queries: Float[Array, "q d"]
 ) -> Float[Array, "n q"]:
@@ -50,6 +53,7 @@ def pixel_cosines(
     return cosines.reshape(*alphas.shape, len(queries)), alphas
 
 
+@partial(jax.jit, static_argnames="plan", inline=True)
 def pixel_features(
     field: FeatureField,
     located: Located | None,
@@ -65,6 +69,7 @@ def pixel_features(
     return jnp.matmul(rendered, parts.lifted(field.lift).T, precision="highest"), alphas[y, x]
 
 
+@partial(jax.jit, inline=True)
 def back_projected_cosines(
     field: FeatureField,
     located: Located | None,

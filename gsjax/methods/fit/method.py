@@ -108,7 +108,7 @@ class Fit:
         problem = Problem(
             shown, shares, extent, behind[config.background], source, partial(shrink_at, config), {}
         )
-        return problem, Run(model, self.step.init(model))
+        return problem, Run(model, jax.jit(self.step.init)(model))
 
     @property
     def step(self) -> Step:
@@ -169,7 +169,7 @@ class Fit:
         larger = with_slots(with_degree(run.params, degree), slots)
         if larger is run.params:
             return run
-        return run.having(params=larger, state=carried_over(run.state, self.step.init(larger)))
+        return run.having(params=larger, state=carried_over(run.state, jax.jit(self.step.init)(larger)))
 
     def _densified(self, problem: Problem, run: Run, step: int, progress: float) -> Run:
         """The run after densification, if it is due after `step`."""
@@ -249,10 +249,10 @@ def on_device_at(frames: list[Frame], view: int, shrink: int) -> Frame:
     cameras = frame.cameras
     camera = Camera(cameras.viewmat, factors[:, None] * cameras.K, width, height, cameras.near)
     return Frame(
-        jnp.asarray(image)[None],
-        None if depth is None else jnp.asarray(depth, jnp.result_type(float))[None],
+        jax.device_put(image[None]),
+        None if depth is None else jax.device_put(depth[None].astype(jnp.result_type(float))),
         on_device(camera),
-        None if mask is None else jnp.asarray(mask)[None],
+        None if mask is None else jax.device_put(mask[None]),
     )
 
 

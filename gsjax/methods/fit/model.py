@@ -41,12 +41,10 @@ def model_of(gaussians: Gaussians, config: FitConfig, views: int) -> Model:
         views: number of photographs.
     """
     dtype = gaussians.means.dtype
-    return Model(
-        gaussians,
-        jnp.zeros((1, gaussians.num, 2), dtype),
-        jnp.zeros((views, 3, 4), dtype) if config.exposure else None,
-        jnp.zeros((views, 6), dtype) if config.refine_poses else None,
-    )
+    nudges = np.zeros((1, gaussians.num, 2), dtype)
+    exposures = np.zeros((views, 3, 4), dtype) if config.exposure else None
+    twists = np.zeros((views, 6), dtype) if config.refine_poses else None
+    return Model(gaussians, *jax.device_put((nudges, exposures, twists)))
 
 
 def exposed(
@@ -109,7 +107,7 @@ def in_slots(gaussians: Gaussians, count: int) -> Gaussians:
     padded = jax.tree.map(lambda leaf: np.asarray(leaf)[rows], gaussians)
     logits = np.where(np.arange(count) < gaussians.num, padded.logit_opacities, EMPTY_LOGIT)
     padded = eqx.tree_at(lambda g: g.logit_opacities, padded, logits.astype(padded.logit_opacities.dtype))
-    return jax.tree.map(jnp.asarray, padded)
+    return jax.device_put(padded)
 
 
 State = TypeVar("State")

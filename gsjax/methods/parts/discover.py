@@ -2,11 +2,11 @@
 
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int, PRNGKeyArray
 from scipy.spatial import cKDTree
+from scipy.special import softmax
 
 from gsjax.geometry.cameras import Camera
 from gsjax.methods.parts.anchor import Anchor
@@ -98,7 +98,7 @@ def begin(
     logits, lifting = lift_masks(
         gaussians, frame.cameras, plan, masks, slots, config.discover.lift_iterations
     )
-    weights = np.asarray(jax.nn.softmax(logits))
+    weights = softmax(np.asarray(logits), axis=-1)
     order, count = _movable_first(np.asarray(gaussians.means), weights)
     weights = weights[order[:count]]
     labels = weights.argmax(-1)

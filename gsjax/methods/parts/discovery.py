@@ -16,6 +16,7 @@ from gsjax.methods.parts.trajectory import BACKGROUND
 from gsjax.methods.parts.unify import Motions, best_cut, motions_of, unified
 from gsjax.methods.parts.weights import fit_field_to_weights
 from gsjax.optim.method import Run
+from gsjax.optim.step import copied
 from gsjax.scene.handles import HandlePose, at_rest
 
 Pairs = tuple[tuple[int, int], ...]
@@ -75,13 +76,13 @@ class Discovery(NamedTuple):
 
     def pose(self, t: int) -> HandlePose:
         """The pose at frame t; at rest if it is not yet found."""
-        return HandlePose(jnp.asarray(self.quats[t]), jnp.asarray(self.translations[t]))
+        return HandlePose(*jax.device_put((self.quats[t], self.translations[t])))
 
     @property
     def motions(self) -> Motions:
         """The motions of all parts, in the order in which frames were found."""
         order = np.argsort(self.found)[-self.count - 1 :]
-        rotations = np.asarray(quats_to_matrices(jnp.asarray(self.quats[order])))
+        rotations = np.asarray(quats_to_matrices(jax.device_put(self.quats[order])))
         return motions_of(rotations, self.translations[order], np.asarray(self.canonical.centers))
 
 
@@ -102,9 +103,8 @@ def initial_run(start: Start, frames: int, config: PartsConfig) -> Run:
     quats = np.zeros((frames, slots, 4), np.float32)
     quats[..., 0] = 1
     nothing, rest = np.zeros(slots, int), at_rest(slots)
-    # Steps donate the buffers of their inputs, and `start` must survive.
-    field = jax.tree.map(jnp.copy, start.field)
-    params = StreamParams(rest, field, jnp.zeros((count, 3), start.canonical.movable.means.dtype))
+    nudges = jax.device_put(np.zeros((count, 3), start.canonical.movable.means.dtype))
+    params = StreamParams(rest, copied(start.field), nudges)
     discovery = Discovery(
         canonical=start.canonical,
         order=start.order,
@@ -118,7 +118,7 @@ def initial_run(start: Start, frames: int, config: PartsConfig) -> Run:
         weights=skinning_weights(start.field, start.canonical),
         predicted=at_rest(slots),
     )
-    return Run(params, stream_step(config.stream).init(params), kept=discovery)
+    return Run(params, jax.jit(stream_step(config.stream).init)(params), kept=discovery)
 
 
 def open_frame(run: Run, t: int) -> Run:
@@ -128,13 +128,17 @@ def open_frame(run: Run, t: int) -> Run:
     before, earlier = discovery.pose(t - direction), t - 2 * direction
     pose = before
     if 0 <= earlier < len(discovery.done) and discovery.done[earlier]:
-        first = discovery.pose(earlier)
-        quats = normalize_quats(2 * before.quats - first.quats)
-        pose = HandlePose(quats, 2 * before.translations - first.translations)
-    # Steps donate the buffers of their inputs, and `kept` must survive.
-    weights, predicted = jax.tree.map(jnp.copy, (weights_of_run(run), pose))
+        pose = _extrapolated(discovery.pose(earlier), before)
+    weights, predicted = copied((weights_of_run(run), pose))
     kept = discovery._replace(frame=t, weights=weights, predicted=predicted)
     return run.having(params=run.params._replace(pose=pose), state=run.state.for_new_frame(), kept=kept)
+
+
+@jax.jit
+def _extrapolated(first: HandlePose, second: HandlePose) -> HandlePose:
+    """The pose after two poses, at the same velocity."""
+    quats = normalize_quats(2 * second.quats - first.quats)
+    return HandlePose(quats, 2 * second.translations - first.translations)
 
 
 def close_frame(run: Run, config: PartsConfig) -> Run:

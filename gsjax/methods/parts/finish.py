@@ -6,7 +6,7 @@ from functools import lru_cache, partial
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from gsjax.geometry.rotations import quats_to_matrices
 from gsjax.methods.parts.config import PartsConfig, StreamConfig
@@ -19,9 +19,9 @@ from gsjax.methods.parts.trajectory import BACKGROUND, PartScene, Trajectory, tr
 from gsjax.methods.protocols import SequenceLike
 from gsjax.optim.compiler import host_options
 from gsjax.optim.method import Run
+from gsjax.optim.step import copied
 from gsjax.rasterize.plan import with_room
 from gsjax.scene.frame import Frame, one_camera, part_of
-from gsjax.scene.gaussians import take
 from gsjax.scene.handles import HandlePose
 from gsjax.scene.region import TILE
 from gsjax.scene.render import plan_render, render
@@ -40,11 +40,10 @@ def begin_refinement(sequence: SequenceLike, run: Run, config: PartsConfig) -> R
         config: settings.
     """
     discovery = prune_parts(sequence, run.kept, np.asarray(weights_of_run(run)), config)
-    poses = HandlePose(jnp.asarray(discovery.quats), jnp.asarray(discovery.translations))
-    # Steps donate the buffers of their inputs, and `kept` must survive.
-    scene = discovery.canonical.movable, discovery.canonical.fixed
-    params = RefineParams(*jax.tree.map(jnp.copy, scene), jax.tree.map(jnp.copy, poses))
-    return run.having(params=params, state=refine_step(config).init(params), kept=discovery)
+    poses = HandlePose(*jax.device_put((discovery.quats, discovery.translations)))
+    canonical = discovery.canonical
+    params = copied(RefineParams(canonical.movable, canonical.fixed, poses))
+    return run.having(params=params, state=jax.jit(refine_step(config).init)(params), kept=discovery)
 
 
 def prune_parts(
@@ -182,10 +181,17 @@ def scene_and_trajectory(
     before = np.asarray(canonical.centers)[kept]
     means = np.asarray(canonical.movable.means)
     after = centers_of(means, labels, weights.shape[1])[kept]
-    quats = jnp.asarray(discovery.quats[:, kept])
-    # x -> R (x - c) + c + T is the same motion about any c: T' = T + (R - I)(c' - c) .
-    turned = jnp.einsum("tpij,pj->tpi", quats_to_matrices(quats), jnp.asarray(after - before))
-    translations = jnp.asarray(discovery.translations[:, kept]) + turned - (after - before)
-    everything = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), canonical.movable, canonical.fixed)
-    scene = PartScene(take(everything, np.argsort(discovery.order)), jnp.asarray(full), jnp.asarray(after))
-    return scene, trajectory_of(jnp.asarray(times, quats.dtype), HandlePose(quats, translations))
+    poses = HandlePose(*jax.device_put((discovery.quats[:, kept], discovery.translations[:, kept])))
+    poses = _about_other_centers(poses, after - before)
+    everything = jax.tree.map(lambda a, b: np.concatenate([a, b]), canonical.movable, canonical.fixed)
+    gaussians = jax.tree.map(lambda a: a[np.argsort(discovery.order)], everything)
+    scene = PartScene(*jax.device_put((gaussians, full, after)))
+    return scene, trajectory_of(jax.device_put(np.asarray(times, poses.quats.dtype)), poses)
+
+
+@jax.jit
+def _about_other_centers(poses: HandlePose, shifts: Float[Array, "P 3"]) -> HandlePose:
+    """The same motions about centres that are shifted, metres: x -> R (x - c) + c + T about any c, with
+    T' = T + (R - I)(c' - c)."""
+    turned = jnp.einsum("tpij,pj->tpi", quats_to_matrices(poses.quats), shifts)
+    return HandlePose(poses.quats, poses.translations + turned - shifts)

@@ -27,9 +27,9 @@ def label_votes(
     """Votes of the masks' pixels for labels 0 to `count` - 1 of each Gaussian: the sum over the pixels of a
     label of the Gaussian's compositing weight, w_i = alpha_i T_i; the transpose of rendering features."""
     total = np.zeros((gaussians.num, count), np.float32)
-    zeros = jnp.zeros((gaussians.num, count), gaussians.means.dtype)
+    zeros = jax.device_put(np.zeros((gaussians.num, count), gaussians.means.dtype))
     for c, mask in enumerate(masks):
-        labels = jax.nn.one_hot(mask[None], count)
+        labels = (mask[None, ..., None] == np.arange(count)).astype(zeros.dtype)
         total += np.asarray(_votes(zeros, gaussians, one_camera(cameras, c), plan, labels))
     return total
 
@@ -62,10 +62,12 @@ def lift_masks(
         count: K, the number of labels.
         iterations: steps of Adam, with one camera each.
     """
-    total = jnp.asarray(label_votes(gaussians, cameras, plan, masks, count))
-    shares = total / jnp.maximum(total.sum(-1, keepdims=True), 1e-6)
-    logits = _SURE * shares.at[:, 0].add(jnp.where(total.sum(-1) < 1e-3, 1.0, 0.0))
-    state, losses = _OPTIMIZER.init(logits), []
+    votes = label_votes(gaussians, cameras, plan, masks, count)
+    total = votes.sum(-1, keepdims=True)
+    shares = votes / np.maximum(total, 1e-6)
+    shares[:, :1] += total < 1e-3
+    logits = jax.device_put(np.float32(_SURE) * shares)
+    state, losses = jax.jit(_OPTIMIZER.init)(logits), []
     for i in range(iterations):
         c = i % len(masks)
         one = one_camera(cameras, c)

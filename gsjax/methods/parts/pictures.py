@@ -132,7 +132,7 @@ def past_picture(
     if t not in problem.past:
         problem.past[t] = _on_host(part_of(problem.sequence.frame(t), (), HALF))
     frame = one_camera(problem.past[t], camera)
-    frame = eqx.tree_at(lambda f: f.images, frame, jnp.asarray(frame.images, jnp.float32) / 255)
+    frame = eqx.tree_at(lambda f: f.images, frame, frame.images / np.float32(255))
     pose = discovery.pose(t)
     seen = with_part_masks(frame, discovery.canonical, discovery.weights, pose, TILE // HALF, blend=blend)
     return seen, pose

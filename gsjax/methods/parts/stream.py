@@ -4,6 +4,7 @@ picture of one camera and in past pictures, whose poses are frozen.
 """
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -117,6 +118,7 @@ def skinning_weights(field: Field, canonical: Canonical) -> Float[Array, "M P"]:
     return weights_of(field, canonical.located, canonical.alive)
 
 
+@partial(jax.jit, static_argnames="blend", inline=True)
 def posed(
     canonical: Canonical,
     weights: Float[Array, "M P"],

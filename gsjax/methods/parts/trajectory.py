@@ -1,8 +1,10 @@
 """The data that a discovery produces and edits transform: Gaussians with weights, and handles over time."""
 
+from functools import partial
 from typing import NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
@@ -81,6 +83,7 @@ class Moment(NamedTuple):
     scales: Float[Array, "P"]
 
 
+@partial(jax.jit, inline=True)
 def moment(trajectory: Trajectory, t: Int[Array, ""] | int) -> Moment:
     """Moment `t`."""
     poses = HandlePose(trajectory.poses.quats[t], trajectory.poses.translations[t])
@@ -98,6 +101,17 @@ def gaussians_at(scene: PartScene, now: Moment, blend: Blend = "quaternion") -> 
         now: poses, scales and opacities of the parts.
         blend: how rotations are blended.
     """
+    changed = eqx.tree_at(
+        lambda g: (g.means, g.log_scales, g.logit_opacities), scene.gaussians, _scaled_and_faded(scene, now)
+    )
+    return skin(changed, scene.weights, scene.centers, now.pose, blend)
+
+
+@partial(jax.jit, inline=True)
+def _scaled_and_faded(
+    scene: PartScene, now: Moment
+) -> tuple[Float[Array, "N 3"], Float[Array, "N 3"], Float[Array, "N"]]:
+    """Means, logarithms of scales, and logits of opacities at a moment, before anything moves."""
     gaussians, weights = scene.gaussians, scene.weights
     # Written in terms of the change, so that the rounding of weights that sum to 1 has no effect.
     larger = now.scales - 1
@@ -106,9 +120,4 @@ def gaussians_at(scene: PartScene, now: Moment, blend: Blend = "quaternion") -> 
     hidden = weights @ (1 - now.opacities)
     logits = jnp.minimum(gaussians.logit_opacities, _OPAQUE)
     shown = jnp.log(jnp.maximum(1 - hidden, _FAINTEST)) - jnp.log1p(hidden * jnp.exp(logits))
-    changed = eqx.tree_at(
-        lambda g: (g.means, g.log_scales, g.logit_opacities),
-        gaussians,
-        (means, gaussians.log_scales + jnp.log1p(growth), logits + shown),
-    )
-    return skin(changed, weights, scene.centers, now.pose, blend)
+    return means, gaussians.log_scales + jnp.log1p(growth), logits + shown

@@ -43,12 +43,14 @@ def new_field(
     if config.weights != "grid":
         empty = jnp.zeros((len(means), parts))
         return (SimplexTable(empty) if config.weights == "simplex" else empty), None
-    low, high = means.min(0), means.max(0)
-    room = _MARGIN * jnp.maximum((high - low).max(), 1e-3)
-    grid = init_feature_grid(key, config.grid, parts, jnp.stack([low - room, high + room]))
+    on_host = np.asarray(means)
+    low, high = on_host.min(0), on_host.max(0)
+    room = _MARGIN * max((high - low).max(), 1e-3)
+    grid = init_feature_grid(key, config.grid, parts, np.stack([low - room, high + room]))
     return grid, locate(grid, means)
 
 
+@partial(jax.jit, inline=True)
 def weights_of(field: Field, located: Located | None, alive: Bool[Array, "P"]) -> Float[Array, "M P"]:
     """The weights of a field, which sum to 1 and are 0 for slots that are not alive."""
     if isinstance(field, SimplexTable):
