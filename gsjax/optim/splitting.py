@@ -72,7 +72,7 @@ def divide(
     slots: Int[Array, ""] | int,
     *,
     threshold: float,
-    large: float,
+    large: Float[Array, ""] | float,
     too_large: Float[Array, ""] | float,
 ) -> tuple[Gaussians, Bool[Array, "n"]]:
     """Clone, split and prune. If vacant slots are too few, the Gaussians with the strongest pull go first.

@@ -73,19 +73,22 @@ def psnr(gaussians, view: Frame) -> float:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("source", "steps"), [("depth", 60), ("random", 400)])
-def test_a_view_that_was_held_out_is_seen_better_and_better(views, source, steps):
-    config = replace(QUICK, steps=steps, start=replace(QUICK.start, source=source))
-    ticks = fitted_to(views[1:], config)
-    assert ticks.problem.start == source
-    before, sizes = psnr(ticks.run.params.gaussians, views[0]), []
-    for now in ticks:
-        sizes.append(max(now.run.plans, key=list(now.run.plans).index))
-        assert not bool(now.info["skipped"])
-    assert now.step == config.steps
-    assert [name.split(":")[0] for name in dict.fromkeys(sizes)] == ["4", "2", "1"]
-    assert now.result.sh_degree == 1
-    assert psnr(now.result, views[0]) > before + 1.5
+@pytest.mark.parametrize(("source", "steps", "seeds"), [("depth", 60, [1]), ("random", 400, range(1, 6))])
+def test_a_view_that_was_held_out_is_seen_better_and_better(views, source, steps, seeds):
+    gains = []
+    for seed in seeds:  # a hundred Gaussians at random places may come to rest in others, so many are tried
+        config = replace(QUICK, steps=steps, seed=seed, start=replace(QUICK.start, source=source))
+        ticks = fitted_to(views[1:], config)
+        assert ticks.problem.start == source
+        before, sizes = psnr(ticks.run.params.gaussians, views[0]), []
+        for now in ticks:
+            sizes.append(max(now.run.plans, key=list(now.run.plans).index))
+            assert not bool(now.info["skipped"])
+        assert now.step == config.steps
+        assert [name.split(":")[0] for name in dict.fromkeys(sizes)] == ["4", "2", "1"]
+        assert now.result.sh_degree == 1
+        gains.append(psnr(now.result, views[0]) - before)
+    assert np.median(gains) > 1.5
 
 
 SPLITTING = replace(

@@ -193,7 +193,7 @@ def split(
     state: Any,
     key: PRNGKeyArray,
     config: FitConfig,
-    radius: float,
+    radius: Float[Array, ""] | float,
     reset: Bool[Array, ""] | bool,
     pruning: Bool[Array, ""] | bool,
     all_seen: Bool[Array, ""] | bool,
