@@ -6,11 +6,10 @@ Each is compared in colour and depth with the pixel it projects to:
     r_i = ( (I(pi(D x_i)) - c_i) / s_color,  (Z(pi(D x_i)) - z(D x_i)) / s_depth )
 
 with I and c as tones (see `points`), which depend little on shading, and weighted by 1 / (1 + r^2)^2
-(Geman-McClure), which ignores points that something else hides. Where a group agrees best is found with more
-weight on brightness than how well it agrees is judged with (`AlignConfig.brightness`). An iteration costs a
-fraction of a rendered one, and depth converges from further away than colour, so groups get, even after large
-turns, to where refinement by rendering converges. All functions here are for one group and one start;
-`jax.vmap` makes it many.
+(Geman-McClure), which ignores points that something else hides. An iteration costs a fraction of a rendered
+one, and depth converges from further away than colour, so groups get, even after large turns, to where
+refinement by rendering converges. All functions here are for one group and one start; `jax.vmap` makes it
+many.
 """
 
 from typing import NamedTuple
@@ -76,22 +75,10 @@ class Residuals(NamedTuple):
 
 
 def _residuals(
-    points: Points,
-    images: ToneImages,
-    config: AlignConfig,
-    widen: Float[ArrayLike, ""] = 1.0,
-    brightness: float = 1.0,
+    points: Points, images: ToneImages, config: AlignConfig, widen: Float[ArrayLike, ""] = 1.0
 ) -> Residuals:
-    """The residuals of one group's points, with the mean of the colour channels times `brightness`."""
+    """The residuals of one group's points."""
     height, width, channels = images.pixels.shape[1:]
-    is_color = (np.arange(channels) < 3)[:, None]
-
-    def brightened(differences):
-        if brightness == 1:
-            return differences
-        mean = sum_of_three(differences[..., :3, :], axis=-2) / 3
-        return differences + jnp.where(is_color, (brightness - 1) * mean[..., None, :], 0.0)
-
     scales = widen * jnp.array([config.color_scale] * 3 + [config.depth_scale] * (channels - 3))[:, None]
 
     def one(means, tones, viewmat, K, image):
@@ -116,7 +103,7 @@ def _residuals(
         if channels == 4:
             gradients = gradients.at[2, 3].add(-1.0)
         gradients = jnp.swapaxes(rotated(viewmat[:3, :3].T, jnp.swapaxes(gradients / scales, 0, 1)), 0, 1)
-        return Residuals(brightened((found - wanted) / scales), counts, brightened(gradients))
+        return Residuals((found - wanted) / scales, counts, gradients)
 
     return jax.vmap(one)(points.means, points.tones, images.cameras.viewmat, images.cameras.K, images.pixels)
 
@@ -152,7 +139,7 @@ def _normal_equations(
 ) -> _Fit:
     """Cost, J^T W J and J^T W r after `twist`, for a small twist about the moved centre that follows it."""
     moved = carry(points, twist, center)
-    residuals = _residuals(moved, images, config, widen, config.brightness)
+    residuals = _residuals(moved, images, config, widen)
     squared = _squared(residuals)
     kinds = list(zip(_CHANNELS[: len(squared)], squared, jnp.moveaxis(residuals.counts, 1, 0), strict=True))
     # Where there is nothing to compare with, a point costs half as much as one that disagrees entirely.

@@ -80,10 +80,7 @@ class AlignConfig:
     """Measured depth that differs from the model's by more than this belongs to another object, metres."""
     shading: float = 0.3
     """Weight of brightness relative to chroma, 0 to 1; low, because shading changes as objects turn. With 0.6
-    an object is not found again where it is darker."""
-    brightness: float = 2.0
-    """Factor on that weight in alignment alone, by which a printed can is seen to spin; how well an object
-    agrees with the images is judged without it."""
+    a printed can that spins is followed more closely, but not found again where it is darker."""
     widen: float = 2.0
     """Factor on both scales while the start may be far off."""
     reach: float = 0.045
@@ -102,9 +99,9 @@ class AlignConfig:
 
     def __post_init__(self):
         scales = ("color_scale", "depth_scale", "max_thickness", "widen", "spacing", "max_step")
-        shares = ("iterations", "center_weight", "reach", "keyframe_turn", "max_turn")
+        shares = ("iterations", "center_weight", "reach", "keyframe_turn", "shading", "max_turn")
         expect(self, "track.align.", **dict.fromkeys(scales, ABOVE_ZERO))
-        expect(self, "track.align.", **dict.fromkeys((*shares, "shading", "brightness"), (0, np.inf)))
+        expect(self, "track.align.", **dict.fromkeys(shares, (0, np.inf)))
         expect(self, "track.align.", centers=(1, np.inf), pixels=(1, np.inf))
         if self.everywhere is not None:
             expect(self, "track.align.", everywhere=(0, np.inf))
