@@ -66,8 +66,8 @@ def freeze_views(
     """
     scene = (means, quats, scales, opacities)
     plan = _plan(*scene, viewmats, Ks, width, height, headroom=1.0, **options)
-    views = zip(np.asarray(viewmats), np.asarray(Ks), strict=True)
-    frozen = [_freeze(*scene, *view, plan) for view in views]
+    cameras = zip(np.asarray(viewmats), np.asarray(Ks), strict=True)
+    frozen = [_freeze(*scene, *camera, plan) for camera in cameras]
     if any(bool(overflow) for _, overflow in frozen):
         raise RuntimeError("the plan made for these views is too small for them; please report this as a bug")
     shown = [_shown(jax.device_get(view)) for view, _ in frozen]

@@ -61,7 +61,7 @@ def of_cameras(frame: Frame, which: slice | Int[Array | np.ndarray, "k"]) -> Fra
 def one_camera(seen: Seen, c: int) -> Seen:
     """Camera `c` alone of a frame, or of a batch of cameras; the camera axis stays."""
     on_host = all(isinstance(leaf, np.ndarray) for leaf in jax.tree.leaves(seen))
-    return _chosen(seen, np.array([c])) if on_host else _one_on_device(seen, c)
+    return _chosen(seen, slice(c, c + 1)) if on_host else _one_on_device(seen, c)
 
 
 @partial(jax.jit, inline=True)
@@ -69,7 +69,7 @@ def _one_on_device(seen: Seen, c: Int[Array, ""] | int) -> Seen:
     return _chosen(seen, jnp.reshape(c, 1))
 
 
-def _chosen(seen: Seen, which: Int[Array | np.ndarray, "k"]) -> Seen:
+def _chosen(seen: Seen, which: slice | Int[Array | np.ndarray, "k"]) -> Seen:
     return of_cameras(seen, which) if isinstance(seen, Frame) else jax.tree.map(lambda a: a[which], seen)
 
 

@@ -266,8 +266,7 @@ def _graphs(
 
 
 def _first_scene(gaussians: Gaussians, config: DeformConfig, frames: int, is_taught: bool) -> DeformingScene:
-    """The scene of copies of the valid Gaussians, as steps donate their buffers, with zero features and
-    twists."""
+    """The scene of copies of the valid Gaussians, with zero features and twists."""
     gaussians, _ = cull_invalid(gaussians)
     if not gaussians.num:
         raise ValueError("gaussians: expected at least one that is valid, found none")
