@@ -10,7 +10,7 @@ import jax.numpy as jnp
 
 from benchmarks.floors import TILE, Floors, between, is_calm, measure_floors, rectangle_pairs
 from benchmarks.metrics import Metric
-from benchmarks.programs import JVP, make_pool, make_programs
+from benchmarks.programs import JVP, make_pool, make_programs, make_stages
 from benchmarks.timing import Compiled, compile_program, median_and_p95, sample
 from benchmarks.workloads import Scene, Workload
 from gsjax.optim.compiler import host_options
@@ -100,6 +100,9 @@ def compile_all(workload: Workload, scene: Scene, inputs: dict, say: Callable) -
         if workload.variants and name != JVP:
             compiled[name + PLAIN] = compile_program(program, inputs, reads)
             compiled[name + UNREAD] = compile_program(program, inputs, None, options=host_options())
+    if workload.variants:
+        for name, program in make_stages(scene, plans["reverse"]).items():
+            compiled[name] = compile_program(program, inputs, reads, options=host_options())
     return compiled
 
 

@@ -164,7 +164,8 @@ the median, *p95* the 95th percentile.
 - **forward**: colours, alphas and features. **forward+backward**: the gradient of sum(colors^2) + sum(alphas)
   (+ sum(features^2)) with respect to means, quats, scales, opacities, colors (and features). **jvp**: the
   images, and their derivative along one of the six tangents of the camera's pose, in turn. Channels beyond 3
-  are features in addition to the colours.
+  are features in addition to the colours. **projection**, **projection+binning**: the first stages of forward
+  by themselves; compositing is the rest.
 - **plain jit**: compiled by a plain `jax.jit`, without `host_options()`. **no reads**: without the `reads` of
   the previous call. The process keeps freed memory (`keep_freed_memory()`), as every command does.
 - **/ exp**: multiple of the time of exp alone over all pixels of the rectangle pairs. Rectangle pairs are the

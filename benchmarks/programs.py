@@ -1,4 +1,4 @@
-"""The timed programs: forward, forward+backward, and the JVP of a pose, on changing inputs."""
+"""The timed programs: forward, its stages, forward+backward, and the JVP of a pose, on changing inputs."""
 
 from collections.abc import Callable
 from typing import Any
@@ -9,13 +9,16 @@ import numpy as np
 
 from benchmarks.timing import perturbed_means, perturbed_viewmat, pose_tangent
 from benchmarks.workloads import Scene
+from gsjax.rasterize.binning import bin_gaussians
 from gsjax.rasterize.plan import Plan
+from gsjax.rasterize.projection import project_gaussians
 from gsjax.rasterize.rasterization import rasterization
 
 PERTURBATION = 1e-4
 POOL = 6  # inputs, one for each tangent of a pose
 TRAINED = ("means", "quats", "scales", "opacities", "colors", "features")
 FORWARD, BACKWARD, JVP = "forward", "forward+backward", "jvp"
+PROJECTING, BINNING = "projection", "projection+binning"
 
 
 def make_pool(scene: Scene, size: int = POOL, relative: float = PERTURBATION) -> list[dict[str, Any]]:
@@ -77,3 +80,22 @@ def make_programs(scene: Scene, plans: dict[str, Plan]) -> dict[str, Callable]:
         return (images, tangents), info
 
     return {FORWARD: draw, BACKWARD: backward, JVP: push}
+
+
+def make_stages(scene: Scene, plan: Plan) -> dict[str, Callable]:
+    """What a forward call begins with, by itself: programs like those of `make_programs`."""
+
+    def project(inputs):
+        usable = jnp.ones(len(scene.means), bool)
+        arrays = [inputs[name] for name in TRAINED[:4]]
+        return project_gaussians(*arrays, usable, inputs["viewmats"][0], scene.K, plan)
+
+    def projected(inputs, reads):
+        found = project(inputs)
+        return found, (reads, jnp.zeros(1, int), jnp.zeros(1, bool))
+
+    def binned(inputs, reads):
+        found = bin_gaussians(project(inputs), None, plan)
+        return found, (reads, found.pairs, found.overflow)
+
+    return {PROJECTING: projected, BINNING: binned}

@@ -43,7 +43,7 @@ class Workload:
         channels: composited channels: 3 for colours only, else the number of features next to colours.
         repeats: largest number of timed calls of each program; None leaves it to the run.
         sweeps: growth plots to which it belongs.
-        variants: whether to measure it also under plain `jax.jit`, and without `reads`.
+        variants: whether to measure it also stage by stage, under plain `jax.jit`, and without `reads`.
     """
 
     name: str
@@ -135,7 +135,7 @@ def _sweep(counts, sizes, channels, num: int, size: tuple[int, int], variants: b
     meeting = ball_workload(num, size, 3, ("gaussians", "pixels", "channels"), variants)
     return [
         meeting,
-        *(ball_workload(n, size, 3, ("gaussians",)) for n in counts if n != num),
+        *(ball_workload(n, size, 3, ("gaussians",), variants) for n in counts if n != num),
         *(ball_workload(num, s, 3, ("pixels",)) for s in sizes if s != size),
         *(ball_workload(num, size, c, ("channels",)) for c in channels if c != 3),
     ]
