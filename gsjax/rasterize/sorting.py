@@ -46,20 +46,12 @@ def _lists_into(items: np.ndarray, firsts: np.ndarray, counts: np.ndarray, out, 
     # A sparse matrix of entries and lists: in compressed rows it is what is given, in compressed columns what
     # is wanted, and scipy turns one into the other by counting.
     for item, first, count, filled, edge in _rows(items, firsts, counts, out, edges):
-        last = len(count) - np.argmax(count[::-1] > 0) if count.any() else 0
-        used = np.flatnonzero(count[:last])
-        item, first, count = item[used], first[used], count[used]
-        ends = np.cumsum(count)
-        starts, total = ends - count, int(ends[-1]) if len(ends) else 0
-        columns, data = np.ones(total, np.int32), filled[:total]
-        filled[:] = 0
-        columns[starts] = np.diff(first, prepend=0) - np.append(1, count)[:-1] + 1
-        data[starts] = np.diff(item, prepend=0)
-        np.cumsum(columns, out=columns)
-        np.cumsum(data, out=data)
-        pointers = np.append(0, ends).astype(np.int32)
-        by_list = csr_array((data, columns, pointers), shape=(len(used), len(edge) - 1)).tocsc()
-        filled[:total] = by_list.data
+        ends = np.cumsum(count, dtype=np.int32)
+        pointers = np.append(np.int32(0), ends)
+        columns, data = np.repeat(first - pointers[:-1], count), np.repeat(item, count)
+        columns += np.arange(len(columns), dtype=np.int32)
+        by_list = csr_array((data, columns, pointers), shape=(len(item), len(edge) - 1)).tocsc()
+        filled[: by_list.nnz], filled[by_list.nnz :] = by_list.data, 0
         edge[:] = by_list.indptr
 
 
