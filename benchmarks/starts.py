@@ -108,6 +108,7 @@ def _end_with_its_page(served: Callable[[], None]) -> None:
         raise KeyboardInterrupt
 
     Viewer.wait = wait
+    os._exit = sys.exit  # as the command line leaves after Ctrl-C; the record is written after it
 
 
 def _union(spans: list[tuple[float, float]]) -> float:

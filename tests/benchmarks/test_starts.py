@@ -2,10 +2,13 @@
 
 import json
 
+import jax.numpy as jnp
 import pytest
 
 from benchmarks import starts
 from gsjax.cli import main
+from gsjax.io.ply import write_ply
+from gsjax.scene.gaussians import Gaussians
 
 
 def record(seconds):
@@ -41,3 +44,12 @@ def test_every_start_is_written_and_a_field_gets_its_scene(monkeypatch, tmp_path
 def test_options_of_the_suite_are_not_those_of_starts(options, says, tmp_path, capfd):
     assert main(["bench", "--starts", *options, "--out", str(tmp_path)]) == 2
     assert says in " ".join(capfd.readouterr().err.split())
+
+
+def test_a_viewer_ends_with_its_page_and_is_recorded(monkeypatch, tmp_path):
+    one = (jnp.zeros((1, 3)), jnp.eye(1, 4), jnp.zeros((1, 3)), jnp.zeros(1), jnp.zeros((1, 1, 3)))
+    write_ply(tmp_path / "scene.ply", Gaussians(*one))
+    monkeypatch.setitem(starts.COMMANDS, "view", ("view", str(tmp_path / "scene.ply"), "--port", "0"))
+    found = starts.measure("view", tmp_path, tmp_path / "cache", "cold")
+    assert 0 < found["first_s"] < found["process_s"]
+    assert found["exit_code"] == 0
