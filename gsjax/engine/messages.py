@@ -37,13 +37,6 @@ def describe(error: BaseException) -> str:
     return " ".join(str(error).split()) or type(error).__name__
 
 
-def say_error(text: str, word: str = "error") -> None:
-    """Print one paragraph on stderr, wrapped only in a terminal, so that programs can search it."""
-    console = Console(stderr=True, highlight=False)
-    line = Text.assemble((f"{word}: ", "bold red"), text.removeprefix(f"{word} "))
-    console.print(line, soft_wrap=not console.is_terminal)
-
-
 def counted(count: int, noun: str) -> str:
     """A number with its noun: "1 part", "2 parts"."""
     return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
@@ -51,7 +44,9 @@ def counted(count: int, noun: str) -> str:
 
 def reason(stopped: BaseException) -> str:
     """The reason why a run was stopped."""
-    return "Ctrl-C" if isinstance(stopped, KeyboardInterrupt) else describe(stopped)
+    if isinstance(stopped, KeyboardInterrupt):  # with the name of its signal, or of Python's own
+        return "Ctrl-C" if str(stopped) in ("", "SIGINT") else str(stopped)
+    return describe(stopped)
 
 
 class Notes:
