@@ -14,7 +14,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
-from platformdirs import user_cache_dir
+
+from gsjax.io.cache import user_cache
 
 
 @cache
@@ -142,13 +143,15 @@ def keep_programs(folder: str | Path | None = None) -> Path | None:
     Returns:
         The folder of the cache; None, with nothing changed, if JAX is already configured
         (`JAX_COMPILATION_CACHE_DIR`, or `JAX_ENABLE_COMPILATION_CACHE=0` for no cache) or the folder is not
-        writable.
+        writable, or the user has no home.
     """
     if jax.config.jax_compilation_cache_dir is not None or not jax.config.jax_enable_compilation_cache:
         return None
+    root = user_cache() if folder is None else Path(folder)
+    if root is None:
+        return None
     kind = hashlib.sha256(_processor().encode()).hexdigest()[:8]
     try:
-        root = Path(folder) if folder is not None else Path(user_cache_dir("gsjax", appauthor=False))
         place = root / f"programs-jax-{jax.__version__}-{kind}"
         (place / TRACES).mkdir(parents=True, exist_ok=True)
         with TemporaryFile(dir=place):
@@ -156,7 +159,7 @@ def keep_programs(folder: str | Path | None = None) -> Path | None:
         for program in place.glob("*-cache"):  # JAX writes the access time afterwards, and needs both files
             if not program.with_name(program.name.removesuffix("cache") + "atime").exists():
                 program.unlink(missing_ok=True)
-    except (OSError, RuntimeError):  # RuntimeError: the user has no home directory
+    except OSError:
         return None
     jax.config.update("jax_compilation_cache_dir", str(place))
     jax.config.update("jax_compilation_cache_max_size", _MOST_BYTES)

@@ -55,9 +55,10 @@ def test_what_is_made_from_a_run_keeps_out_its_like_and_who_would_replace_the_ru
             pass
         other.communicate("")
     written(tmp_path / "run", shared=True)
-    with replaced_folder(folder, ("a",)) as new, pytest.raises(BlockingIOError, match="found process"):
+    with replaced_folder(folder, ("a",)) as new:
         (new / "a").touch()
-        RunFolder.locked(tmp_path / "run", overwrite=True)
+        with pytest.raises(BlockingIOError, match="found process"):
+            RunFolder.locked(tmp_path / "run", overwrite=True)
     assert (folder / "a").exists()
 
 
