@@ -83,7 +83,7 @@ def test_plots_need_no_backend_of_matplotlib(backend, tmp_path):
     program = (
         "import os, sys\nfrom gsjax.viz import plots\nimport matplotlib\n"
         "plots.save(plots.update_time([0.1, 0.2]), sys.argv[1])\n"
-        "print(os.environ['MPLBACKEND'], matplotlib.rcParams._get('backend'))"
+        "print(os.environ['MPLBACKEND'])\nprint(matplotlib.rcParams._get('backend'))"
     )
     done = subprocess.run(
         [sys.executable, "-c", program, str(tmp_path / "plot.png")],
@@ -94,7 +94,7 @@ def test_plots_need_no_backend_of_matplotlib(backend, tmp_path):
         check=True,
     )
     there = {"qtagg", "AGG", "module://nowhere.backend_inline"}
-    given, used = done.stdout.split()
+    given, used = done.stdout.splitlines()
     assert given == backend  # for programs that this one starts
     assert (used.lower() == backend.lower()) == (backend in there)
 

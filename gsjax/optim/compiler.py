@@ -5,7 +5,8 @@ import hashlib
 import os
 import platform
 import threading
-from functools import cache
+from collections.abc import Callable
+from functools import cache, wraps
 from pathlib import Path
 from tempfile import TemporaryFile
 from time import perf_counter
@@ -27,6 +28,18 @@ def host_options() -> dict[str, Any]:
     """
     wide = jax.default_backend() == "cpu" and has_avx512()
     return {"xla_cpu_prefer_vector_width": 512} if wide else {}
+
+
+def host_jit(function: Callable, **options: Any) -> Callable:
+    """`jax.jit` with `host_options`, which are read at the first call: read as a module is imported, they
+    would start JAX's backend, after which nothing configures it (`jax.distributed.initialize`).
+
+    Args:
+        function: the function to compile, at the top level of a module.
+        options: of `jax.jit`.
+    """
+    jitted = cache(lambda: jax.jit(function, compiler_options=host_options(), **options))
+    return wraps(function)(lambda *args, **kwargs: jitted()(*args, **kwargs))
 
 
 def in_memory(arrays: Any, finite: Float[Array, "*n"]) -> Any:
