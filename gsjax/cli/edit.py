@@ -9,6 +9,7 @@ import tyro
 from rich.console import Console
 from rich.progress import track
 
+from gsjax.engine.folder import holds_something
 from gsjax.engine.locks import lock, releasing_locks
 from gsjax.engine.messages import Notes, stage
 from gsjax.engine.options import Common, Overwriting

@@ -33,7 +33,8 @@ def run_politely(command: str, arguments: list[str], entry: tuple[str, str]) -> 
         if command not in _COMPILE_ANEW:
             compiler.keep_programs()
             if missing := missing_device():  # before anything is read, or an earlier run replaced
-                raise ValueError(missing)
+                say_error(missing)
+                return 2
         return import_module(entry[0]).run(options)
     except Exception as error:
         if "--debug" in arguments:
