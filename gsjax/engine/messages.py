@@ -34,6 +34,8 @@ def describe(error: BaseException) -> str:
     """The message of an exception as one paragraph; errors of files begin with the path."""
     if isinstance(error, OSError) and error.filename is not None and error.strerror:
         return f"{error.filename}: {error.strerror[0].lower()}{error.strerror[1:]}"
+    if isinstance(error, FileNotFoundError) and error.errno is not None:  # without a name: of `os.getcwd`
+        return "the working directory: expected a folder, found that it was removed; change into another (cd)"
     return " ".join(str(error).split()) or type(error).__name__
 
 

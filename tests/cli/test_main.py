@@ -114,6 +114,9 @@ def test_errors_of_the_system_read_as_sentences(tmp_path):
     with pytest.raises(OSError, match="No such file") as caught:
         (tmp_path / "gone").read_text()
     assert describe(caught.value) == f"{tmp_path / 'gone'}: no such file or directory"
+    with pytest.raises(FileNotFoundError) as caught:
+        raise FileNotFoundError(2, "No such file or directory")  # as os.getcwd does in a folder that is gone
+    assert describe(caught.value).startswith("the working directory: expected a folder, found that it was")
     assert describe(ValueError("two\n  lines")) == "two lines"
     assert describe(ValueError()) == "ValueError"
 
