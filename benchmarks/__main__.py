@@ -3,8 +3,8 @@
 import sys
 
 from gsjax.engine.interrupts import heard_interrupts
-from gsjax.engine.messages import say_error
 from gsjax.engine.program import run_politely
+from gsjax.engine.streams import say_error
 
 
 def main() -> int:

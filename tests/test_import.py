@@ -2,6 +2,7 @@
 
 import ast
 import json
+import os
 import subprocess
 import sys
 import tomllib
@@ -47,6 +48,55 @@ def test_help_does_not_wait_for_jax():
 def test_help_of_a_command_needs_no_extra(command):
     asked = f"from gsjax.cli import main\ntry: main([{command!r}, '--help'])\nexcept SystemExit: pass"
     assert not loaded(asked) & OPTIONAL
+
+
+EACH = """
+import importlib, socket, sys
+import jax
+from jax._src import xla_bridge
+for name in sys.argv[1:]:
+    try:
+        importlib.import_module(name)
+    except ImportError as error:  # of an extra
+        if str(error.name).startswith("gsjax"):
+            raise
+    if xla_bridge.backends_are_initialized():
+        sys.exit(f"{name} starts JAX's backend")
+with socket.socket() as free:
+    free.bind(("localhost", 0))
+    port = free.getsockname()[1]
+jax.distributed.initialize(f"localhost:{port}", 1, 0)
+"""
+
+
+def test_no_module_starts_the_backend_of_jax():
+    """What configures it, such as `jax.distributed.initialize`, may follow an import."""
+    files = [file.relative_to(ROOT).with_suffix("") for file in (ROOT / "gsjax").rglob("*.py")]
+    names = sorted(".".join(file.parts).removesuffix(".__init__") for file in files)
+    done = subprocess.run([sys.executable, "-c", EACH, *names], cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.parametrize("backend", ["module://nowhere.backend_inline", "nonsense", "qtagg", "inline", "AGG"])
+def test_plots_need_no_backend_of_matplotlib(backend, tmp_path):
+    """A notebook hands its own to the programs that it starts, and it need not be there."""
+    program = (
+        "import os, sys\nfrom gsjax.viz import plots\nimport matplotlib\n"
+        "plots.save(plots.update_time([0.1, 0.2]), sys.argv[1])\n"
+        "print(os.environ['MPLBACKEND'])\nprint(matplotlib.rcParams._get('backend'))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program, str(tmp_path / "plot.png")],
+        cwd=ROOT,
+        env=os.environ | {"MPLBACKEND": backend},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    there = {"qtagg", "AGG", "module://nowhere.backend_inline"}
+    given, used = done.stdout.splitlines()
+    assert given == backend  # for programs that this one starts
+    assert (used.lower() == backend.lower()) == (backend in there)
 
 
 def test_what_is_told_to_install_is_there():

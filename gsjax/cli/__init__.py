@@ -12,6 +12,8 @@ from importlib import import_module
 
 from rich.console import Console
 
+from gsjax.engine.streams import keep_streams_open, lost_output, say_error
+
 GROUPS = {
     "Inspect data": {
         "info": ("gsjax.cli.info", "describe a recording or a set of photographs"),
@@ -49,21 +51,18 @@ options, if defaults depend on the arguments, and the arguments to parse."""
 
 def entry() -> None:
     """The program. After Ctrl-C or an error it exits without waiting for XLA, which may still be compiling in
-    a thread and would crash as Python shuts down. If its output is closed (`gsjax track --help | head`), it
-    ends quietly, with the code of a program that SIGPIPE ended."""
+    a thread and would crash as Python shuts down. Output that nobody can receive (`gsjax fit ... | head`)
+    neither ends a run nor changes its exit code; that of a full disk is missed aloud."""
     # JAX's traces are many objects that live on: looking through them again and again, and once more at the
     # exit, takes a second of a short run.
     gc.set_threshold(100_000, 50, 50)
+    keep_streams_open()
     try:
-        try:
-            code = main()
-        finally:
-            sys.stdout.flush()  # later, an error could not be caught
-    except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # for the rest of the output
-        code = 141
-    if code not in (0, 3, 141):
-        sys.stdout.flush()
+        code = main()
+    finally:
+        if why := lost_output():
+            say_error(f"standard output could not be written ({why})", word="warning")
+    if code not in (0, 3):
         sys.stderr.flush()
         os._exit(code)
     gc.freeze()
@@ -74,7 +73,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command; returns the exit code.
 
     0: done. 1: a fault of gsjax. 2: the user's mistake, reported in a sentence. 3: done, but nothing was
-    found (no feasible grasp). 130: Ctrl-C.
+    found (no feasible grasp). 130: stopped by Ctrl-C, SIGTERM or SIGHUP.
 
     Args:
         arguments: command and options (default: those of the process).
@@ -90,7 +89,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if command not in COMMANDS:
         known, meant = ", ".join(COMMANDS), get_close_matches(command, COMMANDS, 1)
         hint = f"did you mean {meant[0]}? There are" if meant else "there are"
-        Console(stderr=True).print(f"[bold red]error:[/] no command {command!r}; {hint}: {known}")
+        say_error(f"no command {command!r}; {hint}: {known}")
         return 2
     from gsjax.engine.interrupts import heard_interrupts
 
@@ -99,8 +98,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
             from gsjax.engine.program import run_politely
 
             return run_politely(command, rest, COMMANDS[command])
-    except KeyboardInterrupt:
-        Console(stderr=True).print("[bold red]stopped:[/] by Ctrl-C; files on disk are kept")
+    except KeyboardInterrupt as interrupt:
+        from gsjax.engine.messages import reason
+
+        say_error(f"by {reason(interrupt)}; files on disk are kept", word="stopped")
         return 130
 
 

@@ -9,7 +9,8 @@ import tyro
 from gsjax.engine.compare.comparison import compare
 from gsjax.engine.compare.pictures import shows_the_same
 from gsjax.engine.compare.results import FOLDERS, as_json, summarize
-from gsjax.engine.folder import expect_ours, is_run
+from gsjax.engine.folder import expect_ours, holds_something, is_run
+from gsjax.engine.locks import lock, releasing_locks
 from gsjax.engine.options import Common
 from gsjax.engine.records import read_record
 from gsjax.engine.report import write_report
@@ -30,6 +31,7 @@ class Options(Common):
     earlier comparison, which is replaced. By default only the tables are printed."""
 
 
+@releasing_locks()
 def run(options: Options) -> int:
     """Compare, print the tables and write the folder; returns the exit code.
 
@@ -52,10 +54,9 @@ def run(options: Options) -> int:
 
 
 def _check_folder(out: Path) -> None:
-    """Raises FileExistsError where the folder holds something that is no comparison."""
-    if out.exists() and not out.is_dir():
-        raise NotADirectoryError(f"--out {out}: expected a folder, found a file; name another")
-    if out.is_dir() and any(out.iterdir()) and (is_run(out) or not (out / _JSON).is_file()):
+    """Locks the folder; raises FileExistsError where it holds something that is no comparison."""
+    lock(out)
+    if holds_something(out) and (is_run(out) or not (out / _JSON).is_file()):
         what = "a run" if is_run(out) else "other files"
         raise FileExistsError(
             f"--out {out}: expected a new folder, an empty one or an earlier comparison, found {what}; "

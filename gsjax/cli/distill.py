@@ -3,10 +3,12 @@
 from gsjax.engine.distill.run import Options, run
 from gsjax.engine.teaching.cache import cache_folder
 
+_KEPT = cache_folder()
 HELP = (
     " As in `gsjax distill RUN`, or, for the scene of another program, `gsjax distill scene.ply --images "
-    "PHOTOGRAPHS --features FILES --out FIELD`. Outputs of encoders and segmenters are kept in "
-    f"{cache_folder()}; delete that folder to have them computed again, or for its space."
+    "PHOTOGRAPHS --features FILES --out FIELD`. Outputs of encoders and segmenters are "
+    + ("not kept, as this user has no home." if _KEPT is None else f"kept in {_KEPT}; ")
+    + ("" if _KEPT is None else "delete that folder to have them computed again, or for its space.")
 )
 
 __all__ = ["HELP", "Options", "run"]

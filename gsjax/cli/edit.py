@@ -9,6 +9,8 @@ import tyro
 from rich.console import Console
 from rich.progress import track
 
+from gsjax.engine.folder import holds_something
+from gsjax.engine.locks import lock, releasing_locks
 from gsjax.engine.messages import Notes, stage
 from gsjax.engine.options import Common, Overwriting
 from gsjax.engine.parts.films import SCRIPT, VIDEO, Shot, edited, new_folder, telling_camera, write_film
@@ -43,6 +45,7 @@ class Options(Common, Overwriting):
     """Write the Gaussians of each frame too, as ply/000000.ply and so on."""
 
 
+@releasing_locks()
 def run(options: Options) -> int:
     """Edit a run, and film the result; returns the exit code. A film that Ctrl-C stops can be watched so far.
 
@@ -52,6 +55,8 @@ def run(options: Options) -> int:
     console = Console(stderr=True, highlight=False)
     with Notes(console) as notes:
         script = read_script(options)
+        if options.run.is_dir():
+            lock(options.run, shared=True)
         saved = open_parts_run(options.run)
         given = None if options.camera is None else saved.camera(options.camera)
         with stage(console, "editing"):
@@ -117,15 +122,15 @@ def _folder(options: Options) -> Path:
 
     Raises:
         FileExistsError: it holds something that is no film, or a film that may not be replaced.
+        BlockingIOError: another process writes into it.
         NotADirectoryError: it is a file.
     """
     if options.out is None and options.script is None and not options.overwrite:
         return new_folder(options.run / "edit", _UNNAMED)
     name = _UNNAMED if options.script is None else options.script.stem
     folder = options.run / "edit" / name if options.out is None else options.out
-    if folder.exists() and not folder.is_dir():
-        raise NotADirectoryError(f"{folder}: expected a folder, found a file; name another --out")
-    if folder.is_dir() and any(folder.iterdir()):
+    lock(folder)
+    if holds_something(folder):
         if not (folder / SCRIPT).is_file():
             raise FileExistsError(
                 f"{folder}: expected a new or empty folder, or that of an earlier film (with "

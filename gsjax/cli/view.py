@@ -12,8 +12,9 @@ import tyro
 from rich.console import Console
 
 from gsjax.engine.distill.saved import Whereabouts
-from gsjax.engine.messages import Notes, say_error, stage
+from gsjax.engine.messages import Notes, stage
 from gsjax.engine.options import Common
+from gsjax.engine.streams import say_error
 from gsjax.engine.viewables import open_viewable
 from gsjax.io.atomic import write_new
 from gsjax.io.pictures import write_png

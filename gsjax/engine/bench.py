@@ -50,4 +50,5 @@ def run(options: Options) -> int:
     folder = str(Path.cwd())
     if folder not in sys.path:  # a console script does not search the working directory
         sys.path.insert(0, folder)
+    import_module("gsjax.viz")  # with it, the suite may import matplotlib whatever MPLBACKEND says
     return import_module("benchmarks.starts" if options.starts else "benchmarks.suite").run(options)

@@ -41,7 +41,7 @@ def finish(
 
 
 def exit_code(stopped: BaseException | None) -> int:
-    """0, or 130 where Ctrl-C ended the run.
+    """0, or 130 where Ctrl-C or a signal ended the run.
 
     Raises:
         BaseException: anything else that ended it early.

@@ -13,6 +13,7 @@ from typing import Any
 
 import yaml
 
+from gsjax.engine.locks import LOCK, lock, locked
 from gsjax.io.atomic import atomic_write, write_json, write_npz
 
 _WRITTEN = (
@@ -45,7 +46,7 @@ def expect_run(path: Path, made_by: str = "") -> None:
     """Raises FileNotFoundError if this is not the folder of a run (of the command `made_by`)."""
     expect_folder(path, made_by)
     if not is_run(path):
-        found = "other files" if any(path.iterdir()) else "an empty folder"
+        found = "other files" if holds_something(path) else "an empty folder"
         raise FileNotFoundError(
             f"{_wanted(path, made_by)}, whose config.yml begins with {SIGNATURE!r}, found {found}; give a "
             "run's --out"
@@ -140,8 +141,25 @@ class RunFolder:
             raise FileNotFoundError(f"{self.path}: expected a run to resume, found none; leave out --resume")
         if self.path.exists() and not self.path.is_dir():
             raise NotADirectoryError(f"{self.path}: expected a folder, found a file; name another folder")
-        if self.path.is_dir() and any(self.path.iterdir()):
+        if self.path.is_dir() and holds_something(self.path):
             self._claim(overwrite, resume)
+
+    @classmethod
+    def locked(cls, path: Path, *, overwrite: bool = False, resume: bool | None = False) -> "RunFolder":
+        """Claim the folder while no other process writes into it, until the command ends
+        (`gsjax.engine.locks`). A run around it, as around a field, is not replaced meanwhile.
+
+        Args:
+            path, overwrite, resume: as for `RunFolder`.
+
+        Raises:
+            BlockingIOError: another process writes into it.
+            OSError, ValueError: as for `RunFolder`; or the folder cannot be made or written.
+        """
+        if is_run(path.parent):
+            lock(path.parent, shared=True)
+        lock(path)
+        return cls(path, overwrite=overwrite, resume=resume)
 
     def _claim(self, overwrite: bool, resume: bool | None) -> None:
         # config.yml is written first, so a folder without it is no run's: delete nothing there.
@@ -258,11 +276,20 @@ def fresh_folder(path: Path, written: Sequence[str]) -> Path:
 @contextmanager
 def replaced_folder(path: Path, written: Sequence[str]) -> Iterator[Path]:
     """A new folder to write into, which replaces what gsjax left at `path` earlier when the block succeeds.
-    Until then, and after an exception (Ctrl-C too), the earlier folder stays as it was.
+    Until then, and after an exception (Ctrl-C too), the earlier folder stays as it was. Meanwhile no other
+    process may write a folder of that name, or replace the run that it is in.
 
     Args, raises: as `fresh_folder`.
+
+    Raises:
+        BlockingIOError: another process does.
     """
     path = expect_ours(path, written)
+    with locked(path.parent, shared=True), locked(path.parent, f".{path.name}.lock"):
+        yield from _replaced(path)
+
+
+def _replaced(path: Path) -> Iterator[Path]:
     new, old = (path.with_name(f".{path.name}.{os.getpid()}.partial{which}") for which in ("", "_old"))
     for stale in (new, old):  # of a killed process with the same number
         shutil.rmtree(stale, ignore_errors=True)
@@ -298,6 +325,11 @@ def expect_ours(path: Path, written: Sequence[str]) -> Path:
     raise FileExistsError(
         f"{path}: expected nothing, or only what gsjax writes there itself; found {found}; move it elsewhere"
     )
+
+
+def holds_something(folder: Path) -> bool:
+    """Whether there is more in a folder than the lock of a command that writes there, or was killed."""
+    return any(entry.name != LOCK for entry in folder.iterdir())
 
 
 def _flat(settings: Mapping[str, Any], within: str = "") -> dict[str, Any]:

@@ -1,8 +1,9 @@
-"""Ctrl-C that is not lost.
+"""Ctrl-C that is not lost, and signals that end a run as Ctrl-C does.
 
 Python raises KeyboardInterrupt wherever it happens to be. In a finalizer, or a callback of the garbage
 collector (JAX has one) or of a weak reference, the exception is printed and dropped, and the program goes on.
-Here Ctrl-C is raised again until it gets through.
+Here Ctrl-C is raised again until it gets through. So are SIGTERM, which schedulers and `kill` send, and
+SIGHUP, of a terminal that is closed: what was computed is written.
 """
 
 import signal
@@ -16,7 +17,9 @@ from typing import Any, no_type_check
 UNINTERRUPTIBLE = frozenset({"called_by_xla", "shielded"})
 """Functions that Ctrl-C waits for: callbacks of XLA, which drops exceptions, and `shielded` calls."""
 RETRY_S = 0.01
+_HEARD = ("SIGINT", "SIGTERM", "SIGHUP")
 _waiting = threading.Event()  # one per process, as signals are
+_newest = ["SIGINT"]
 
 
 @no_type_check  # a wrapper that checks types could be interrupted between the call's end and its own
@@ -32,7 +35,7 @@ def raise_if_interrupted() -> None:
     time."""
     if _waiting.is_set():
         _forget()
-        raise KeyboardInterrupt
+        raise KeyboardInterrupt(*_newest)
 
 
 def _forget() -> None:
@@ -52,22 +55,27 @@ def is_uninterruptible(frame: FrameType | None) -> bool:
 
 @contextmanager
 def heard_interrupts() -> Iterator[None]:
-    """While the block runs, Ctrl-C raises KeyboardInterrupt where it gets through, perhaps a little later.
+    """While the block runs, Ctrl-C, SIGTERM and SIGHUP raise KeyboardInterrupt, with the signal's name, where
+    it gets through, perhaps a little later.
 
-    If SIGINT is ignored or handled by something else, or there are no timers, nothing changes.
+    A signal that is ignored (`nohup`) or handled by something else stays so. Without timers nothing changes.
     """
+    heard = [signal.Signals[name] for name in _HEARD if name in signal.Signals.__members__]
+    usual = (signal.default_int_handler, signal.SIG_DFL)
+    before = {number: handler for number in heard if (handler := signal.getsignal(number)) in usual}
     main = threading.current_thread() is threading.main_thread()
-    usual = main and signal.getsignal(signal.SIGINT) is signal.default_int_handler
-    if not usual or not hasattr(signal, "setitimer"):
+    if not main or not before or not hasattr(signal, "setitimer"):
         yield
         return
 
     def interrupt(number: int, frame: FrameType | None) -> None:
+        if number != signal.SIGALRM:
+            _newest[0] = signal.Signals(number).name
         if is_uninterruptible(frame):
             try_again()
         else:
             _forget()
-            raise KeyboardInterrupt
+            raise KeyboardInterrupt(*_newest)
 
     def try_again() -> None:
         _waiting.set()
@@ -80,12 +88,13 @@ def heard_interrupts() -> Iterator[None]:
             print_dropped(unraisable)
 
     print_dropped, sys.unraisablehook = sys.unraisablehook, dropped
-    before = signal.signal(signal.SIGALRM, interrupt)
-    signal.signal(signal.SIGINT, interrupt)
+    before[signal.SIGALRM] = signal.getsignal(signal.SIGALRM)
+    for number in before:
+        signal.signal(number, interrupt)
     try:
         yield
     finally:
         _forget()
-        signal.signal(signal.SIGINT, signal.default_int_handler)
-        signal.signal(signal.SIGALRM, before)
+        for number, handler in before.items():
+            signal.signal(number, handler)
         sys.unraisablehook = print_dropped

@@ -10,7 +10,10 @@ from typing import Any
 import jax
 
 from gsjax.engine.messages import counted
+from gsjax.engine.messages import describe as describe_error
 from gsjax.optim.compiler import has_avx512
+
+_ASKED = ("JAX_PLATFORMS", "JAX_PLATFORM_NAME")  # variables of the environment that name a backend
 
 
 def describe() -> dict[str, Any]:
@@ -27,6 +30,26 @@ def describe() -> dict[str, Any]:
         "jax": jax.__version__,
         "python": platform.python_version(),
     }
+
+
+def compute_on_host() -> None:
+    """Let JAX use the CPU alone, whatever the environment asks for. Call it before JAX computes anything."""
+    jax.config.update("jax_platforms", "cpu")
+    jax.config.update("jax_platform_name", "cpu")
+
+
+def missing_device() -> str | None:
+    """Why JAX has no device to compute on, and what to do, in a sentence; None if it has one."""
+    try:
+        jax.devices()
+    except (RuntimeError, AssertionError) as error:  # by JAX, where the backend is not there or has no device
+        asked = next((f"{name}={value}" for name in _ASKED if (value := os.environ.get(name))), "JAX")
+        why = f" ({describe_error(error)})" if str(error) else ""
+        return (
+            f"{asked}: expected a backend with a device on this machine, found none{why}; leave it out, or "
+            "set JAX_PLATFORMS=cpu"
+        )
+    return None
 
 
 def usable_cores() -> int:

@@ -34,14 +34,9 @@ def describe(error: BaseException) -> str:
     """The message of an exception as one paragraph; errors of files begin with the path."""
     if isinstance(error, OSError) and error.filename is not None and error.strerror:
         return f"{error.filename}: {error.strerror[0].lower()}{error.strerror[1:]}"
+    if isinstance(error, FileNotFoundError) and error.errno is not None:  # without a name: of `os.getcwd`
+        return "the working directory: expected a folder, found that it was removed; change into another (cd)"
     return " ".join(str(error).split()) or type(error).__name__
-
-
-def say_error(text: str, word: str = "error") -> None:
-    """Print one paragraph on stderr, wrapped only in a terminal, so that programs can search it."""
-    console = Console(stderr=True, highlight=False)
-    line = Text.assemble((f"{word}: ", "bold red"), text.removeprefix(f"{word} "))
-    console.print(line, soft_wrap=not console.is_terminal)
 
 
 def counted(count: int, noun: str) -> str:
@@ -51,7 +46,9 @@ def counted(count: int, noun: str) -> str:
 
 def reason(stopped: BaseException) -> str:
     """The reason why a run was stopped."""
-    return "Ctrl-C" if isinstance(stopped, KeyboardInterrupt) else describe(stopped)
+    if isinstance(stopped, KeyboardInterrupt):  # with the name of its signal, or of Python's own
+        return "Ctrl-C" if str(stopped) in ("", "SIGINT") else str(stopped)
+    return describe(stopped)
 
 
 class Notes:

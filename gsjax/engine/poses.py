@@ -3,8 +3,7 @@
 import os
 import shutil
 import tempfile
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -25,6 +24,7 @@ from gsjax.data.structure_from_motion import (
     reconstruct_cameras,
     shortened,
 )
+from gsjax.engine.locks import lock, releasing_locks
 from gsjax.engine.messages import Notes, stage
 from gsjax.engine.options import Common, Overwriting
 from gsjax.engine.terminal import print_facts
@@ -50,6 +50,7 @@ class Options(Common, Overwriting):
     """Settings of the reconstruction."""
 
 
+@releasing_locks()
 def run(options: Options) -> int:
     """Find the cameras of photographs, and write a dataset that `gsjax fit` opens.
 
@@ -64,13 +65,15 @@ def run(options: Options) -> int:
             f"--out {options.out}: the photographs themselves are there; name another folder, or move them "
             f"to {options.out / 'images'} and give that"
         )
+    lock(options.out)
     _check_out(options.out, in_place, options.overwrite)
     with Notes(console) as notes:
         names = [] if of_video else list_photographs(options.images)
         reference = None if options.compare is None else open_photographs(options.compare)
         if reference is not None and not of_video:
             _in_both(names, reference)  # an error before the work, not after
-        with _workshop(options.out) as work:
+        with tempfile.TemporaryDirectory(prefix=".poses-", dir=options.out) as made:
+            work = Path(made)
             folder = work / "images" if of_video else options.images
             if of_video:
                 with stage(console, f"choosing frames of {options.images}"):
@@ -127,8 +130,6 @@ def _in_both(names: Sequence[str], reference: Photographs) -> list[tuple[int, in
 
 
 def _check_out(out: Path, in_place: bool, overwrite: bool) -> None:
-    if out.exists() and not out.is_dir():
-        raise NotADirectoryError(f"{out}: expected a folder, found a file; name another folder")
     own = [
         name for name in ("images", "sparse") if (out / name).exists() and not (in_place and name == "images")
     ]
@@ -141,20 +142,6 @@ def _check_out(out: Path, in_place: bool, overwrite: bool) -> None:
         )
     if not overwrite:
         raise FileExistsError(f"{out}: found the result of an earlier gsjax poses; --overwrite replaces it")
-
-
-@contextmanager
-def _workshop(out: Path) -> Iterator[Path]:
-    """A temporary folder on the disk of the result; `out` is removed again if nothing was written."""
-    made = [folder for folder in (out, *out.parents) if not folder.exists()]
-    out.mkdir(parents=True, exist_ok=True)
-    try:
-        with tempfile.TemporaryDirectory(prefix=".poses-", dir=out) as work:
-            yield Path(work)
-    finally:
-        for folder in made:
-            if folder.is_dir() and not any(folder.iterdir()):
-                folder.rmdir()
 
 
 def _write(

@@ -1,18 +1,18 @@
 """Running a command: its options are parsed, and a user's mistake becomes one sentence."""
 
-import select
-import sys
 from dataclasses import fields
 from importlib import import_module
 from typing import Any
 
-from gsjax.engine.machine import keep_to_cores
-from gsjax.engine.messages import describe, say_error
+from gsjax.engine.machine import compute_on_host, keep_to_cores, missing_device
+from gsjax.engine.messages import describe
+from gsjax.engine.streams import say_error
 from gsjax.extras import MissingExtra
 
 # ValueError covers DataError and PlyError, and every check of an argument.
 USER_ERRORS = (ValueError, OSError, MissingExtra)
-_COMPILE_ANEW = ("bench", "experiment")  # they measure compile time
+_ON_HOST = ("info", "poses", "compare")  # an accelerator would not help them, and need not be there
+_COMPILE_ANEW = ("bench", "experiment")  # they measure compile time, and may set up JAX themselves
 
 
 def run_politely(command: str, arguments: list[str], entry: tuple[str, str]) -> int:
@@ -28,27 +28,24 @@ def run_politely(command: str, arguments: list[str], entry: tuple[str, str]) -> 
         keep_to_cores(getattr(options, "cores", None))  # before JAX counts them
         compiler = import_module("gsjax.optim.compiler")
         compiler.keep_freed_memory()
+        if command in _ON_HOST:
+            compute_on_host()
         if command not in _COMPILE_ANEW:
             compiler.keep_programs()
+            if missing := missing_device():  # before anything is read, or an earlier run replaced
+                say_error(missing)
+                return 2
         return import_module(entry[0]).run(options)
     except Exception as error:
-        if "--debug" in arguments or (isinstance(error, BrokenPipeError) and is_unread()):
+        if "--debug" in arguments:
             raise
-        if isinstance(error, USER_ERRORS):
-            say_error(describe(error))
+        mistake = describe(error) if isinstance(error, USER_ERRORS) else missing_device()
+        if mistake is not None:
+            say_error(mistake)
             return 2
         fault = f"a fault of gsjax itself: {type(error).__name__}: {describe(error)}"
         say_error(f"{fault}. Please report it with the output of --debug")
         return 1
-
-
-def is_unread() -> bool:
-    """Whether stdout is a pipe whose reader has gone, as after `| head`."""
-    if not hasattr(select, "poll"):
-        return False
-    output = select.poll()
-    output.register(sys.__stdout__, select.POLLOUT)
-    return any(events & select.POLLERR for _, events in output.poll(0))
 
 
 def parse_options(command: str, arguments: list[str], entry: tuple[str, str]) -> Any:

@@ -5,7 +5,8 @@ import hashlib
 import os
 import platform
 import threading
-from functools import cache
+from collections.abc import Callable
+from functools import cache, wraps
 from pathlib import Path
 from tempfile import TemporaryFile
 from time import perf_counter
@@ -14,7 +15,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
-from platformdirs import user_cache_dir
+
+from gsjax.io.cache import user_cache
 
 
 @cache
@@ -26,6 +28,18 @@ def host_options() -> dict[str, Any]:
     """
     wide = jax.default_backend() == "cpu" and has_avx512()
     return {"xla_cpu_prefer_vector_width": 512} if wide else {}
+
+
+def host_jit(function: Callable, **options: Any) -> Callable:
+    """`jax.jit` with `host_options`, which are read at the first call: read as a module is imported, they
+    would start JAX's backend, after which nothing configures it (`jax.distributed.initialize`).
+
+    Args:
+        function: the function to compile, at the top level of a module.
+        options: of `jax.jit`.
+    """
+    jitted = cache(lambda: jax.jit(function, compiler_options=host_options(), **options))
+    return wraps(function)(lambda *args, **kwargs: jitted()(*args, **kwargs))
 
 
 def in_memory(arrays: Any, finite: Float[Array, "*n"]) -> Any:
@@ -142,13 +156,15 @@ def keep_programs(folder: str | Path | None = None) -> Path | None:
     Returns:
         The folder of the cache; None, with nothing changed, if JAX is already configured
         (`JAX_COMPILATION_CACHE_DIR`, or `JAX_ENABLE_COMPILATION_CACHE=0` for no cache) or the folder is not
-        writable.
+        writable, or the user has no home.
     """
     if jax.config.jax_compilation_cache_dir is not None or not jax.config.jax_enable_compilation_cache:
         return None
+    root = user_cache() if folder is None else Path(folder)
+    if root is None:
+        return None
     kind = hashlib.sha256(_processor().encode()).hexdigest()[:8]
     try:
-        root = Path(folder) if folder is not None else Path(user_cache_dir("gsjax", appauthor=False))
         place = root / f"programs-jax-{jax.__version__}-{kind}"
         (place / TRACES).mkdir(parents=True, exist_ok=True)
         with TemporaryFile(dir=place):
@@ -156,7 +172,7 @@ def keep_programs(folder: str | Path | None = None) -> Path | None:
         for program in place.glob("*-cache"):  # JAX writes the access time afterwards, and needs both files
             if not program.with_name(program.name.removesuffix("cache") + "atime").exists():
                 program.unlink(missing_ok=True)
-    except (OSError, RuntimeError):  # RuntimeError: the user has no home directory
+    except OSError:
         return None
     jax.config.update("jax_compilation_cache_dir", str(place))
     jax.config.update("jax_compilation_cache_max_size", _MOST_BYTES)

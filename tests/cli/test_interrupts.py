@@ -8,18 +8,38 @@ import weakref
 import pytest
 
 from gsjax.engine.interrupts import heard_interrupts, raise_if_interrupted, shielded
+from gsjax.engine.messages import reason
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="signals")
 
 
-def interrupt() -> None:
-    os.kill(os.getpid(), signal.SIGINT)
+def interrupt(number: int = signal.SIGINT) -> None:
+    os.kill(os.getpid(), number)
 
 
 def test_an_interrupt_is_raised_at_once():
     with pytest.raises(KeyboardInterrupt), heard_interrupts():
         interrupt()
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+@pytest.mark.parametrize("name", ["SIGTERM", "SIGHUP"])
+def test_a_signal_that_would_end_the_program_stops_it_as_ctrl_c_does(name):
+    number = signal.Signals[name]
+    with pytest.raises(KeyboardInterrupt) as stopped, heard_interrupts():
+        interrupt(number)
+    assert (str(stopped.value), reason(stopped.value)) == (name, name)
+    assert signal.getsignal(number) is signal.SIG_DFL
+    assert reason(KeyboardInterrupt()) == reason(KeyboardInterrupt("SIGINT")) == "Ctrl-C"
+
+
+def test_what_nohup_ignores_stays_ignored():
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        with heard_interrupts():
+            interrupt(signal.SIGHUP)
+    finally:
+        signal.signal(signal.SIGHUP, before)
 
 
 def in_the_garbage_collector():

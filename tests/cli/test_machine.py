@@ -7,7 +7,15 @@ import sys
 import numpy as np
 import pytest
 
-from gsjax.engine.machine import describe, in_words, keep_to_cores, name, peak_memory_mb, resident_mb
+from gsjax.engine.machine import (
+    describe,
+    in_words,
+    keep_to_cores,
+    missing_device,
+    name,
+    peak_memory_mb,
+    resident_mb,
+)
 
 needs_affinity = pytest.mark.skipif(
     not hasattr(os, "sched_setaffinity"), reason="this system does not let a process choose its cores"
@@ -42,6 +50,31 @@ def test_threads_run_on_the_cores_that_are_kept_to_those_of_jax_too():
     """Importing a command must not have started JAX's yet."""
     said = subprocess.run([sys.executable, "-c", KEPT], capture_output=True, text=True, check=True)
     assert said.stdout.split() == ["1", "True", "True"]
+
+
+@pytest.mark.parametrize("variable", ["JAX_PLATFORMS", "JAX_PLATFORM_NAME"])
+def test_only_commands_that_compute_need_the_backend_that_is_asked_for(variable, tmp_path):
+    scene, out = "simulated:tabletop?frames=2&width=40&height=32", str(tmp_path / "run")
+    for command, code in ((["info", scene], 0), (["fit", scene, "--out", out], 2)):
+        program = [sys.executable, "-m", "gsjax.cli", *command]
+        asked = os.environ | {variable: "nonsense"}
+        done = subprocess.run(program, env=asked, capture_output=True, text=True, check=False)
+        assert (done.returncode, "Traceback" in done.stderr) == (code, False), done.stderr
+    assert done.stderr.startswith(f"error: {variable}=nonsense: expected a backend with a device on this")
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_backend_without_devices_is_named(monkeypatch):
+    def without():
+        raise AssertionError  # as JAX does for CUDA without a GPU
+
+    assert missing_device() is None
+    monkeypatch.setenv("JAX_PLATFORMS", "cuda")
+    monkeypatch.setattr("jax.devices", without)
+    said = (
+        "JAX_PLATFORMS=cuda: expected a backend with a device on this machine, found none; leave it out, or "
+    )
+    assert missing_device() == f"{said}set JAX_PLATFORMS=cpu"
 
 
 @needs_affinity

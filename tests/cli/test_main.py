@@ -51,7 +51,7 @@ def test_it_ends_quietly_where_nobody_reads(arguments):
         [sys.executable, "-m", "gsjax.cli", *arguments], stdout=writes, stderr=subprocess.PIPE
     )
     os.close(writes)
-    assert (ended.returncode, ended.stderr) == (141, b"")
+    assert (ended.returncode, ended.stderr) == (0, b"")
 
 
 @pytest.mark.parametrize("command", list(COMMANDS))
@@ -114,6 +114,9 @@ def test_errors_of_the_system_read_as_sentences(tmp_path):
     with pytest.raises(OSError, match="No such file") as caught:
         (tmp_path / "gone").read_text()
     assert describe(caught.value) == f"{tmp_path / 'gone'}: no such file or directory"
+    with pytest.raises(FileNotFoundError) as caught:
+        raise FileNotFoundError(2, "No such file or directory")  # as os.getcwd does in a folder that is gone
+    assert describe(caught.value).startswith("the working directory: expected a folder, found that it was")
     assert describe(ValueError("two\n  lines")) == "two lines"
     assert describe(ValueError()) == "ValueError"
 

@@ -25,6 +25,7 @@ from gsjax.engine.deform.scores import judge
 from gsjax.engine.drive import drive
 from gsjax.engine.ending import exit_code, finish
 from gsjax.engine.folder import RunFolder, expect_dataset
+from gsjax.engine.locks import releasing_locks
 from gsjax.engine.machine import describe as describe_machine
 from gsjax.engine.messages import Notes, stage
 from gsjax.engine.options import RESUME_MAY_CHANGE, OfDataset, checked
@@ -58,6 +59,7 @@ class Options(TeacherOptions, OfDataset):
     """Settings of the scene and its training."""
 
 
+@releasing_locks()
 def run(options: Options) -> int:
     """Reconstruct a deforming scene and report on it; returns the exit code.
 
@@ -70,7 +72,7 @@ def run(options: Options) -> int:
     budget = Budget(options.minutes, begun)
     with Notes(console) as notes:
         expect_dataset(options.dataset)
-        folder = RunFolder(options.out, overwrite=options.overwrite, resume=options.resume)
+        folder = RunFolder.locked(options.out, overwrite=options.overwrite, resume=options.resume)
         settings = replace(options, dataset=located(options.dataset), **choice.located())
         if options.resume:
             folder.check_config(settings, but=RESUME_MAY_CHANGE)

@@ -18,6 +18,7 @@ from gsjax.engine.distill.scene import FieldScene, SceneOptions, open_scene
 from gsjax.engine.drive import drive
 from gsjax.engine.ending import exit_code, finish
 from gsjax.engine.folder import RunFolder, plain
+from gsjax.engine.locks import releasing_locks
 from gsjax.engine.machine import describe as describe_machine
 from gsjax.engine.messages import Notes, stage
 from gsjax.engine.options import RESUME_MAY_CHANGE, Common, Resuming, Seeded, Timed, checked
@@ -41,6 +42,7 @@ class Options(Common, Resuming, Timed, Seeded, TeacherChoice, SceneOptions):
     """Settings of the field and its training."""
 
 
+@releasing_locks()
 def run(options: Options) -> int:
     """Distil a field and report on it; returns the exit code.
 
@@ -54,7 +56,8 @@ def run(options: Options) -> int:
         options.check()
         scene = open_scene(options)
         sha256 = digest(scene.file)
-        folder = RunFolder(_out(options, scene.file), overwrite=options.overwrite, resume=options.resume)
+        out = _out(options, scene.file)
+        folder = RunFolder.locked(out, overwrite=options.overwrite, resume=options.resume)
         settings = with_paths(options)
         if options.resume:
             folder.check_config(settings, but=RESUME_MAY_CHANGE)

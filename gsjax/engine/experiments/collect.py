@@ -11,8 +11,9 @@ from rich.text import Text
 from gsjax.engine.experiments.records import RESULTS
 from gsjax.engine.experiments.sweep import Experiment
 from gsjax.engine.experiments.table import Shown, remarks, tabulate
-from gsjax.engine.messages import describe, say_error
+from gsjax.engine.messages import describe
 from gsjax.engine.report import write_report
+from gsjax.engine.streams import say_error
 from gsjax.engine.summary import Column, Media, Summary, Table
 from gsjax.io.atomic import atomic_write, write_json
 

@@ -13,6 +13,7 @@ from typing import Any
 from gsjax.engine import machine
 from gsjax.engine.experiments.records import read_record
 from gsjax.engine.experiments.sweep import RESERVED, Cell, Experiment
+from gsjax.engine.locks import locked
 from gsjax.engine.messages import describe
 from gsjax.io.atomic import write_json
 from gsjax.optim.compiler import forget_programs
@@ -36,7 +37,9 @@ def run_here(
     """
     for cell in cells:
         say(str(cell))
-        yield cell, run_cell(experiment, cell, script_run, experiment.cells_folder, debug)
+        with locked(experiment.cells_folder, f".{cell.id}.lock"):  # others may run other cells
+            record = run_cell(experiment, cell, script_run, experiment.cells_folder, debug)
+        yield cell, record
 
 
 def run_cell(

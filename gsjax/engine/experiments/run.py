@@ -17,8 +17,9 @@ from gsjax.engine.experiments.cluster import PROCESSES, check_scheduler, run_on_
 from gsjax.engine.experiments.collect import collect, stdout
 from gsjax.engine.experiments.local import run_here
 from gsjax.engine.experiments.sweep import Cell, Experiment, experiment_names, in_words, read_experiment
-from gsjax.engine.messages import Notes, describe, say_error
+from gsjax.engine.messages import Notes, describe, reason
 from gsjax.engine.options import Common
+from gsjax.engine.streams import say_error
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -134,10 +135,10 @@ def run_experiment(experiment: Experiment, options: Run) -> int:
                     console.print(_line(cell, record), soft_wrap=not console.is_terminal)
                     progress.update(task, advance=1, description="cells")
         code = collect(experiment, figure, options.debug)
-    except KeyboardInterrupt:
+    except KeyboardInterrupt as interrupt:
         kept = sum(experiment.is_done(experiment.own(cell)) for cell in chosen)
         again = "the same command" + (" without --fresh" if options.fresh else "")
-        after = f"by Ctrl-C after {kept} of {len(chosen)} cells"
+        after = f"by {reason(interrupt)} after {kept} of {len(chosen)} cells"
         say_error(f"{after}; {again} continues from there", word="stopped")
         return 130
     if failed:

@@ -39,6 +39,7 @@ def load_script(root: Path, path: Path, text: str, described: bool) -> tuple[Cal
     spec = spec_from_file_location(name, path)
     assert spec is not None
     module = module_from_spec(spec)
+    import_module("gsjax.viz")  # with it, the script may import matplotlib whatever MPLBACKEND says
     sys.modules[name] = module  # where dataclasses, pickle and other scripts look it up
     try:
         exec(compile(text, str(path), "exec"), module.__dict__)

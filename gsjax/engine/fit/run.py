@@ -21,6 +21,7 @@ from gsjax.engine.fit.sizes import Sizes
 from gsjax.engine.fit.start import start_from
 from gsjax.engine.fit.tensorboard import TensorBoard
 from gsjax.engine.folder import RunFolder
+from gsjax.engine.locks import releasing_locks
 from gsjax.engine.machine import describe as describe_machine
 from gsjax.engine.messages import Notes
 from gsjax.engine.options import RESUME_MAY_CHANGE, OfDataset, checked, expect_positive
@@ -64,6 +65,7 @@ class Options(OfDataset):
     Gaussians and the degree of their colours follow from what there is time for."""
 
 
+@releasing_locks()
 def run(options: Options) -> int:
     """Fit a scene and report on it; returns the exit code.
 
@@ -86,7 +88,7 @@ def run(options: Options) -> int:
         chosen, held_out = split(photographs, options.test_every)
         if options.until_psnr is not None and not len(held_out):
             raise ValueError("--until-psnr: nothing is held out to judge by; see --test-every")
-        folder = RunFolder(options.out, overwrite=options.overwrite, resume=options.resume)
+        folder = RunFolder.locked(options.out, overwrite=options.overwrite, resume=options.resume)
         settings = replace(options, dataset=located(options.dataset))
         is_default = options.fit == FitConfig(seed=options.fit.seed)  # so that --minutes decide
         if options.resume:

@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from gsjax.engine.machine import describe as describe_machine
-from gsjax.engine.messages import Notes
+from gsjax.engine.messages import Notes, reason
 from gsjax.engine.parts.saved import PartsRun, read_parts
 from gsjax.geometry.cameras import Camera, resized
 from gsjax.io.atomic import atomic_write, write_json
@@ -174,9 +174,10 @@ def write_film(
                     write_ply(folder / _PLY / f"{len(seconds):06d}.ply", shot.gaussians)
                 video.write(shot.image)
                 seconds.append(shot.seconds)
-        except KeyboardInterrupt:
+        except KeyboardInterrupt as interrupt:
             stopped = True
-            notes.add(f"This film is not complete: it was stopped after {len(seconds)} frames by Ctrl-C.")
+            after = f"after {len(seconds)} frames by {reason(interrupt)}"
+            notes.add(f"This film is not complete: it was stopped {after}.")
     warm = [each for each in seconds if each is not None]
     found = {
         "kind": "edit",

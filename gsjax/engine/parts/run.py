@@ -16,6 +16,7 @@ from gsjax.engine.ending import exit_code, finish
 from gsjax.engine.fit.run import Options as FitOptions
 from gsjax.engine.fit.run import run as run_fit
 from gsjax.engine.folder import RunFolder, expect_dataset, expect_run, is_run
+from gsjax.engine.locks import releasing_locks
 from gsjax.engine.messages import Notes, stage
 from gsjax.engine.options import RESUME_MAY_CHANGE, OfRecording, SamWeights, Seeded, checked
 from gsjax.engine.parts.loop import Loop, resumed
@@ -62,6 +63,7 @@ class Options(Seeded, SamWeights, OfRecording):
     """How parts are found and followed."""
 
 
+@releasing_locks()
 def run(options: Options) -> int:
     """Find the parts of a recording and report on them; returns the exit code.
 
@@ -75,7 +77,7 @@ def run(options: Options) -> int:
         recording = chosen_recording(options)
         _check(options, recording)
         segmenter: Segmenter = PieceSegmenter() if options.sam is None else load_sam(options.sam)
-        folder = RunFolder(options.out, overwrite=options.overwrite, resume=options.resume)
+        folder = RunFolder.locked(options.out, overwrite=options.overwrite, resume=options.resume)
         settings = replace(options, dataset=located(options.dataset), cameras=recording.tracked.camera_ids)
         if options.resume:
             folder.check_config(settings, but=RESUME_MAY_CHANGE)

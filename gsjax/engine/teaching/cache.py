@@ -8,17 +8,18 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import numpy as np
-from platformdirs import user_cache_dir
 
 from gsjax.io.atomic import write_npz
+from gsjax.io.cache import user_cache
 
 Arrays = Mapping[str, np.ndarray]
 _READ_ERRORS = (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error)
 
 
-def cache_folder() -> Path:
-    """The default folder of outputs; its content may be deleted."""
-    return Path(user_cache_dir("gsjax", appauthor=False)) / "features"
+def cache_folder() -> Path | None:
+    """The default folder of outputs; its content may be deleted. None for a user without a home."""
+    root = user_cache()
+    return None if root is None else root / "features"
 
 
 class FeatureCache:
@@ -31,7 +32,7 @@ class FeatureCache:
     def __init__(self, folder: Path | None = None):
         """
         Args:
-            folder: the folder (default: in the user's cache folder).
+            folder: the folder (default: in the user's cache folder; without one, nothing is kept).
         """
         self._folder = folder or cache_folder()
         self.found = self.asked = 0
@@ -44,6 +45,9 @@ class FeatureCache:
             inputs: arrays.
             compute: computes the output.
         """
+        if self._folder is None:
+            self.asked += 1
+            return dict(compute())
         path = self._folder / f"{content_digest(key, inputs)}.npz"
         try:
             with np.load(path, allow_pickle=False) as stored:
@@ -57,7 +61,7 @@ class FeatureCache:
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             write_npz(path, output)
-        except OSError:  # a full disk, or no home: then it is computed next time too
+        except OSError:  # a full disk: then it is computed next time too
             pass
         return output
 

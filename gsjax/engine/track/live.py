@@ -20,6 +20,7 @@ from gsjax.data.stream import Arrival, NewestSnapshots, Snapshot, replay
 from gsjax.engine.drive import Tick
 from gsjax.engine.ending import ended, exit_code
 from gsjax.engine.folder import RunFolder
+from gsjax.engine.locks import releasing_locks
 from gsjax.engine.machine import describe as describe_machine
 from gsjax.engine.machine import resident_mb
 from gsjax.engine.messages import FITTING, MEASURING, Notes, stage
@@ -89,6 +90,7 @@ class Source(NamedTuple):
     snapshots: Iterator[Snapshot]
 
 
+@releasing_locks()
 def run(options: Options) -> int:
     """Follow a stream and report on it; returns the exit code.
 
@@ -99,7 +101,7 @@ def run(options: Options) -> int:
     _check(options)
     console = Console(stderr=True, highlight=False)
     with Notes(console) as notes:
-        folder = RunFolder(options.out, overwrite=options.overwrite, resume=None)
+        folder = RunFolder.locked(options.out, overwrite=options.overwrite, resume=None)
         source = _open(options, console)
         folder.write_config(options)  # from here on an earlier run is gone
         log = Log(source.scene.label_ids, source.names)

@@ -2,7 +2,6 @@
 
 import numpy as np
 from jaxtyping import Bool
-from matplotlib.figure import Figure
 
 from gsjax.engine.folder import RunFolder
 from gsjax.engine.recording import FirstMask, Recording
@@ -80,7 +79,7 @@ def write_plots(
     """
     written = []
 
-    def keep(name: str, figure: Figure, caption: str) -> None:
+    def keep(name: str, figure: plots.Figure, caption: str) -> None:
         written.append(Media(plots.save(figure, folder.plot(name)), caption))
 
     labels, moved = {name: label for label, name in names.items()}, tracking.num_frames > 1

@@ -10,8 +10,9 @@ from rich.console import Console
 
 from gsjax.engine.ending import ended, exit_code, finish
 from gsjax.engine.folder import RunFolder, expect_dataset
+from gsjax.engine.locks import releasing_locks
 from gsjax.engine.machine import describe as describe_machine
-from gsjax.engine.messages import FITTING, Notes, reason, say_error, stage
+from gsjax.engine.messages import FITTING, Notes, reason, stage
 from gsjax.engine.options import (
     RESUME_MAY_CHANGE,
     FirstMasks,
@@ -32,6 +33,7 @@ from gsjax.engine.recording import (
     warn_of_missing,
 )
 from gsjax.engine.scores import Scores
+from gsjax.engine.streams import say_error
 from gsjax.engine.summary import Media, format_number
 from gsjax.engine.track.loop import Tracking, begin, follow
 from gsjax.engine.track.outputs import write_first_mask, write_plots, write_tracking
@@ -71,6 +73,7 @@ def options_for(arguments: list[str]) -> tuple[type[Options], list[str]]:
     return preset_options(Options, arguments, "track", PRESETS)
 
 
+@releasing_locks()
 def run(options: Options) -> int:
     """Track a recording and report on it; returns the exit code.
 
@@ -83,7 +86,7 @@ def run(options: Options) -> int:
     with Notes(console) as notes:
         expect_dataset(options.dataset)
         recording = chosen_recording(options)
-        folder = RunFolder(options.out, overwrite=options.overwrite, resume=options.resume)
+        folder = RunFolder.locked(options.out, overwrite=options.overwrite, resume=options.resume)
         settings = replace(options, dataset=located(options.dataset), cameras=recording.tracked.camera_ids)
         if options.resume:
             folder.check_config(settings, but=RESUME_MAY_CHANGE)
@@ -239,7 +242,7 @@ def _note_if_stopped(tracking: Tracking, recording: Recording, notes: Notes) -> 
     why = reason(tracking.stopped).rstrip(".")
     notes.add(f"This run is not complete: it was stopped {after} by {why}.")
     if isinstance(tracking.stopped, KeyboardInterrupt):
-        say_error(f"by Ctrl-C {after}; scoring those (Ctrl-C again to skip that)", word="stopped")
+        say_error(f"by {why} {after}; scoring those (Ctrl-C again to skip that)", word="stopped")
 
 
 def _note_what_is_missing(

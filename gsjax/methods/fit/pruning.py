@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float
 
 from gsjax.geometry.cameras import Camera, on_device
 from gsjax.methods.fit.config import FitConfig
-from gsjax.optim.compiler import host_options
+from gsjax.optim.compiler import host_jit
 from gsjax.rasterize.plan import HEADROOM, Plan, with_room
 from gsjax.scene.frame import Frame
 from gsjax.scene.gaussians import Gaussians, take
@@ -75,7 +75,7 @@ def light_of(
     return most
 
 
-@partial(jax.jit, static_argnames="plan", compiler_options=host_options())
+@partial(host_jit, static_argnames="plan")
 def _weights(
     gaussians: Gaussians, camera: Camera, mask: Bool[Array, "1 h w"] | None, plan: Plan
 ) -> tuple[Float[Array, "n"], object]:

@@ -10,7 +10,7 @@ import optax
 from jaxtyping import Array, Float, Int
 
 from gsjax.geometry.cameras import Camera
-from gsjax.optim.compiler import host_options
+from gsjax.optim.compiler import host_jit
 from gsjax.rasterize.plan import Plan
 from gsjax.scene.frame import one_camera
 from gsjax.scene.gaussians import Gaussians
@@ -34,7 +34,7 @@ def label_votes(
     return total
 
 
-@partial(jax.jit, static_argnames="plan", compiler_options=host_options())
+@partial(host_jit, static_argnames="plan")
 def _votes(zeros, gaussians: Gaussians, cameras: Camera, plan: Plan, values):
     # Zeros made in here would be constant-folded through the whole render, which takes many seconds.
     _, transpose = jax.vjp(lambda f: render(gaussians, cameras, plan, features=f).features, zeros)
@@ -76,7 +76,7 @@ def lift_masks(
     return logits, np.asarray(losses)
 
 
-@partial(jax.jit, static_argnames="plan", compiler_options=host_options())
+@partial(host_jit, static_argnames="plan")
 def _lift_step(logits, state, gaussians, cameras, plan, masks):
     def loss(logits):
         drawn = render(gaussians, cameras, plan, features=jax.nn.softmax(logits))

@@ -57,7 +57,7 @@ def field(made, tmp_path):
 @pytest.fixture(autouse=True)
 def cache(tmp_path, monkeypatch):
     """No test finds what another one encoded."""
-    monkeypatch.setattr("gsjax.engine.teaching.cache.user_cache_dir", lambda *a, **k: str(tmp_path / "cache"))
+    monkeypatch.setattr("gsjax.engine.teaching.cache.user_cache", lambda: tmp_path / "cache")
 
 
 def metrics(out):

@@ -30,7 +30,7 @@ def cache(tmp_path_factory):
     """A cache of features for these tests alone."""
     with pytest.MonkeyPatch.context() as patch:
         folder = tmp_path_factory.mktemp("cache")
-        patch.setattr("gsjax.engine.teaching.cache.user_cache_dir", lambda *a, **k: str(folder))
+        patch.setattr("gsjax.engine.teaching.cache.user_cache", lambda: folder)
         yield folder
 
 

@@ -108,21 +108,22 @@ def test_a_run_from_end_to_end(pristine, tmp_path, gsjax_track, opened):
     assert "the truth holds no pose of it" in page
 
 
-def test_ctrl_c_leaves_a_usable_run(pristine, tmp_path, gsjax_track, still, monkeypatch):
+@pytest.mark.parametrize("name", ["Ctrl-C", "SIGTERM"])
+def test_ctrl_c_leaves_a_usable_run(pristine, tmp_path, gsjax_track, still, monkeypatch, name):
     frame = Sequence.frame
 
     def interrupted(sequence, t):
         if t == 2 and sequence.num_cameras == 2:
-            raise KeyboardInterrupt
+            signal.raise_signal(signal.SIGINT if name == "Ctrl-C" else signal.Signals[name])
         return frame(sequence, t)
 
     monkeypatch.setattr(Sequence, "frame", interrupted)
     code, said = gsjax_track(pristine, "--cameras", "0", "1", "--eval-cameras", "2")
     assert code == 130
-    assert "stopped: by Ctrl-C after 2 of 4 frames" in said
+    assert f"stopped: by {name} after 2 of 4 frames" in said
     run = tmp_path / "run"
     found = json.loads((run / "metrics.json").read_text())
-    assert (found["complete"], found["stopped"]) == (False, "Ctrl-C")
+    assert (found["complete"], found["stopped"]) == (False, name)
     assert (found["frames"]["tracked"], found["frames"]["scored"]) == (2, 2)
     assert np.load(run / "trajectory.npz")["means"].shape[0] == 2
     assert "partial run" in (run / "report.html").read_text()
@@ -146,14 +147,15 @@ def test_ctrl_c_while_scoring_keeps_what_was_scored(pristine, tmp_path, gsjax_tr
 
 
 @pytest.mark.skipif(os.name != "posix", reason="signals")
-def test_sigint_stops_the_program(pristine, tmp_path):
+@pytest.mark.parametrize("name", ["SIGINT", "SIGTERM", "SIGHUP"])
+def test_a_signal_stops_the_program(pristine, tmp_path, name):
     command = [sys.executable, "-m", "gsjax.cli", "track", str(pristine), "--out", str(tmp_path / "run")]
     process = subprocess.Popen([*command, *QUICK], stderr=subprocess.PIPE, text=True)
     while not (tmp_path / "run" / "config.yml").exists():
         time.sleep(0.05)
         assert process.poll() is None
     time.sleep(0.5)  # it is compiling now, where JAX's own callbacks drop exceptions
-    process.send_signal(signal.SIGINT)
+    process.send_signal(signal.Signals[name])
     _, said = process.communicate(timeout=120)
     assert process.returncode == 130, said
     assert "Traceback" not in said

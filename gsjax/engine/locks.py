@@ -1,0 +1,258 @@
+"""One writer at a time in a folder.
+
+A writer locks a file in the folder, RUN/.lock, with `flock`. The system releases the lock when the process
+ends, however it ends: a run that was killed is free for the next writer, and nobody is misled by a process
+number that is used again. Network file systems with locks (NFS 4, SMB, Lustre mounted with `flock`) share
+them between machines. Where a file system has none, the writers that the file lists decide: those of this
+machine as long as their processes live, and those of other machines until the file is removed.
+
+Commands that only add to a run, such as a query, share its lock: they keep out a run that would replace it,
+but not each other.
+"""
+
+import atexit
+import errno
+import json
+import os
+import socket
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager, suppress
+from contextvars import ContextVar
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+
+try:
+    import fcntl
+except ImportError:  # Windows: the list of writers decides
+    fcntl = None
+
+LOCK = ".lock"
+"""The file of a folder's lock: there while somebody writes into the folder, and after a writer was killed."""
+_NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP, errno.EINVAL)
+_ATTEMPTS, _BETWEEN_S = 5, 0.1
+_MOST_BYTES = 2**16  # of a list of writers
+
+
+@dataclass(frozen=True)
+class Writer:
+    """A process that writes into a folder, as the file of the lock lists it.
+
+    Attributes:
+        pid: the number of the process.
+        host: the name of its machine.
+        since: the local time at which it began.
+        shared: whether others may write beside it.
+    """
+
+    pid: int = field(default_factory=os.getpid)
+    host: str = field(default_factory=socket.gethostname)
+    since: str = field(default_factory=lambda: time.strftime("%Y-%m-%d %H:%M:%S"))
+    shared: bool = False
+
+    def __str__(self) -> str:
+        where = "" if self.host == socket.gethostname() else f" on {self.host}"
+        return f"process {self.pid}{where}, which has been writing there since {self.since}"
+
+    @property
+    def may_live(self) -> bool:
+        """Whether the process may be there still; nobody can tell that of another machine's."""
+        if self.host != socket.gethostname() or os.name != "posix":
+            return True
+        try:
+            os.kill(self.pid, 0)
+        except ProcessLookupError:
+            return False
+        except OSError:  # it is another user's
+            pass
+        return True
+
+
+@dataclass
+class _Held:
+    """A lock that this process holds, `times` over: its open file, and the folders that were made for it."""
+
+    file: int
+    made: list[Path]
+    writer: Writer
+    times: int = 0
+
+
+_held: dict[Path, _Held] = {}
+_of_process = ExitStack()
+atexit.register(_of_process.close)
+_scope: ContextVar[ExitStack] = ContextVar("the locks of a command", default=_of_process)
+
+
+@contextmanager
+def releasing_locks() -> Iterator[None]:
+    """What `lock` locks in the block is released at its end; also a decorator."""
+    with ExitStack() as stack:
+        token = _scope.set(stack)
+        try:
+            yield
+        finally:
+            _scope.reset(token)
+
+
+def lock(folder: Path, *, shared: bool = False) -> None:
+    """Lock a folder until the end of the block of `releasing_locks`, or else of the process.
+
+    Args, raises: as for `locked`.
+    """
+    _scope.get().enter_context(locked(folder, shared=shared))
+
+
+@contextmanager
+def locked(folder: Path, name: str = LOCK, *, shared: bool = False) -> Iterator[None]:
+    """Lock a folder, or a part of it, while the block runs. A process may lock the same twice.
+
+    Args:
+        folder: the folder. It is made if it is not there, and removed again if it is still empty at the end.
+        name: name of the lock's file: that of the whole folder, or ".PART.lock".
+        shared: whether other processes may share the lock. Then a folder without write access is no error,
+            and is not locked.
+
+    Raises:
+        BlockingIOError: another process has locked it; the message says which, and since when.
+        NotADirectoryError: it is a file.
+        OSError: the folder cannot be made or written.
+    """
+    if folder.exists() and not folder.is_dir():
+        raise NotADirectoryError(f"{folder}: expected a folder, found a file; name another folder")
+    path = folder.resolve() / name
+    held = _held.get(path)
+    if held is None:
+        held = _taken(folder, path, shared)
+    elif held.writer.shared and not shared:
+        alone = replace(held.writer, shared=False)
+        _acquire(held.file, folder, path, alone)
+        _list_writers(held.file, [alone])
+        held.writer = alone
+    if held is not None:
+        held.times += 1
+    try:
+        yield
+    finally:
+        if held is not None:
+            held.times -= 1
+            if not held.times:
+                del _held[path]
+                _release(path, held)
+
+
+def _taken(folder: Path, path: Path, shared: bool) -> _Held | None:
+    """The lock, which is now this process's; None where a shared one cannot be written."""
+    writer, made = Writer(shared=shared), []
+    while True:
+        made += [place for place in path.parents if not place.exists()]
+        try:
+            file = _opened(folder, path)
+        except OSError:
+            if shared:
+                return None
+            raise
+        try:
+            _acquire(file, folder, path, writer)
+        except BaseException:
+            os.close(file)
+            raise
+        if _is_at(file, path):
+            break
+        os.close(file)  # whoever had it has removed the file meanwhile
+    _list_writers(file, [*(_others(file, writer) if shared else []), writer])
+    _held[path] = _Held(file, made, writer)
+    return _held[path]
+
+
+def _opened(folder: Path, path: Path) -> int:
+    """The opened file of a lock; it is made if it was not there."""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise type(error)(f"{folder}: cannot make this folder ({error.strerror})") from error
+    try:
+        return os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
+    except OSError as error:
+        raise type(error)(
+            f"{folder}: cannot write into this folder ({error.strerror}); name another"
+        ) from error
+
+
+def _acquire(file: int, folder: Path, path: Path, writer: Writer) -> None:
+    """Lock an open file.
+
+    Raises:
+        BlockingIOError: others have locked it.
+    """
+    for attempt in range(_ATTEMPTS):
+        free = _flock(file, writer.shared)
+        others = _others(file, writer)
+        if free or (free is None and not any(not (writer.shared and one.shared) for one in others)):
+            return
+        if others:
+            break
+        time.sleep(_BETWEEN_S * (attempt + 1 < _ATTEMPTS))  # it has not listed itself yet, or is ending
+    who = str(others[-1]) if others else "another process, which writes there"
+    gone = "" if free is not None else f"; if it is gone, remove {path}"
+    raise BlockingIOError(
+        f"{folder}: expected a folder into which no other process writes, found {who}; wait until it ends, "
+        f"stop it, or name another folder{gone}"
+    )
+
+
+def _flock(file: int, shared: bool) -> bool | None:
+    """Lock an open file; returns whether that succeeded, or None where the file system has no locks."""
+    if fcntl is None:
+        return None
+    try:
+        fcntl.flock(file, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
+    except OSError as error:
+        if error.errno in _NO_LOCKS:
+            return None
+        if error.errno in (errno.EACCES, errno.EAGAIN):
+            return False
+        raise
+    return True
+
+
+def _is_at(file: int, path: Path) -> bool:
+    """Whether an open file is the one at a path."""
+    with suppress(FileNotFoundError):
+        return os.path.samestat(os.fstat(file), os.stat(path))
+    return False
+
+
+def _others(file: int, writer: Writer) -> list[Writer]:
+    """The other writers that an open file lists and that may live; what cannot be read is left out."""
+    os.lseek(file, 0, os.SEEK_SET)
+    found = []
+    for line in os.read(file, _MOST_BYTES).splitlines():
+        with suppress(ValueError, TypeError):
+            found.append(Writer(**json.loads(line)))
+    own = (writer.pid, writer.host)
+    return [other for other in found if (other.pid, other.host) != own and other.may_live]
+
+
+def _list_writers(file: int, writers: list[Writer]) -> None:
+    lines = "".join(json.dumps(asdict(writer)) + "\n" for writer in writers)
+    with suppress(OSError):  # a full disk; the lock holds all the same
+        os.ftruncate(file, 0)
+        os.lseek(file, 0, os.SEEK_SET)
+        os.write(file, lines.encode())
+
+
+def _release(path: Path, held: _Held) -> None:
+    """Release a lock; its file is removed unless others share it."""
+    with suppress(OSError):  # of a file system that is gone, say
+        others = _others(held.file, held.writer)
+        alone = _flock(held.file, shared=False)  # so that nobody joins before the file is removed
+        if alone or (alone is None and not others):
+            if _is_at(held.file, path):
+                path.unlink()
+        else:
+            _list_writers(held.file, others)
+    os.close(held.file)
+    for place in held.made:
+        with suppress(OSError):  # something was written into it
+            place.rmdir()

@@ -1,0 +1,78 @@
+"""Standard streams that never end a run: what nobody can receive is dropped.
+
+Output may be closed (`>&-`), its reader may go away (`| head`), its disk may be full, its terminal may be
+gone, and its encoding may lack a character.
+"""
+
+import errno
+import io
+import os
+import select
+import sys
+from typing import TextIO
+
+from rich.console import Console
+from rich.text import Text
+
+_NOBODY_READS = (errno.EPIPE, errno.EBADF, errno.EIO)
+"""Errors of a pipe without a reader, of a closed stream, and of a terminal that is gone."""
+
+
+class _Output(io.FileIO):
+    """The file of a stream. `lost` is the first error because of which something was dropped, or None."""
+
+    lost: OSError | None = None
+
+    def write(self, data, /) -> int:
+        """Write or drop all of the data; returns its number of bytes."""
+        size = memoryview(data).nbytes
+        try:
+            while (written := super().write(data)) is None:  # another program made the stream non-blocking
+                select.select([], [self], [])
+        except OSError as error:
+            self.lost = self.lost or error
+            return size
+        return written
+
+
+def keep_streams_open() -> None:
+    """Replace stdout and stderr of this process by ones whose errors are dropped.
+
+    The numbers of closed streams are taken too: a file that is opened later would get one, and whatever a
+    library prints would end up in it.
+    """
+    for number in range(3):
+        try:
+            os.fstat(number)
+        except OSError:
+            os.open(os.devnull, os.O_RDWR)  # gets the lowest free number
+    sys.stdout, sys.stderr = _kept_open(sys.stdout), _kept_open(sys.stderr)
+
+
+def lost_output() -> str | None:
+    """Why a part of stdout is lost, in words; None if all was written, or if nobody reads it."""
+    sys.stdout.flush()
+    raw = getattr(getattr(sys.stdout, "buffer", None), "raw", None)
+    lost = raw.lost if isinstance(raw, _Output) else None
+    return None if lost is None or lost.errno in _NOBODY_READS else lost.strerror
+
+
+def say_error(text: str, word: str = "error") -> None:
+    """Print one paragraph on stderr, wrapped only in a terminal, so that programs can search it."""
+    console = Console(stderr=True, highlight=False)
+    line = Text.assemble((f"{word}: ", "bold red"), text.removeprefix(f"{word} "))
+    console.print(line, soft_wrap=not console.is_terminal)
+
+
+def _kept_open(stream: TextIO | None) -> TextIO:
+    if stream is None:
+        return open(os.devnull, "w", encoding="utf-8")
+    if not isinstance(stream, io.TextIOWrapper):
+        return stream
+    return io.TextIOWrapper(
+        io.BufferedWriter(_Output(stream.fileno(), "w", closefd=False)),
+        encoding=stream.encoding,
+        errors="replace",
+        line_buffering=stream.line_buffering,
+        write_through=stream.write_through,
+    )

@@ -1,0 +1,14 @@
+"""The folder for what is kept between runs and may be deleted."""
+
+from pathlib import Path
+
+from platformdirs import user_cache_dir
+
+
+def user_cache() -> Path | None:
+    """The folder of gsjax in the user's cache; None for a user without a home, as containers have them."""
+    try:
+        folder = Path(user_cache_dir("gsjax", appauthor=False))
+    except RuntimeError:
+        return None
+    return folder if folder.is_absolute() else None  # "~/.cache" of platformdirs before it raised errors

@@ -1,0 +1,155 @@
+"""One writer at a time in a folder, whatever becomes of it."""
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+
+import pytest
+
+from gsjax.engine import locks
+from gsjax.engine.locks import LOCK, Writer, lock, locked, releasing_locks
+
+pytestmark = pytest.mark.skipif(os.name != "posix", reason="locks of files")
+
+
+def refusal(folder, **how) -> str:
+    with pytest.raises(BlockingIOError) as refused, locked(folder, **how):
+        pass
+    return str(refused.value)
+
+
+def test_a_second_writer_is_told_who_writes_and_since_when(tmp_path, written):
+    other = written(tmp_path)
+    since = json.loads((tmp_path / LOCK).read_text())["since"]
+    said = refusal(tmp_path)
+    assert f"found process {other.pid}, which has been writing there since {since}; wait until" in said
+    assert "remove" not in said  # of a lock that ends with its process
+    other.communicate("")
+    with locked(tmp_path):
+        assert json.loads((tmp_path / LOCK).read_text())["pid"] == os.getpid()
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])
+def test_what_a_dead_writer_left_is_taken_over(tmp_path, written, number):
+    other = written(tmp_path)
+    other.send_signal(number)
+    other.wait()
+    assert (tmp_path / LOCK).exists()
+    with locked(tmp_path):
+        assert json.loads((tmp_path / LOCK).read_text())["pid"] == os.getpid()
+
+
+@pytest.mark.parametrize(
+    "left",
+    ["", "{", "[1]\n", '{"pid": "x"}', json.dumps({"pid": 1, "host": socket.gethostname()}), "\0" * 99],
+)
+def test_what_the_file_says_locks_nothing(tmp_path, left):
+    """Another process may have the number by now: the first one of the machine is always there."""
+    (tmp_path / LOCK).write_text(left)
+    with locked(tmp_path):
+        pass
+    assert not (tmp_path / LOCK).exists()
+
+
+def test_some_share_what_another_must_not_replace(tmp_path, written):
+    other = written(tmp_path, shared=True)
+    with locked(tmp_path, shared=True):
+        pass
+    assert f"process {other.pid}" in refusal(tmp_path)
+    other.communicate("")
+    alone = written(tmp_path)
+    assert f"process {alone.pid}" in refusal(tmp_path, shared=True)
+    alone.communicate("")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_parts_of_a_folder_are_locked_apart(tmp_path, written):
+    written(tmp_path)
+    with locked(tmp_path, ".query.lock"):
+        assert (tmp_path / ".query.lock").exists()
+    assert not (tmp_path / ".query.lock").exists()
+
+
+def test_a_process_may_lock_what_it_has_locked(tmp_path):
+    link = tmp_path / "link"
+    link.symlink_to(tmp_path / "run")
+    with locked(tmp_path / "run"), locked(link, shared=True):
+        pass
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_folder_is_left_as_it_was_found(tmp_path):
+    with locked(tmp_path / "a" / "b"):
+        assert (tmp_path / "a" / "b" / LOCK).is_file()
+    assert list(tmp_path.iterdir()) == []
+    with locked(tmp_path / "a" / "b"):
+        (tmp_path / "a" / "kept").touch()
+    assert list((tmp_path / "a").iterdir()) == [tmp_path / "a" / "kept"]
+
+
+def test_locks_of_a_command_end_with_it(tmp_path):
+    @releasing_locks()
+    def command():
+        lock(tmp_path / "run")
+        inner()
+        assert not (tmp_path / "inner").exists()
+        assert (tmp_path / "run" / LOCK).exists()
+        raise KeyboardInterrupt
+
+    @releasing_locks()
+    def inner():
+        lock(tmp_path / "inner")
+        assert (tmp_path / "inner" / LOCK).exists()
+
+    with pytest.raises(KeyboardInterrupt):
+        command()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_places_where_nobody_can_write(tmp_path, monkeypatch):
+    (tmp_path / "file").touch()
+    with (
+        pytest.raises(NotADirectoryError, match="file: expected a folder, found a file"),
+        locked(tmp_path / "file"),
+    ):
+        pass
+    with pytest.raises(OSError, match="file/run: cannot make this folder"), locked(tmp_path / "file" / "run"):
+        pass
+
+    def read_only(*_):
+        raise OSError(30, "Read-only file system")
+
+    monkeypatch.setattr(os, "open", read_only)
+    with pytest.raises(OSError, match="cannot write into this folder"), locked(tmp_path):
+        pass
+    with locked(tmp_path, shared=True):  # who only adds to a run elsewhere need not write into it
+        pass
+
+
+def listed(tmp_path, **about) -> None:
+    values = {"pid": 1, "host": socket.gethostname(), "since": "2026-01-02 03:04:05", "shared": False}
+    (tmp_path / LOCK).write_text(json.dumps(values | about) + "\n")
+
+
+def test_without_locks_of_files_the_writers_that_are_listed_decide(tmp_path, monkeypatch):
+    monkeypatch.setattr(locks, "_flock", lambda *_, **__: None)
+    listed(tmp_path)
+    said = refusal(tmp_path)
+    assert "found process 1, which has been writing there since 2026-01-02 03:04:05" in said
+    assert f"if it is gone, remove {tmp_path / LOCK}" in said
+    listed(tmp_path, host="elsewhere")
+    assert "process 1 on elsewhere, which" in refusal(tmp_path)
+    listed(tmp_path, shared=True)
+    with locked(tmp_path, shared=True):
+        pass
+    ended = subprocess.Popen([sys.executable, "-c", ""])
+    ended.wait()
+    listed(tmp_path, pid=ended.pid)
+    assert not Writer(ended.pid).may_live
+    with locked(tmp_path):
+        assert json.loads((tmp_path / LOCK).read_text())["pid"] == os.getpid()
+    assert list(tmp_path.iterdir()) == []
