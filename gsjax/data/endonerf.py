@@ -28,6 +28,7 @@ from gsjax.data.frame_folders import (
     warn_about_single_frame,
 )
 from gsjax.data.objects import Truth
+from gsjax.data.origin import near_origin
 from gsjax.data.sequence import Sequence
 from gsjax.data.tool_masks import LABEL_NAMES, TOOL, Tool, check_tool, find_masks, tool_labels
 
@@ -38,6 +39,7 @@ RIGHT = "right"
 _BOUNDS_OFF_BY = 5.0  # a ratio larger than this indicates another unit
 
 
+@near_origin
 def read_endonerf(
     path: str | Path,
     *,
