@@ -3,10 +3,13 @@ steps of centimetres or metres, so they are held relative to an origin of their 
 
 from collections.abc import Sequence
 
+import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
 from gsjax.geometry.cameras import NEAR
+from gsjax.scene.gaussians import Gaussians
 
 FAR = 1e3
 """A scene is far if its distance from the origin is this many times its size: float32 then rounds places to
@@ -39,7 +42,6 @@ def about(
     viewmats: Float[np.ndarray, "*batch 4 4"], origin: Float[np.ndarray, "3"] | None
 ) -> Float[np.ndarray, "*batch 4 4"]:
     """View matrices of the same cameras for coordinates relative to `origin`; as they are if it is None.
-    With `-origin`, they are brought back.
 
     Args:
         viewmats: world to camera, float64.
@@ -50,6 +52,13 @@ def about(
     moved = np.array(viewmats, np.float64)
     moved[..., :3, 3] += moved[..., :3, :3] @ origin
     return moved
+
+
+def cameras_in_world(
+    viewmats: Float[np.ndarray, "*batch 4 4"], origin: Float[np.ndarray, "3"] | None
+) -> Float[np.ndarray, "*batch 4 4"]:
+    """View matrices for coordinates relative to an origin, for those of the data: the inverse of `about`."""
+    return viewmats if origin is None else about(viewmats, -origin)
 
 
 def in_world(
@@ -64,6 +73,16 @@ def relative_to(
 ) -> Float[np.ndarray, "*batch 3"]:
     """Places in the coordinates of the data, relative to an origin: the inverse of `in_world`."""
     return places if origin is None else np.asarray(places, np.float64) - origin
+
+
+def moved_to(
+    gaussians: Gaussians, was: Float[np.ndarray, "3"] | None, now: Float[np.ndarray, "3"] | None
+) -> Gaussians:
+    """Gaussians relative to the origin `was`, relative to the origin `now`; None is that of the data."""
+    if was is None and now is None:
+        return gaussians
+    means = relative_to(in_world(np.asarray(gaussians.means), was), now)
+    return eqx.tree_at(lambda g: g.means, gaussians, jnp.asarray(means, gaussians.means.dtype))
 
 
 def in_words(places: Float[np.ndarray, "n 3"], origin: Float[np.ndarray, "3"]) -> str:

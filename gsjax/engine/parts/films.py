@@ -17,12 +17,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from gsjax.engine.files import write_scene
 from gsjax.engine.machine import describe as describe_machine
 from gsjax.engine.messages import Notes
 from gsjax.engine.parts.saved import PartsRun, read_parts
 from gsjax.geometry.cameras import Camera, resized
 from gsjax.io.atomic import atomic_write, write_json
-from gsjax.io.ply import write_ply
 from gsjax.io.video import VideoWriter
 from gsjax.methods.parts.film import Film, Layer, film_gaussians
 from gsjax.methods.parts.limits import Beyond, beyond_captured, describe_beyond
@@ -163,7 +163,7 @@ def write_film(
     shutil.rmtree(folder / _PLY, ignore_errors=True)
     with atomic_write(folder / SCRIPT) as temporary:
         temporary.write_text(to_yaml(script), encoding="utf-8")
-    sequence = saved.recording.judged
+    sequence, origin = saved.recording.judged, saved.recording.judged.origin
     view = sequence.camera(0, sequence.camera_ids.index(camera))
     fps = script.fps or 1 / float(np.median(np.diff(saved.recording.tracked.times)))
     seconds, stopped = [], False
@@ -171,7 +171,7 @@ def write_film(
         try:
             for shot in watch(shots(film, view, saved), len(film[0].trajectory.times)):
                 if ply:
-                    write_ply(folder / _PLY / f"{len(seconds):06d}.ply", shot.gaussians)
+                    write_scene(folder / _PLY / f"{len(seconds):06d}.ply", shot.gaussians, origin=origin)
                 video.write(shot.image)
                 seconds.append(shot.seconds)
         except KeyboardInterrupt:
