@@ -20,7 +20,6 @@ _WRITTEN = (
     *("config.yml", "metrics.json", "metrics.jsonl", "report.html", "trajectory.npz", "scene.ply"),
     *("cameras.npz", "poses.npz", "parts.npz", "field.npz", "deformation.npz", "video_*.mp4", ".*.partial*"),
     *(
-        "scene_labels.npz",
         "canonical",
         "renders",
         "plots",
@@ -32,7 +31,7 @@ _WRITTEN = (
         "tensorboard",
         "test",
     ),
-    "resume",
+    *("scene_labels.npz", "resume"),
 )
 """All that a run, and what is made from it, writes into its folder; `screenshots` are kept."""
 _VALUABLE = (

@@ -10,7 +10,7 @@ from gsjax.engine.folder import RunFolder
 from gsjax.engine.messages import Notes
 from gsjax.io.atomic import write_npz
 from gsjax.methods.deform import DeformingScene, Problem, refined_viewmats, times_of
-from gsjax.scene.origin import about
+from gsjax.scene.origin import cameras_in_world
 
 NAME = "poses.npz"
 """Refined view matrices of all frames and cameras, in the folder of a run."""
@@ -35,12 +35,8 @@ def as_refined(
     learned = times_of(problem.frames)
     found = refined_viewmats(given, data.times, scene.twists, learned, problem.radius)
     sequence = replace(data.sequence, viewmats=found)
-    back = None if sequence.origin is None else -sequence.origin
-    arrays = {
-        "viewmats": about(found, back),
-        "frame_ids": sequence.frame_ids,
-        "camera_ids": sequence.camera_ids,
-    }
+    arrays = {"viewmats": cameras_in_world(found, sequence.origin)}
+    arrays |= {"frame_ids": sequence.frame_ids, "camera_ids": sequence.camera_ids}
     write_npz(folder.path / NAME, arrays)
     notes.add(
         f"Poses were refined ({NAME}), and frames are judged with the refined poses. The pose of a held-out "

@@ -36,7 +36,7 @@ from gsjax.methods.fit.padding import sizes_of
 from gsjax.optim.method import Run
 from gsjax.scene.frame import Frame
 from gsjax.scene.gaussians import Gaussians
-from gsjax.scene.origin import about
+from gsjax.scene.origin import cameras_in_world
 
 _UNLIMITED = 1_000_000  # steps
 _MAY_CHANGE = (*RESUME_MAY_CHANGE, "tensorboard", "save_every")
@@ -277,7 +277,7 @@ def write_cameras(
     if model.twists is None and model.exposures is None:
         return
     viewmats = np.concatenate([frame.cameras.viewmat for frame in frames])
-    found = {"names": np.array(names), "viewmats": about(viewmats, None if origin is None else -origin)}
+    found = {"names": np.array(names), "viewmats": cameras_in_world(viewmats, origin)}
     if model.exposures is not None:
         exposures = np.asarray(model.exposures)
         found["exposures"] = np.eye(3, 4) + exposures - exposures.mean(0)
