@@ -19,18 +19,7 @@ from gsjax.io.labels import ENDING
 _WRITTEN = (
     *("config.yml", "metrics.json", "metrics.jsonl", "report.html", "trajectory.npz", "scene.ply"),
     *("cameras.npz", "poses.npz", "parts.npz", "field.npz", "deformation.npz", "video_*.mp4", ".*.partial*"),
-    *(
-        "canonical",
-        "renders",
-        "plots",
-        "query",
-        "grasp",
-        "eval",
-        "edit",
-        "field",
-        "tensorboard",
-        "test",
-    ),
+    *("canonical", "renders", "plots", "query", "grasp", "eval", "edit", "field", "tensorboard", "test"),
     *("scene_labels.npz", "resume"),
 )
 """All that a run, and what is made from it, writes into its folder; `screenshots` are kept."""

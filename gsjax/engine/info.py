@@ -15,6 +15,7 @@ from gsjax.data.errors import MissingFile
 from gsjax.data.open import is_photographs, is_recording
 from gsjax.engine.folder import expect_dataset
 from gsjax.engine.info_picture import by_camera, by_split, write_picture
+from gsjax.engine.info_scene import describe_scene
 from gsjax.engine.messages import Notes
 from gsjax.engine.options import Common, OneDataset, Reading
 from gsjax.engine.summary import Column, Table
@@ -44,6 +45,13 @@ def run(options: Options) -> int:
         raise ValueError(
             f"--picture: expected a name that ends in {', '.join(PICTURES)}, found {options.picture.name!r}"
         )
+    if (file := Path(options.dataset)).suffix.lower() == ".ply" and file.is_file():
+        if options.picture is not None:
+            raise ValueError(f"--picture: draws cameras, and {file} has none; leave it out")
+        with Notes(Console(stderr=True, highlight=False)):
+            facts = describe_scene(file)
+        print_facts(facts, title=file.name)
+        return 0
     expect_dataset(options.dataset)
     table = None
     with Notes(Console(stderr=True, highlight=False)):

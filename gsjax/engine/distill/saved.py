@@ -123,9 +123,8 @@ def open_field_run(
         )
     gaussians = jax.tree.map(jnp.asarray, gaussians)
     stored = replace(stored, means=gaussians.means)
-    shown = (
-        _photographs(folder, stored, file, (gaussians, report), now.images, notes) if photographs else None
-    )
+    read = gaussians, report
+    shown = _photographs(folder, stored, file, read, now.images, notes) if photographs else None
     of_file = (report.rows, report.stored, report.labels, report.origin)
     return FieldRun(folder, stored, file, gaussians, *of_file, shown, now.weights)
 
