@@ -45,9 +45,11 @@ def test_what_is_not_far_keeps_its_coordinates(places):
 
 def test_distance_counts_in_sizes_of_the_scene():
     spread = np.random.default_rng(0).normal(size=(100, 3))
-    assert far_origin(spread + [0.5 * FAR, 0, 0]) is None
-    assert far_origin(spread + [10 * FAR, 0, 0]) is not None
-    assert far_origin(spread + [10 * FAR, 0, 0], [1e5 * spread]) is None  # its points are all around
+    assert far_origin(spread + np.array([0.5 * FAR, 0, 0])) is None
+    assert far_origin(spread + np.array([10 * FAR, 0, 0])) is not None
+    assert (
+        far_origin(spread + np.array([10 * FAR, 0, 0]), [1e5 * spread]) is None
+    )  # its points are all around
 
 
 def test_cameras_and_places_come_back_as_they_were():

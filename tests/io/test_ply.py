@@ -187,9 +187,8 @@ def test_places_far_from_0_are_written_as_double_and_read_relative_to_an_origin(
 
 def test_float32_far_from_0_is_said_to_have_lost_places(tmp_path):
     path, gaussians = tmp_path / "scene.ply", random_gaussians(50)
-    far = {
-        axis: (np.asarray(gaussians.means)[:, i] + UTM[i]).astype(np.float32) for i, axis in enumerate("xyz")
-    }
+    places = (np.asarray(gaussians.means) + UTM).astype(np.float32)
+    far = dict(zip("xyz", places.T, strict=True))
     changed(path, gaussians, **far)
     with pytest.warns(UserWarning, match="of float32, which has lost what is smaller than these steps"):
         loaded, report = read_ply(path)
@@ -198,11 +197,12 @@ def test_float32_far_from_0_is_said_to_have_lost_places(tmp_path):
 
 def test_near_0_nothing_is_taken_off(tmp_path):
     path, gaussians = tmp_path / "scene.ply", random_gaussians(50)
-    write_ply(path, gaussians, origin=np.array([10.0, 0, -20]))
+    shift = np.array([10.0, 0, -20])
+    write_ply(path, gaussians, origin=shift)
     loaded, report = read_ply(path)
     assert report.origin is None
     assert PlyData.read(str(path))["vertex"].data.dtype["x"] == np.float32
-    np.testing.assert_allclose(loaded.means, np.asarray(gaussians.means) + [10, 0, -20], atol=1e-5)
+    np.testing.assert_allclose(loaded.means, gaussians.means + shift, atol=1e-5)
 
 
 @pytest.mark.parametrize(
