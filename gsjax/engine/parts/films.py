@@ -5,7 +5,7 @@ import shutil
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 from itertools import chain, count
 from pathlib import Path
 from time import perf_counter
@@ -20,7 +20,7 @@ from jaxtyping import Array, Float, Int
 from gsjax.engine.files import write_scene
 from gsjax.engine.machine import describe as describe_machine
 from gsjax.engine.messages import Notes
-from gsjax.engine.parts.saved import PartsRun, read_parts
+from gsjax.engine.parts.saved import PartsRun, read_parts_about
 from gsjax.geometry.cameras import Camera, resized
 from gsjax.io.atomic import atomic_write, write_json
 from gsjax.io.video import VideoWriter
@@ -69,7 +69,8 @@ def edited(script: Script, saved: PartsRun) -> tuple[Film, list[str]]:
     Raises:
         ValueError, OSError: there is no such part or other run, or the edits cannot be applied.
     """
-    known = cache(read_parts)  # each other run is read once
+    # Each other run is read once.
+    known = cache(partial(read_parts_about, origin=saved.recording.judged.origin))
     film = apply(script, saved.layer, saved.names, known)
     recorded, now = saved.layer, film[0].trajectory
     doubts = []

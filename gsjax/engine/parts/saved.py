@@ -19,7 +19,7 @@ from gsjax.methods.parts import PartScene, order_of_frames, trajectory_of
 from gsjax.methods.parts.film import Layer
 from gsjax.methods.parts.timeline import Names
 from gsjax.scene.handles import Blend, HandlePose
-from gsjax.scene.origin import relative_to
+from gsjax.scene.origin import in_world, moved_to, relative_to
 
 _FILES = ("parts.npz", "scene.ply", "metrics.json")
 _ARRAYS = {
@@ -94,6 +94,23 @@ def read_parts(path: str | Path) -> tuple[Layer, Names]:
     """
     layer, names, *_ = _read(Path(path))
     return layer, names
+
+
+def read_parts_about(path: str | Path, origin: Float[np.ndarray, "3"] | None) -> tuple[Layer, Names]:
+    """As `read_parts`, relative to the origin of another run.
+
+    Args:
+        path: the folder.
+        origin: that of the other run.
+
+    Raises:
+        FileNotFoundError, ValueError: as for `open_parts_run`.
+    """
+    layer, names, _, own = _read(Path(path))
+    scene = layer.scene
+    centers = jnp.asarray(relative_to(in_world(np.asarray(scene.centers), own), origin), float)
+    scene = PartScene(moved_to(scene.gaussians, own, origin), scene.weights, centers)
+    return Layer(scene, layer.trajectory), names
 
 
 def _read(path: Path) -> tuple[Layer, dict[str, int], bool, Float[np.ndarray, "3"] | None]:
