@@ -205,7 +205,8 @@ def _query_deformation(options: Options, console: Console) -> None:
             raise ValueError(f"--{option}: expected a TEXT too, found none; leave out --{option} or give one")
     with Notes(console) as notes:
         with stage(console, "reading the scene"):
-            result, origin = (read(options.run / DEFORMATION) for read in (read_deformation, origin_of))
+            file = options.run / DEFORMATION
+            result, origin = read_deformation(file), origin_of(file)
         warn_of_partial(options.run, notes)
         scene = QueryableScene(options.run, result, options.weights, origin)
         if ways:

@@ -13,7 +13,7 @@ import os
 import re
 import warnings
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import jax.numpy as jnp
@@ -60,8 +60,9 @@ class PlyReport:
         rows: row in the file of each returned Gaussian, [N].
         labels: int32 label of each returned Gaussian, [N]; None if the file has no labels.
         invisible: number of rows left out because their opacity is 0, a logit of -inf.
-        origin: what was taken off the means because they lie far from 0: the file has `means + origin`, which
-            float32 cannot hold. None if they are as in the file.
+        origin: what was taken off the means because they lie far from 0, where float32 cannot hold them; None
+            if they are as in the file.
+        places: of the returned Gaussians as in the file, float64 [N,3].
         antialiased: whether a comment says that the scene is to be drawn antialiased.
     """
 
@@ -72,6 +73,7 @@ class PlyReport:
     labels: Int[np.ndarray, "N"] | None = None
     invisible: int = 0
     origin: Float[np.ndarray, "3"] | None = None
+    places: Float[np.ndarray, "N 3"] = field(default_factory=lambda: np.zeros((0, 3)), repr=False)
     antialiased: bool = False
 
 
@@ -190,6 +192,7 @@ def read_ply(path: str | os.PathLike) -> tuple[Gaussians, PlyReport]:
         labels=None if labels is None else labels[rows].astype(np.int32),
         invisible=int(invisible.sum()),
         origin=origin,
+        places=places[rows],
         antialiased=_says_antialiased([*ply.comments, *(c for e in ply.elements for c in e.comments)]),
     )
     _warn(path, report, places, ply)

@@ -1,9 +1,11 @@
 """Data far from 0 are relative to an origin, with a warning; near 0 nothing changes."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from gsjax.data import DataWarning, Truth, open_photographs, open_sequence, photographs_of
+from gsjax.data import DataWarning, open_photographs, open_sequence, photographs_of
 from gsjax.data.objects import PointModel
 from gsjax.data.origin import near_origin, relative_to_origin
 from gsjax.data.simulated import tabletop
@@ -103,28 +105,34 @@ def test_photographs_far_from_0_are_read_like_those_near_it(tmp_path, place, clo
 
 
 def test_all_that_is_known_of_a_recording_moves_with_it():
-    near, place = tabletop(frames=2, width=32, height=24), np.array(PLACES["UTM"])
+    plain, place = tabletop(frames=2, width=32, height=24), np.array(PLACES["UTM"])
+    assert plain.truth is not None
+    names, poses = plain.truth.names, plain.truth.poses
     joint = Joint("revolute", np.array([0.0, 0, 1]), np.array([0.1, 0.2, 0]), np.zeros(2))
-    poses, tracks = near.truth.poses, np.random.default_rng(0).normal(size=(2, 5, 3))
-    truth = Truth(near.truth.names, near.truth.label_ids, poses, joints=(joint,) * len(near.truth.names))
-    model = PointModel("can", *(np.ones((1, n)) for n in (3, 4, 3)), np.ones(1), np.ones((1, 3)), 3)
-    model = PointModel(**(vars(model) | {"pose": poses[0, 0], "plane": np.array([0.0, 0, 1, -0.5])}))
-    near = type(near)(**(vars(near) | {"truth": type(truth)(**(vars(truth) | {"tracks": tracks}))}))
-    near = type(near)(**(vars(near) | {"models": (model,)}))
-    far = relative_to_origin(near, -place)  # as if it had been recorded there
-    far = type(far)(**(vars(far) | {"origin": None}))
+    tracks = np.random.default_rng(0).normal(size=(2, 5, 3))
+    truth = replace(plain.truth, joints=(joint,) * len(names), tracks=tracks)
+    shape = [np.ones((1, n)) for n in (3, 4, 3)]
+    model = PointModel(
+        "can", *shape, np.ones(1), np.ones((1, 3)), 3, poses[0, 0], np.array([0.0, 0, 1, -0.5])
+    )
+    near = replace(plain, truth=truth, models=(model,))
+    far = replace(relative_to_origin(near, -place), origin=None)  # as if it had been recorded there
     with pytest.warns(DataWarning, match="relative to the origin"):
         found = near_origin(lambda: far)()
-    shift = found.origin - place
-    np.testing.assert_allclose(found.truth.poses[..., :3, 3], poses[..., :3, 3] - shift, atol=1e-6)
-    np.testing.assert_allclose(found.truth.tracks, tracks - shift, atol=1e-6)
-    np.testing.assert_allclose(found.truth.joints[0].point, joint.point - shift, atol=1e-6)
-    np.testing.assert_allclose(found.models[0].pose[:3, 3], model.pose[:3, 3] - shift, atol=1e-6)
-    np.testing.assert_allclose(found.models[0].plane @ [*(-shift + [7, 7, 0.5]), 1], 0, atol=1e-6)
-    for points, sequence in ((tracks[0], near), (tracks[0] - shift, found)):
-        pixels, depths = project_points(sequence, 0, 0, points)
-        np.testing.assert_allclose(depths, project_points(near, 0, 0, tracks[0])[1], atol=1e-6)
-        assert pixels.shape == (5, 2)
+    shift, moved = found.origin - place, found.truth
+    assert moved is not None
+    np.testing.assert_allclose(moved.poses[..., :3, 3], poses[..., :3, 3] - shift, atol=1e-6)
+    np.testing.assert_allclose(moved.tracks, tracks - shift, atol=1e-6)
+    np.testing.assert_allclose(
+        [each.point for each in moved.joints if each], joint.point - shift + 0 * poses[0, :, :3, 3], atol=1e-6
+    )
+    there = found.models[0]
+    np.testing.assert_allclose(
+        there.pose, np.block([[poses[0, 0, :, :3], poses[0, 0, :, 3:] - np.r_[shift, 0][:, None]]]), atol=1e-6
+    )
+    np.testing.assert_allclose(there.plane, [0, 0, 1, -0.5 + shift[2]], atol=1e-6)
+    _, depths = project_points(found, 0, 0, tracks[0] - shift)
+    np.testing.assert_allclose(depths, project_points(near, 0, 0, tracks[0])[1], atol=1e-6)
     np.testing.assert_array_equal(found.select(frames=[1]).scaled(0.5).origin, found.origin)
     np.testing.assert_array_equal(photographs_of(found).origin, found.origin)
     back = relative_to_origin(found, None)
