@@ -52,5 +52,5 @@ def read_labels(path: str | os.PathLike, count: int) -> Int[np.ndarray, "N"] | N
         if found.shape == (count,) and np.issubdtype(found.dtype, np.integer):
             return found.astype(np.int32)
         said = f"{found.dtype} of shape {found.shape}"
-    warnings.warn(f"{file}: {expected}, found {said}; they are left out", UserWarning, stacklevel=3)
+    warnings.warn(f"{file}: {expected}, found {said}; they are left out", UserWarning, stacklevel=1)
     return None

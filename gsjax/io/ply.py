@@ -222,14 +222,14 @@ def _warn(path: Path, report: PlyReport, places: Float[np.ndarray, "N 3"], ply: 
     if report.invisible:
         left_out.append(f"{report.invisible} of {report.stored} Gaussians are invisible (opacity 0)")
     if left_out:
-        warnings.warn(f"{path}: {' and '.join(left_out)} and are left out", UserWarning, stacklevel=3)
+        warnings.warn(f"{path}: {' and '.join(left_out)} and are left out", UserWarning, stacklevel=1)
     if report.origin is None:
         return
     words = in_words(places, report.origin)
     types = ply["vertex"].data.dtype
     if "x" in (types.names or ()) and types["x"].itemsize < 8:
         words += "; the file itself is of float32, which has lost what is smaller than these steps"
-    warnings.warn(f"{path}: {words}", UserWarning, stacklevel=3)
+    warnings.warn(f"{path}: {words}", UserWarning, stacklevel=1)
 
 
 def _known(path: Path, vertices: np.ndarray) -> set[str]:

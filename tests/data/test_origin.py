@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from gsjax.data import DataWarning, open_photographs, open_sequence, photographs_of
 from gsjax.data.objects import PointModel
@@ -111,25 +112,24 @@ def test_all_that_is_known_of_a_recording_moves_with_it():
     joint = Joint("revolute", np.array([0.0, 0, 1]), np.array([0.1, 0.2, 0]), np.zeros(2))
     tracks = np.random.default_rng(0).normal(size=(2, 5, 3))
     truth = replace(plain.truth, joints=(joint,) * len(names), tracks=tracks)
-    shape = [np.ones((1, n)) for n in (3, 4, 3)]
-    model = PointModel(
-        "can", *shape, np.ones(1), np.ones((1, 3)), 3, poses[0, 0], np.array([0.0, 0, 1, -0.5])
-    )
+    shape, plane = [np.ones((1, n)) for n in (3, 4, 3)], np.array([0.0, 0, 1, -0.5])
+    model = PointModel("can", *shape, np.ones(1), np.ones((1, 3)), 3, poses[0, 0], plane)
     near = replace(plain, truth=truth, models=(model,))
     far = replace(relative_to_origin(near, -place), origin=None)  # as if it had been recorded there
     with pytest.warns(DataWarning, match="relative to the origin"):
         found = near_origin(lambda: far)()
-    shift, moved = found.origin - place, found.truth
+    moved = found.truth
+    assert found.origin is not None
     assert moved is not None
+    shift = found.origin - place
     np.testing.assert_allclose(moved.poses[..., :3, 3], poses[..., :3, 3] - shift, atol=1e-6)
     np.testing.assert_allclose(moved.tracks, tracks - shift, atol=1e-6)
-    np.testing.assert_allclose(
-        [each.point for each in moved.joints if each], joint.point - shift + 0 * poses[0, :, :3, 3], atol=1e-6
-    )
+    for each in moved.joints:
+        assert each is not None
+        np.testing.assert_allclose(each.point, joint.point - shift, atol=1e-6)
     there = found.models[0]
-    np.testing.assert_allclose(
-        there.pose, np.block([[poses[0, 0, :, :3], poses[0, 0, :, 3:] - np.r_[shift, 0][:, None]]]), atol=1e-6
-    )
+    assert there.pose is not None
+    np.testing.assert_allclose(there.pose[:3, 3], poses[0, 0, :3, 3] - shift, atol=1e-6)
     np.testing.assert_allclose(there.plane, [0, 0, 1, -0.5 + shift[2]], atol=1e-6)
     _, depths = project_points(found, 0, 0, tracks[0] - shift)
     np.testing.assert_allclose(depths, project_points(near, 0, 0, tracks[0])[1], atol=1e-6)
@@ -142,10 +142,9 @@ def test_all_that_is_known_of_a_recording_moves_with_it():
 
 def test_a_recording_of_another_layout_is_moved_too(tmp_path):
     """TUM RGB-D with a trajectory of a satellite receiver."""
-    from PIL import Image
-
+    tmp_path = tmp_path / "freiburg1"
     for kind, mode, value in (("rgb", "RGB", (90, 80, 70)), ("depth", "I;16", 5000)):
-        (tmp_path / kind).mkdir()
+        (tmp_path / kind).mkdir(parents=True)
         for t in range(2):
             picture = Image.new(mode, (640, 480), value)
             picture.putpixel((0, 0), (0, 0, 0) if mode == "RGB" else 0)

@@ -135,7 +135,8 @@ def changed(path, gaussians, **columns):
     """A PLY of these Gaussians with some properties replaced, by name, in their own types."""
     write_ply(path, gaussians)
     old = PlyData.read(str(path), mmap=False)["vertex"].data
-    types = {name: np.asarray(columns.get(name, old[name])).dtype for name in (*old.dtype.names, *columns)}
+    types = {name: old.dtype[name] for name in old.dtype.names}
+    types |= {name: column.dtype for name, column in columns.items()}
     new = np.empty(gaussians.num, list(types.items()))
     for name in types:
         new[name] = columns[name] if name in columns else old[name]
