@@ -11,6 +11,7 @@ from jaxtyping import Int
 from rich.console import Console
 from rich.progress import track
 
+from gsjax.data.origin import relative_to_origin
 from gsjax.data.photographs import Photographs
 from gsjax.engine.fit.judge import Compared, Judge, write_panel
 from gsjax.engine.folder import replaced_folder
@@ -89,8 +90,9 @@ def run(options: Options) -> int:
         record = read_record(options.run)
         _check(record)
         weights = None if options.lpips_weights is None else load_lpips(options.lpips_weights)
-        gaussians, _ = read_ply(record.path / "scene.ply")
+        gaussians, report = read_ply(record.path / "scene.ply")
         photographs, indices, held_out = _choose(options, record)
+        photographs = relative_to_origin(photographs, report.origin)
         frames = read_frames(photographs.select(indices.tolist()), console)
         folder, rows = record.path / EVALUATION.parent, []
         with replaced_folder(folder, _WRITTEN) as new:

@@ -10,7 +10,7 @@ import tyro
 from rich.console import Console
 
 from gsjax.engine.deform.file import NAME as DEFORMATION
-from gsjax.engine.deform.file import read_deformation, warn_of_partial
+from gsjax.engine.deform.file import origin_of, read_deformation, warn_of_partial
 from gsjax.engine.deform.query import QueryableScene, label_everything
 from gsjax.engine.distill.file import FOLDER
 from gsjax.engine.distill.query import QueryableField
@@ -205,9 +205,10 @@ def _query_deformation(options: Options, console: Console) -> None:
             raise ValueError(f"--{option}: expected a TEXT too, found none; leave out --{option} or give one")
     with Notes(console) as notes:
         with stage(console, "reading the scene"):
-            result = read_deformation(options.run / DEFORMATION)
+            file = options.run / DEFORMATION
+            result, origin = read_deformation(file), origin_of(file)
         warn_of_partial(options.run, notes)
-        scene = QueryableScene(options.run, result, options.weights)
+        scene = QueryableScene(options.run, result, options.weights, origin)
         if ways:
             info = answer(scene, question, folder, notes, console)
         else:

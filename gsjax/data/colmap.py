@@ -22,6 +22,7 @@ from scipy.spatial.transform import Rotation
 from gsjax.data.errors import DataError, DataWarning
 from gsjax.data.files import picture_size, read_image, read_mask
 from gsjax.data.lens import Lens, scaled_intrinsics, undistort
+from gsjax.data.origin import near_origin
 from gsjax.data.photographs import Cloud, Photographs
 
 PLACES = ("sparse/0", "sparse", "colmap/sparse/0", ".")
@@ -61,6 +62,7 @@ class _Image(NamedTuple):
     viewmat: Float[np.ndarray, "4 4"]
 
 
+@near_origin
 def read_colmap(path: str | Path, images: str = "images") -> Photographs:
     """The registered photographs of a reconstruction, sorted by name, and its points.
 

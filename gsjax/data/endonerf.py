@@ -28,6 +28,7 @@ from gsjax.data.frame_folders import (
     warn_about_single_frame,
 )
 from gsjax.data.objects import Truth
+from gsjax.data.origin import near_origin, relative_to_origin
 from gsjax.data.sequence import Sequence
 from gsjax.data.tool_masks import LABEL_NAMES, TOOL, Tool, check_tool, find_masks, tool_labels
 
@@ -38,6 +39,7 @@ RIGHT = "right"
 _BOUNDS_OFF_BY = 5.0  # a ratio larger than this indicates another unit
 
 
+@near_origin
 def read_endonerf(
     path: str | Path,
     *,
@@ -83,7 +85,8 @@ def read_endonerf(
     """
     _expect_options(depth_unit_m, pose_unit_m, baseline_m, depth_percentiles)
     root = Path(path)
-    rows = poses_bounds.read_llff(root, axes, images)
+    # Relative to no origin until the unit is known.
+    rows = relative_to_origin(poses_bounds.read_llff(root, axes, images), None)
     frames = pictures(root / images)
     width, height = check_one_size(frames)
     meta = _read_meta(root)

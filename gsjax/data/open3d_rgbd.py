@@ -20,6 +20,7 @@ from gsjax.data.errors import DataError, DataWarning
 from gsjax.data.files import image_size, read_depth, read_image
 from gsjax.data.frame_folders import DEFAULT_RATE_HZ
 from gsjax.data.lens import intrinsics_matrix
+from gsjax.data.origin import near_origin
 from gsjax.data.sequence import Sequence
 from gsjax.data.validation import check_poses
 
@@ -43,6 +44,7 @@ def is_open3d(root: Path) -> bool:
     )
 
 
+@near_origin
 def read_open3d(
     path: str | Path,
     K: Float[np.ndarray, "3 3"] | tuple[float, float, float, float],

@@ -69,5 +69,6 @@ def sequence_of(photographs: Photographs) -> Sequence:
         load_depth=(lambda t, c: photographs.depth(order[t])) if has_depth else None,
         label_names=LABEL_NAMES if has_masks else {},
         near=photographs.near,
+        origin=photographs.origin,
         locate=locate and (lambda kind, t, c: locate(kind, order[t])),
     )

@@ -22,6 +22,7 @@ from gsjax.data.errors import DataError, DataWarning
 from gsjax.data.files import SATURATED_DEPTH, read_arrays, read_depth, read_image, read_json, read_mask
 from gsjax.data.frame_folders import DEFAULT_RATE_HZ
 from gsjax.data.objects import Truth
+from gsjax.data.origin import near_origin
 from gsjax.data.sequence import Sequence
 from gsjax.data.validation import check_intrinsics, check_poses
 from gsjax.geometry.joints import Joint
@@ -34,6 +35,7 @@ META_NAMES = ("train_meta.json", "test_meta.json")
 _ADVICE_META = "Correct the file, or remove that frame or camera from it."
 
 
+@near_origin
 def read_panoptic(path: str | Path) -> Sequence:
     """The sequence in a folder of this layout, with the cameras of both metas in the order in which they are
     listed.

@@ -62,6 +62,8 @@ class Photographs:
         background: RGB, 0 to 1, composited behind transparent photographs; None if none is transparent.
         near: near clipping distance, in the data's unit.
         locate: (kind, i) -> path of a file, for messages; kind is "image", "mask", "labels" or "depth".
+        origin: where the data lie far from 0, what poses and points are relative to, in the coordinates of
+            the files, [3] float64; None if they are as in the files.
 
     Raises:
         ValueError: shapes disagree, a pose is not a rigid motion, or there is no photograph.
@@ -83,6 +85,7 @@ class Photographs:
     background: tuple[float, float, float] | None = None
     near: float = NEAR
     locate: Callable[[str, int], str] | None = field(default=None, repr=False)
+    origin: Float[np.ndarray, "..."] | None = None
 
     def __post_init__(self):
         count = len(self.names)
@@ -91,6 +94,8 @@ class Photographs:
         check_shape("sizes", self.sizes, (count, 2))
         check_shape("Ks", self.Ks, (count, 3, 3))
         check_shape("viewmats", self.viewmats, (count, 4, 4))
+        if self.origin is not None:
+            check_shape("origin", self.origin, (3,))
         for name in ("times", "splits"):
             if getattr(self, name) is not None:
                 check_shape(name, np.asarray(getattr(self, name)), (count,))
@@ -248,5 +253,6 @@ def photographs_of(sequence: Sequence) -> Photographs:
         label_names=sequence.names_of_labels,
         times=np.repeat(sequence.times, cameras) if frames > 1 else None,
         near=sequence.near,
+        origin=sequence.origin,
         locate=lambda kind, i: sequence.where("mask" if kind == "labels" else kind, *views[i]),
     )

@@ -15,6 +15,7 @@ from gsjax.data.errors import DataError
 from gsjax.data.files import picture_size, read_arrays, read_image
 from gsjax.data.frame_folders import pictures
 from gsjax.data.lens import scaled_intrinsics
+from gsjax.data.origin import near_origin
 from gsjax.data.photographs import Photographs
 from gsjax.data.sequence import Sequence
 from gsjax.data.validation import check_poses
@@ -32,6 +33,7 @@ _TO_OPENCV = {
 }
 
 
+@near_origin
 def read_llff(path: str | Path, axes: Axes, images: str = "images") -> Photographs:
     """Photographs sorted by name, one per row of poses_bounds.npy.
 
@@ -63,6 +65,7 @@ def read_llff(path: str | Path, axes: Axes, images: str = "images") -> Photograp
     )
 
 
+@near_origin
 def read_dynerf(path: str | Path, axes: Axes = "llff") -> Sequence:
     """A DyNeRF scene (Li et al. 2022): cam00.mp4, cam01.mp4, ..., one per row of poses.
 

@@ -18,6 +18,7 @@ from gsjax.data.association import associate
 from gsjax.data.errors import DataError
 from gsjax.data.files import read_arrays, read_json
 from gsjax.data.objects import PointModel
+from gsjax.data.origin import near_origin
 from gsjax.data.sequence import Sequence
 from gsjax.data.video import Video
 from gsjax.geometry.cameras import viewmat_from_opengl
@@ -34,6 +35,7 @@ BLOCK_LABEL = 1
 _HALF_PIXEL = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
 
 
+@near_origin
 def read_push_t(path: str | Path, demo: int = 0, *, max_skew: float = MAX_SKEW_S) -> Sequence:
     """Demonstration `demo` of a push-T folder. Cameras are numbered from 0 in the order of cameras.json.
 

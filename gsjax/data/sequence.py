@@ -50,6 +50,8 @@ class Sequence:
             are invalid in `depth`.
         near: near clipping distance, metres.
         locate: (kind, t, c) -> path of a file, for messages; kind is "image", "depth", "mask" or "flow".
+        origin: where the data lie far from 0, what all places are relative to, in the coordinates of the
+            files, [3] float64; None if they are as in the files.
 
     Raises:
         ValueError: shapes disagree, a pose is not a rigid motion, or times do not increase.
@@ -73,6 +75,7 @@ class Sequence:
     float_images: bool = False
     near: float = NEAR
     locate: Callable[[str, int, int], str] | None = field(default=None, repr=False)
+    origin: Float[np.ndarray, "..."] | None = None
 
     def __post_init__(self):
         for name in ("times", "Ks", "viewmats"):
@@ -87,6 +90,8 @@ class Sequence:
         check_shape("frame_ids", np.asarray(self.frame_ids), (frames,))
         check_shape("Ks", self.Ks, (frames, cameras, 3, 3))
         check_shape("viewmats", self.viewmats, (frames, cameras, 4, 4))
+        if self.origin is not None:
+            check_shape("origin", self.origin, (3,))
         check_intrinsics(self.Ks, self._camera_in_frame)
         check_poses("viewmat", self.viewmats, self._camera_in_frame, _POSE_ADVICE)
         if self.truth is not None:

@@ -20,6 +20,7 @@ from jaxtyping import Float
 
 from gsjax.data.errors import DataError, DataWarning
 from gsjax.data.files import read_depth, read_image
+from gsjax.data.origin import near_origin
 from gsjax.data.sequence import Sequence
 from gsjax.data.validation import check_poses
 from gsjax.geometry.cameras import intrinsics
@@ -35,6 +36,7 @@ _MICROSOFT_NAN = re.compile(r"-?\d\.#(?:IND|QNAN|SNAN|INF)\w*(?:[+-]\d+)?")
 _FRAME = re.compile(r"frame-(\d+)\.pose\.txt")
 
 
+@near_origin
 def read_seven_scenes(path: str | Path, *, register: bool = True) -> Sequence:
     """The sequence in a folder of this layout (such as seq-01 of a scene): one camera, 0; times are frame
     numbers at 30 Hz.

@@ -23,6 +23,7 @@ from gsjax.data.clouds import read_cloud
 from gsjax.data.errors import DataError, DataWarning
 from gsjax.data.files import picture_size, read_depth, read_json, read_mask, read_rgba
 from gsjax.data.lens import Lens, scaled_intrinsics, undistort
+from gsjax.data.origin import near_origin
 from gsjax.data.photographs import Photographs
 from gsjax.data.validation import check_poses
 from gsjax.geometry.cameras import intrinsics, viewmat_from_opengl
@@ -47,6 +48,7 @@ class _Frame(NamedTuple):
     time: float | None
 
 
+@near_origin
 def read_transforms(
     path: str | Path,
     *,

@@ -21,6 +21,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from gsjax.data.association import associate
 from gsjax.data.errors import DataError, DataWarning
 from gsjax.data.files import image_size, read_depth, read_image
+from gsjax.data.origin import near_origin
 from gsjax.data.sequence import Sequence
 from gsjax.geometry.distortion import undistort_map
 
@@ -48,6 +49,7 @@ _COMPLETE = "Check the folder; was it copied completely?"
 _UNIT_TOLERANCE = 0.01  # on a quaternion's length: files have four digits
 
 
+@near_origin
 def read_tum(
     path: str | Path,
     K: Float[np.ndarray, "3 3"] | None = None,

@@ -4,18 +4,20 @@ advice of error messages if a file is not as it was written."""
 import zipfile
 import zlib
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
+import equinox as eqx
 import numpy as np
 import yaml
+from jaxtyping import Float, Int
 
 from gsjax.data import ReadOptions
 from gsjax.data.errors import DataError
-from gsjax.engine.messages import Notes
+from gsjax.data.origin import relative_to_origin
 from gsjax.engine.recording import Opener, Recording, open_recording
-from gsjax.io.ply import PlyReport, read_ply
+from gsjax.io.ply import PlyReport, read_ply, write_ply
 from gsjax.scene.gaussians import Gaussians
 
 _SETTINGS = ("dataset", "cameras", "frames")
@@ -82,23 +84,44 @@ def check_arrays(
     return sizes
 
 
-def read_drawable(file: Path, notes: Notes) -> tuple[Gaussians, PlyReport]:
-    """The drawable Gaussians of a PLY file, and what else it held; warns of those that cannot be drawn.
+def write_scene(
+    path: Path,
+    gaussians: Gaussians,
+    labels: Int[np.ndarray, "n"] | None = None,
+    *,
+    origin: Float[np.ndarray, "3"] | None = None,
+    antialiased: bool = False,
+) -> None:
+    """Write Gaussians as a PLY that any viewer of 3DGS reads: without their features.
+
+    Args:
+        path: the file.
+        gaussians: the Gaussians.
+        labels: their labels, for a file beside it.
+        origin, antialiased: as for `write_ply`.
+    """
+    if gaussians.features is not None:
+        gaussians = eqx.tree_at(lambda g: g.features, gaussians, None)
+    write_ply(path, gaussians, labels=labels, origin=origin, antialiased=antialiased)
+
+
+def read_drawable(file: Path) -> tuple[Gaussians, PlyReport]:
+    """The drawable Gaussians of a PLY file, and what else it held.
 
     Raises:
         FileNotFoundError, PlyError: as for `read_ply`.
         ValueError: it holds none.
     """
     gaussians, report = read_ply(file)
-    if report.culled:
-        notes.warn(f"{file}: {report.culled} of {report.stored} Gaussians cannot be drawn and are left out")
     if gaussians.num == 0:
         raise ValueError(f"{file}: expected Gaussians, found none that can be drawn")
     return gaussians, report
 
 
-def read_scene(path: Path, count: int, arrays: str, again: str) -> Gaussians:
-    """The Gaussians of a run's scene.ply.
+def read_scene(
+    path: Path, count: int, arrays: str, again: str
+) -> tuple[Gaussians, Float[np.ndarray, "3"] | None]:
+    """The Gaussians of a run's scene.ply, and the origin that they are relative to, if they are far from 0.
 
     Args:
         path: folder of the run.
@@ -113,7 +136,13 @@ def read_scene(path: Path, count: int, arrays: str, again: str) -> Gaussians:
     if gaussians.num != count or report.stored != count:
         found = f"{gaussians.num} drawable Gaussians of {report.stored} in scene.ply"
         raise ValueError(f"{path}: expected {count} Gaussians as in {arrays}, found {found}; {again}")
-    return gaussians
+    return gaussians, report.origin
+
+
+def about_scene(recording: Recording, origin: Float[np.ndarray, "3"] | None) -> Recording:
+    """A recording relative to the origin of its scene."""
+    tracked, judged = (relative_to_origin(each, origin) for each in (recording.tracked, recording.judged))
+    return replace(recording, tracked=tracked, judged=judged)
 
 
 def reopen(

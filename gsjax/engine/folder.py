@@ -15,12 +15,13 @@ import yaml
 
 from gsjax.engine.locks import LOCK, lock, locked
 from gsjax.io.atomic import atomic_write, write_json, write_npz
+from gsjax.io.labels import ENDING
 
 _WRITTEN = (
     *("config.yml", "metrics.json", "metrics.jsonl", "report.html", "trajectory.npz", "scene.ply"),
     *("cameras.npz", "poses.npz", "parts.npz", "field.npz", "deformation.npz", "video_*.mp4", ".*.partial*"),
     *("canonical", "renders", "plots", "query", "grasp", "eval", "edit", "field", "tensorboard", "test"),
-    "resume",
+    *("scene_labels.npz", "resume"),
 )
 """All that a run, and what is made from it, writes into its folder; `screenshots` are kept."""
 _VALUABLE = (
@@ -31,7 +32,7 @@ _VALUABLE = (
 _RESUMED = ("resume/*", "canonical/resume/*", "canonical/scene.ply")
 """What a run resumes from; `gsjax parts` contains a fit, which may be all that is there."""
 OF_QUERY = ("query.json", "selection.npz", "masks", "frames", "video.mp4", "overview.png")
-OF_QUERY += ("object.ply", "without.ply", "recolored.ply", "moved.ply")
+OF_QUERY += ("object.ply", "without.ply", "recolored.ply", "moved.ply", f"*{ENDING}")
 """The files that `gsjax query` writes."""
 SIGNATURE = "# gsjax run"  # the first line of config.yml: other programs write files of that name too
 
@@ -88,7 +89,8 @@ class RunFolder:
                                   centres [P,3], R [T,P,3,3], t [T,P,3], times [T]
           field.npz               of `gsjax distill`: features of places, and what they mean
           deformation.npz         of `gsjax deform`: the canonical scene, its features, and its motion
-          scene.ply               the Gaussians: of a fit, or of the first (or canonical) frame with labels
+          scene.ply               the Gaussians: of a fit, or of the first (or canonical) frame
+          scene_labels.npz        labels [N] of these, where there are any
           canonical/              of `gsjax parts`: the fit of its canonical frame, a run of its own
           cameras.npz             of a fit that learned them: names [V], viewmats [V,4,4], exposures [V,3,4]
           poses.npz               of `gsjax deform --deform.refine-poses`: viewmats [T,4,4] as refined

@@ -15,11 +15,13 @@ from gsjax.data.errors import MissingFile
 from gsjax.data.open import is_photographs, is_recording
 from gsjax.engine.folder import expect_dataset
 from gsjax.engine.info_picture import by_camera, by_split, write_picture
+from gsjax.engine.info_scene import describe_scene
 from gsjax.engine.messages import Notes
 from gsjax.engine.options import Common, OneDataset, Reading
 from gsjax.engine.summary import Column, Table
 from gsjax.engine.terminal import print_facts, print_table
 from gsjax.methods.fit import extent_of
+from gsjax.scene.origin import in_world
 
 PICTURES = (".png", ".svg", ".pdf")
 MOST_LABELS, MOST_CAMERAS = 8, 6  # in the table of masks
@@ -43,6 +45,13 @@ def run(options: Options) -> int:
         raise ValueError(
             f"--picture: expected a name that ends in {', '.join(PICTURES)}, found {options.picture.name!r}"
         )
+    if (file := Path(options.dataset)).suffix.lower() == ".ply" and file.is_file():
+        if options.picture is not None:
+            raise ValueError(f"--picture: draws cameras, and {file} has none; leave it out")
+        with Notes(Console(stderr=True, highlight=False)):
+            facts = describe_scene(file)
+        print_facts(facts, title=file.name)
+        return 0
     expect_dataset(options.dataset)
     table = None
     with Notes(Console(stderr=True, highlight=False)):
@@ -71,7 +80,7 @@ def describe_photographs(photographs: Photographs) -> dict[str, str]:
     """Facts about photographs; opens nothing but the first depth image."""
     sizes = Counter(map(tuple, photographs.sizes.tolist()))
     extent = extent_of(photographs.viewmats)
-    focus = ", ".join(f"{value:.2f}" for value in extent.focus)
+    focus = ", ".join(f"{value:.2f}" for value in in_world(np.asarray(extent.focus), photographs.origin))
     times, splits, cloud = photographs.times, photographs.splits, photographs.cloud
     listed = [f"{w} x {h}" + (f" ({n})" if len(sizes) > 1 else "") for (w, h), n in sizes.most_common(4)]
     depth = "none"
@@ -84,12 +93,18 @@ def describe_photographs(photographs: Photographs) -> dict[str, str]:
         "size": ", ".join([*listed, *(["..."] if len(sizes) > 4 else [])]),
         "view": _fields_of_view(photographs.sizes[:, 0], photographs.Ks),
         "cameras": f"within {extent.radius:.2f} of their middle, looking at ({focus})",
+        **_origin(photographs.origin),
         "splits": ", ".join(f"{n} {name}" for name, n in Counter(splits or ()).items()) or "none",
         "points": "none" if cloud is None else f"{len(cloud.points):,}",
         "depth": depth,
         "masks": "none" if photographs.load_mask is None else "yes",
         "times": "none" if times is None else f"{times.min():.3f} to {times.max():.3f} s",
     }
+
+
+def _origin(origin: Float[np.ndarray, "3"] | None) -> dict[str, str]:
+    """The fact about data that lie far from 0; none for others."""
+    return {} if origin is None else {"origin": f"({', '.join(f'{value:.12g}' for value in origin)})"}
 
 
 def first_masks(sequence: Sequence) -> dict[int, np.ndarray]:
@@ -114,6 +129,7 @@ def describe_sequence(sequence: Sequence, masks: dict[int, np.ndarray]) -> dict[
     labels = ", ".join(map(str, _labels(masks))) or "none but the background"
     return {
         "cameras": f"{len(ids)}: {', '.join(map(str, ids))} ({movement})",
+        **_origin(sequence.origin),
         "image": f"{width} x {sequence.height}, {_fields_of_view(width, sequence.Ks[0])}",
         "frames": f"{sequence.num_frames}, numbered {sequence.frame_ids[0]} to {sequence.frame_ids[-1]}",
         "times": times,

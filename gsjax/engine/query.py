@@ -19,13 +19,14 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 from rich.console import Console
 
+from gsjax.engine.files import write_scene
 from gsjax.engine.folder import OF_QUERY, replaced_folder
 from gsjax.engine.messages import Notes
 from gsjax.io.atomic import write_json, write_new, write_npz
 from gsjax.io.pictures import write_png
-from gsjax.io.ply import write_ply
 from gsjax.methods.query import Prompt, Threshold
 from gsjax.scene.gaussians import Gaussians
+from gsjax.scene.origin import in_world
 from gsjax.scene.selection import only, shifted, tinted
 from gsjax.viz.viewer import Answer, Asking
 
@@ -137,6 +138,8 @@ class Queryable(ABC):
         rows: row of the scene's file of each Gaussian.
         num_rows: number of rows in that file, including Gaussians that cannot be drawn.
         labels: label of each Gaussian; None without.
+        origin: what places are relative to, where the scene lies far from 0.
+        antialiased: whether the scene is drawn antialiased.
         frame_ids: numbers of the frames; None of a scene that stands still.
     """
 
@@ -146,6 +149,8 @@ class Queryable(ABC):
     rows: Int[np.ndarray, "n"]
     num_rows: int
     labels: Int[np.ndarray, "n"] | None = None
+    origin: Float[np.ndarray, "3"] | None = None
+    antialiased: bool = False
     frame_ids: tuple[int, ...] | None = None
 
     @abstractmethod
@@ -247,11 +252,11 @@ def answer(
         _write_selection(new / "selection.npz", run, gaussians, found)
         for name, kept in (("object", selected), ("without", ~selected)):
             if kept.any():
-                _write_part(new / f"{name}.ply", gaussians, kept, run.labels)
+                _write_part(new / f"{name}.ply", run, gaussians, kept)
         for name, scene in question.changed(gaussians, selected).items():
-            write_ply(new / f"{name}.ply", scene, labels=run.labels)
+            _write_part(new / f"{name}.ply", run, scene)
         pixels = run.draw(new, found, notes, console)
-        means = np.asarray(gaussians.means)[selected]
+        means = in_world(np.asarray(gaussians.means)[selected], run.origin)
         info = {
             "text": question.text,
             "point": question.point,
@@ -300,7 +305,7 @@ def asking_of(run: Queryable) -> Asking:
         stem = "_".join(re.findall(r"[^\W_]+", called.lower())) or "selection"
         files = (folder / (f"{stem}.ply" if number == 1 else f"{stem}_{number}.ply") for number in count(1))
         gaussians = run.at(frame)
-        return write_new(files, lambda path: _write_part(path, gaussians, selected, run.labels))
+        return write_new(files, lambda path: _write_part(path, run, gaussians, selected))
 
     return Asking(run.hint, ask, like, save)
 
@@ -338,16 +343,19 @@ def _write_selection(path: Path, run: Queryable, gaussians: Gaussians, found: Se
     selected, scores = found.selected, found.scores.astype(np.float32)
     all_scores = np.full(run.num_rows, np.nan, np.float32)
     all_scores[run.rows] = scores
-    means = np.asarray(gaussians.means)[selected]
+    means = in_world(np.asarray(gaussians.means)[selected], run.origin)
     arrays = {"indices": run.rows[selected], "scores": scores[selected], "means": means}
     write_npz(path, arrays | {"all_scores": all_scores})
 
 
 def _write_part(
-    path: Path, gaussians: Gaussians, kept: Bool[np.ndarray, "n"], labels: Int[np.ndarray, "n"] | None
+    path: Path, run: Queryable, gaussians: Gaussians, kept: Bool[np.ndarray, "n"] | None = None
 ) -> None:
-    """Writes some Gaussians as a PLY file, with their labels where there are any."""
-    write_ply(path, only(gaussians, kept), labels=None if labels is None else labels[kept])
+    """Writes some Gaussians (default: all) as a PLY file, with their labels where there are any."""
+    labels = run.labels
+    if kept is not None:
+        gaussians, labels = only(gaussians, kept), None if labels is None else labels[kept]
+    write_scene(path, gaussians, labels, origin=run.origin, antialiased=run.antialiased)
 
 
 def _spaced(numbers: tuple[float, ...]) -> str:

@@ -8,9 +8,10 @@ import numpy as np
 import yaml
 
 from gsjax.data.ordered import open_as_sequence
+from gsjax.data.origin import relative_to_origin
 from gsjax.data.photographs import Photographs
 from gsjax.engine.deform.file import NAME as DEFORMATION
-from gsjax.engine.deform.file import read_deformation
+from gsjax.engine.deform.file import origin_of, read_deformation
 from gsjax.engine.deform.query import QueryableScene, probabilities_of
 from gsjax.engine.distill.file import NAME
 from gsjax.engine.distill.query import QueryableField
@@ -49,8 +50,9 @@ def open_viewable(path: Path, notes: Notes, now: Whereabouts = AS_IT_WAS) -> tup
         if path.suffix.lower() != ".ply":
             raise ValueError(f"{path}: expected a PLY file or the folder of a run, found another file")
         _expect_only((), now, f"{path} is a PLY file")
-        gaussians, report = read_drawable(path, notes)
-        return Viewable(path.name, gaussians, report.labels), path.absolute().parent
+        gaussians, report = read_drawable(path)
+        viewable = Viewable(path.name, gaussians, report.labels, antialiased=report.antialiased)
+        return viewable, path.absolute().parent
     if not path.is_dir():
         raise FileNotFoundError(f"{path}: expected a run or a PLY file, found nothing there; check the path")
     if (path / NAME).is_file():
@@ -119,17 +121,17 @@ def _of_fit(path: Path, notes: Notes, now: Whereabouts) -> Viewable:
     """The scene of a run of `gsjax fit`, with its field, and its photographs if they are still there."""
     field, config = _field_of_fit(path, notes, now), path / "config.yml"
     if field is None:
-        gaussians, report = read_drawable(path / "scene.ply", notes)
-        labels = report.labels
+        gaussians, report = read_drawable(path / "scene.ply")
+        labels, origin = report.labels, report.origin
     else:
-        gaussians, labels = field.gaussians, field.labels
+        gaussians, labels, origin = field.gaussians, field.labels, field.origin
     try:
         settings = yaml.safe_load(config.read_text(encoding="utf-8"))
         antialiased = bool(settings["fit"]["antialiased"])
         behind = settings["fit"]["background"]
         shots, photographs = None, None
         try:
-            photographs = photographs_of_run(settings, now.images)
+            photographs = relative_to_origin(photographs_of_run(settings, now.images), origin)
             shots = _shots_of(photographs)
         except (ValueError, OSError) as error:
             notes.warn(f"its photographs are not shown: {describe(error)}")
@@ -158,7 +160,7 @@ def _of_deformation(path: Path, notes: Notes, weights: Path | None) -> Viewable:
         raise ValueError(f"--weights: {path} has no CLIP features; leave it out")
     first, labels, asking, times = result.at(0.0), None, None, result.timeline.times
     if result.meaning is not None and first.features is not None:
-        asking = asking_of(QueryableScene(path, result, weights))
+        asking = asking_of(QueryableScene(path, result, weights, origin_of(path / DEFORMATION)))
         likely = probabilities_of(first.features, jnp.asarray(result.meaning.codebook, jnp.float32))
         labels = 1 + most_likely(np.asarray(likely))
     return Viewable(

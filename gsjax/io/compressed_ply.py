@@ -49,20 +49,29 @@ def is_compressed(ply: PlyData) -> bool:
     return not set(PACKED).isdisjoint(ply["vertex"].data.dtype.names or ())
 
 
-def decompress(ply: PlyData) -> Gaussians:
+def positions(ply: PlyData) -> Float[np.ndarray, "N 3"]:
+    """The places of the Gaussians of a compressed PLY in which `find_fault` finds nothing, float64."""
+    fractions = _fractions(ply["vertex"].data["packed_position"], (11, 10, 11))
+    return _in_range(ply["chunk"].data, _POSITION, fractions)
+
+
+def decompress(ply: PlyData, means: Float[np.ndarray, "N 3"]) -> Gaussians:
     """The Gaussians of a compressed PLY in which `find_fault` finds nothing, float32.
 
     Colours and opacities are stored after activation, so they (and scales) are clamped by
     `gaussians_from_activated`: stored opacities of 0 and 255 get finite logits.
+
+    Args:
+        ply: the file.
+        means: its `positions`, perhaps relative to an origin.
     """
     chunks, vertices = ply["chunk"].data, ply["vertex"].data
-    positions = _fractions(vertices["packed_position"], (11, 10, 11))
     log_scales = _fractions(vertices["packed_scale"], (11, 10, 11))
     colors, opacities = np.split(_fractions(vertices["packed_color"], (8, 8, 8, 8)), [3], axis=1)
     if "min_r" in chunks.dtype.names:
         colors = _in_range(chunks, _COLOR, colors)
     return gaussians_from_activated(
-        _in_range(chunks, _POSITION, positions),
+        means,
         _quats(vertices["packed_rotation"]),
         np.exp(_in_range(chunks, _SCALE, log_scales)),
         opacities[:, 0],

@@ -1,22 +1,31 @@
 """Gaussians as PLY files in the 3DGS layout (Kerbl et al. 2023), which most viewers and trainers read.
 
 One vertex per Gaussian: x y z, nx ny nz (zeros), f_dc_0..2, f_rest_* channel-major (all of red, then green,
-then blue), opacity as a logit, scale_0..2 as logarithms, rot_0..3 as w x y z. gsjax adds feature_* and label
-if a scene has them; other readers ignore both. PlayCanvas's compressed PLY can be read, but not written.
+then blue), opacity as a logit, scale_0..2 as logarithms, rot_0..3 as w x y z. gsjax adds feature_* if a scene
+has them. Labels lie in a file beside it (`gsjax.io.labels`), because other readers trip over integers.
+PlayCanvas's compressed PLY can be read, but not written.
+
+That a scene is to be drawn antialiased (Mip-Splatting) is said in a comment of the header: Brush and
+splat-transform write "SplatRenderMode: mip", Postshot "antialiased 1"; the last such line counts.
 """
 
 import os
-from dataclasses import dataclass
+import re
+import warnings
+from collections.abc import Iterable
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Int, Integer
+from jaxtyping import Bool, Float, Int, Integer
 from plyfile import PlyData, PlyElement, PlyParseError
 
 from gsjax.io.atomic import atomic_write
-from gsjax.io.compressed_ply import PACKED, decompress, find_fault, is_compressed
-from gsjax.scene.gaussians import SH_SIZES, Gaussians, take, valid_rows
+from gsjax.io.compressed_ply import PACKED, decompress, find_fault, is_compressed, positions
+from gsjax.io.labels import labels_beside, read_labels, write_labels
+from gsjax.scene.gaussians import FLAT, OPAQUE, SH_SIZES, Gaussians, take, valid_rows
+from gsjax.scene.origin import far_origin, in_words, in_world
 
 _REQUIRED = (
     *("x", "y", "z"),
@@ -25,8 +34,12 @@ _REQUIRED = (
     *(f"scale_{i}" for i in range(3)),
     *(f"rot_{i}" for i in range(4)),
 )
+_PLACE = ("x", "y", "z")
 _NORMALS = ("nx", "ny", "nz")
 _REST_COUNTS = tuple(3 * (size - 1) for size in SH_SIZES)
+_ANTIALIASED = "SplatRenderMode: mip"
+_MODES = re.compile(r"\s*(?:splatrendermode\s*:\s*(\w+)|antialiased\s+([01])|train_flags\b(.*))\s*$", re.I)
+_LOST = 0.01  # of a Gaussian's size: steps of float32 that are larger lose its place
 
 
 class PlyError(ValueError):
@@ -42,10 +55,15 @@ class PlyReport:
 
     Attributes:
         stored: number of rows in the file.
-        culled: number of rows left out because of a NaN, an infinity or a zero quaternion.
+        culled: number of rows left out because of a NaN, a zero quaternion, or an infinity without meaning.
         extra: properties that were not read.
         rows: row in the file of each returned Gaussian, [N].
         labels: int32 label of each returned Gaussian, [N]; None if the file has no labels.
+        invisible: number of rows left out because their opacity is 0, a logit of -inf.
+        origin: what was taken off the means because they lie far from 0, where float32 cannot hold them; None
+            if they are as in the file.
+        places: of the returned Gaussians as in the file, float64 [N,3].
+        antialiased: whether a comment says that the scene is to be drawn antialiased.
     """
 
     stored: int
@@ -53,23 +71,34 @@ class PlyReport:
     extra: tuple[str, ...]
     rows: Int[np.ndarray, "N"]
     labels: Int[np.ndarray, "N"] | None = None
+    invisible: int = 0
+    origin: Float[np.ndarray, "3"] | None = None
+    places: Float[np.ndarray, "N 3"] = field(default_factory=lambda: np.zeros((0, 3)), repr=False)
+    antialiased: bool = False
 
 
 def write_ply(
-    path: str | os.PathLike, gaussians: Gaussians, *, labels: Integer[np.ndarray, "labels"] | None = None
+    path: str | os.PathLike,
+    gaussians: Gaussians,
+    *,
+    labels: Integer[np.ndarray, "labels"] | None = None,
+    origin: Float[np.ndarray, "3"] | None = None,
+    antialiased: bool = False,
 ) -> None:
-    """Write Gaussians (and their `labels`) as a binary little-endian PLY of float32, atomically.
+    """Write Gaussians as a binary little-endian PLY of float32, atomically.
 
     Args:
         path: the file.
         gaussians: the Gaussians, on the host or a device.
-        labels: integers [N], written as a property `label`.
+        labels: integers [N], written to a file beside it: NAME_labels.npz of NAME.ply. Without labels, such a
+            file of an earlier scene is removed.
+        origin: what means are relative to (`PlyReport.origin`, `Photographs.origin`); it is put back. Where
+            float32 would then lose places, x y z are of type double.
+        antialiased: say in a comment that the scene is to be drawn antialiased.
 
     Raises:
         ValueError: `labels` is not one integer per Gaussian.
     """
-    columns = _columns(gaussians)
-    fields = [(name, "<f4") for name in columns]
     if labels is not None:
         labels = np.asarray(labels)
         if labels.shape != (gaussians.num,) or not np.issubdtype(labels.dtype, np.integer):
@@ -77,20 +106,34 @@ def write_ply(
                 f"labels: expected integers of shape [{gaussians.num}], found {labels.dtype} of shape "
                 f"{labels.shape}"
             )
-        columns["label"] = labels
-        fields.append(("label", "<i4"))
+    columns = _columns(gaussians, origin)
+    kind = "<f8" if _is_lost(columns, origin) else "<f4"
+    fields = [(name, kind if name in _PLACE else "<f4") for name in columns]
     vertices = np.empty(gaussians.num, dtype=fields)
     for name, column in columns.items():
         vertices[name] = column
+    comments, element = [_ANTIALIASED] if antialiased else [], PlyElement.describe(vertices, "vertex")
+    labels_beside(path).unlink(missing_ok=True)  # before the scene, with which they would not fit
     with atomic_write(path) as temporary:
-        PlyData([PlyElement.describe(vertices, "vertex")], byte_order="<").write(str(temporary))
+        PlyData([element], byte_order="<", comments=comments).write(str(temporary))
+    if labels is not None:
+        write_labels(path, labels)
 
 
-def _columns(gaussians: Gaussians) -> dict[str, np.ndarray]:
+def _is_lost(columns: dict[str, np.ndarray], origin: Float[np.ndarray, "3"] | None) -> bool:
+    """Whether float32 would move Gaussians by more than a small part of their size."""
+    if origin is None or not len(columns["x"]):
+        return False
+    reach = np.float32(max(np.abs(columns[axis]).max() for axis in _PLACE))
+    scales = np.exp(np.median([columns[f"scale_{i}"] for i in range(3)], axis=0))
+    return bool(np.spacing(reach) > _LOST * np.median(scales))
+
+
+def _columns(gaussians: Gaussians, origin: Float[np.ndarray, "3"] | None) -> dict[str, np.ndarray]:
     """The float properties of a file, by name, in the order of 3DGS."""
-    means, quats = np.asarray(gaussians.means), np.asarray(gaussians.quats)
+    means, quats = in_world(np.asarray(gaussians.means), origin), np.asarray(gaussians.quats)
     sh0, log_scales = np.asarray(gaussians.sh0)[:, 0], np.asarray(gaussians.log_scales)
-    columns = dict(zip("xyz", means.T, strict=True))
+    columns = dict(zip(_PLACE, means.T, strict=True))
     columns |= {name: np.zeros(gaussians.num) for name in _NORMALS}
     columns |= {f"f_dc_{i}": sh0[:, i] for i in range(3)}
     if gaussians.shN is not None:
@@ -108,8 +151,11 @@ def _columns(gaussians: Gaussians) -> dict[str, np.ndarray]:
 def read_ply(path: str | os.PathLike) -> tuple[Gaussians, PlyReport]:
     """The Gaussians of a 3DGS PLY or a PlayCanvas compressed PLY (detected from the header), as float32.
 
-    The file may be binary of either byte order, or ASCII. Rows that cannot be rendered (with a NaN, an
-    infinity or a zero quaternion) are culled and counted. See `gsjax.io.compressed_ply` for packed values.
+    The file may be binary of either byte order, or ASCII. Rows that cannot be drawn (with a NaN or a zero
+    quaternion) are left out and counted, with a warning. Infinities that mean something are kept as the
+    nearest value that can be drawn: an opacity of logit +inf is opaque, a log scale of -inf is flat; a logit
+    of -inf is invisible, and left out and counted. Places far from 0 are returned relative to
+    `PlyReport.origin`, with a warning. See `gsjax.io.compressed_ply` for packed values.
 
     Raises:
         FileNotFoundError: there is no file at `path`.
@@ -124,24 +170,74 @@ def read_ply(path: str | os.PathLike) -> tuple[Gaussians, PlyReport]:
     if is_compressed(ply):
         if fault := find_fault(ply):
             raise PlyError(path, *fault)
-        gaussians, known = decompress(ply), {*PACKED}
+        places = positions(ply)
+        origin = far_origin(places)
+        gaussians, known = decompress(ply, _relative(places, origin)), {*PACKED}
+        invisible = np.zeros(len(vertices), bool)
     else:
-        gaussians, known = _uncompressed(path, vertices)
+        known = _known(path, vertices)
+        places = np.stack([vertices[axis] for axis in _PLACE], axis=1).astype(np.float64)
+        origin = far_origin(places)
+        gaussians, invisible = _uncompressed(vertices, _relative(places, origin))
     names = vertices.dtype.names or ()
     valid = valid_rows(gaussians)
-    rows = np.flatnonzero(valid)
+    invisible &= valid
+    rows = np.flatnonzero(valid & ~invisible)
+    labels = np.asarray(vertices["label"]) if "label" in names else read_labels(path, len(vertices))
     report = PlyReport(
         stored=len(vertices),
         culled=int(np.sum(~valid)),
         extra=tuple(name for name in names if name not in {*known, "label"}),
         rows=rows,
-        labels=np.asarray(vertices["label"])[rows].astype(np.int32) if "label" in names else None,
+        labels=None if labels is None else labels[rows].astype(np.int32),
+        invisible=int(invisible.sum()),
+        origin=origin,
+        places=places[rows],
+        antialiased=_says_antialiased([*ply.comments, *(c for e in ply.elements for c in e.comments)]),
     )
+    _warn(path, report, places, ply)
     return take(gaussians, rows), report
 
 
-def _uncompressed(path: Path, vertices: np.ndarray) -> tuple[Gaussians, set[str]]:
-    """The Gaussians of a PLY in the 3DGS layout, and the names of the properties of that layout."""
+def _relative(
+    places: Float[np.ndarray, "N 3"], origin: Float[np.ndarray, "3"] | None
+) -> Float[np.ndarray, "N 3"]:
+    return (places if origin is None else places - origin).astype(np.float32)
+
+
+def _says_antialiased(comments: Iterable[str]) -> bool:
+    """Whether the last comment about how to draw the scene says so."""
+    said = [found for comment in comments if (found := _MODES.match(comment))]
+    if not said:
+        return False
+    mode, flag, flags = said[-1].groups()
+    return (mode or "").lower() == "mip" or flag == "1" or "antialiasing" in (flags or "").lower()
+
+
+def _warn(path: Path, report: PlyReport, places: Float[np.ndarray, "N 3"], ply: PlyData) -> None:
+    """Warn of Gaussians that are left out, and of places far from 0."""
+    left_out = []
+    if report.culled:
+        left_out.append(f"{report.culled} of {report.stored} Gaussians cannot be drawn (NaN, no rotation)")
+    if report.invisible:
+        left_out.append(f"{report.invisible} of {report.stored} Gaussians are invisible (opacity 0)")
+    if left_out:
+        warnings.warn(f"{path}: {' and '.join(left_out)} and are left out", UserWarning, stacklevel=1)
+    if report.origin is None:
+        return
+    words = in_words(places, report.origin)
+    types = ply["vertex"].data.dtype
+    if "x" in (types.names or ()) and types["x"].itemsize < 8:
+        words += "; the file itself is of float32, which has lost what is smaller than these steps"
+    warnings.warn(f"{path}: {words}", UserWarning, stacklevel=1)
+
+
+def _known(path: Path, vertices: np.ndarray) -> set[str]:
+    """The names of the properties of the 3DGS layout.
+
+    Raises:
+        PlyError: one is missing, or there is an unusual number of harmonics.
+    """
     names = vertices.dtype.names or ()
     missing = [name for name in _REQUIRED if name not in names]
     if missing:
@@ -160,17 +256,29 @@ def _uncompressed(path: Path, vertices: np.ndarray) -> tuple[Gaussians, set[str]
             f"{len(rest)}",
             "Export the scene with spherical harmonics of degree 3 or less",
         )
+    return {*_REQUIRED, *_NORMALS, *rest, *features}
+
+
+def _uncompressed(
+    vertices: np.ndarray, means: Float[np.ndarray, "N 3"]
+) -> tuple[Gaussians, Bool[np.ndarray, "N"]]:
+    """The Gaussians of a PLY in the 3DGS layout, whose infinities are finite where they mean something, and
+    which of them are invisible."""
+    names = vertices.dtype.names or ()
+    rest, features = _numbered(names, "f_rest_"), _numbered(names, "feature_")
     shN = _stack(vertices, rest).reshape(len(vertices), 3, len(rest) // 3) if rest else None
+    logits = _stack(vertices, ["opacity"])[:, 0]
+    log_scales = _stack(vertices, [f"scale_{i}" for i in range(3)])
     gaussians = Gaussians(
-        means=jnp.asarray(_stack(vertices, ("x", "y", "z"))),
+        means=jnp.asarray(means),
         quats=jnp.asarray(_stack(vertices, [f"rot_{i}" for i in range(4)])),
-        log_scales=jnp.asarray(_stack(vertices, [f"scale_{i}" for i in range(3)])),
-        logit_opacities=jnp.asarray(_stack(vertices, ["opacity"])[:, 0]),
+        log_scales=jnp.asarray(np.where(np.isneginf(log_scales), np.float32(FLAT), log_scales)),
+        logit_opacities=jnp.asarray(np.where(np.isinf(logits), np.float32(OPAQUE), logits)),
         sh0=jnp.asarray(_stack(vertices, [f"f_dc_{i}" for i in range(3)])[:, None, :]),
         shN=None if shN is None else jnp.asarray(shN.transpose(0, 2, 1)),
         features=jnp.asarray(_stack(vertices, features)) if features else None,
     )
-    return gaussians, {*_REQUIRED, *_NORMALS, *rest, *features}
+    return gaussians, np.isneginf(logits)
 
 
 def _parse(path: Path) -> PlyData:
@@ -203,8 +311,9 @@ def _numbered(names: tuple[str, ...], prefix: str) -> list[str]:
 
 
 def _stack(vertices: np.ndarray, names) -> np.ndarray:
-    """Columns of a structured array stacked along axis 1, float32."""
-    return np.stack([vertices[name] for name in names], axis=1).astype(np.float32)
+    """Columns of a structured array stacked along axis 1, float32; what does not fit is infinite."""
+    with np.errstate(over="ignore"):
+        return np.stack([vertices[name] for name in names], axis=1).astype(np.float32)
 
 
 def _advice(names: tuple[str, ...]) -> str:

@@ -1,5 +1,6 @@
 """The scene: Gaussians as one pytree of raw (unconstrained) parameters, and separate integer tags."""
 
+import math
 from collections.abc import Sequence
 from functools import partial
 from typing import Any, TypeVar
@@ -17,6 +18,8 @@ from gsjax.geometry.spherical_harmonics import num_sh_bases, rgb_to_sh0
 # Activated values are clipped to this range before their logarithm is taken, so that 0 and 1 stay finite.
 _MIN_SCALE = 1e-12
 _MIN_OPACITY = 1e-6
+FLAT, OPAQUE = math.log(_MIN_SCALE), math.log1p(-_MIN_OPACITY) - math.log(_MIN_OPACITY)
+"""The log scale of a Gaussian without thickness, and the logit of one that hides all behind it."""
 SH_SIZES = tuple(num_sh_bases(degree) for degree in range(4))
 
 

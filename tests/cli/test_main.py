@@ -7,13 +7,17 @@ import sys
 import warnings
 from dataclasses import replace
 
+import equinox as eqx
+import numpy as np
 import pytest
 from rich.console import Console
 
 from gsjax.cli import COMMANDS, main
 from gsjax.data import DataWarning
 from gsjax.engine.messages import Notes, describe
+from gsjax.io.ply import write_ply
 from gsjax.methods.track import PRESETS, TrackConfig
+from gsjax.scene.gaussians import gaussians_from_activated
 
 
 @pytest.fixture
@@ -80,11 +84,28 @@ def test_debug_shows_where_it_failed(tmp_path):
         main(["info", str(tmp_path / "nowhere"), "--debug"])
 
 
-def test_info_of_a_ply_file_points_to_view(say, tmp_path):
+def test_info_of_a_ply_file_says_what_it_holds_and_what_is_odd(say, tmp_path):
+    means, quats = np.arange(12.0).reshape(4, 3), np.eye(4)[:1].repeat(4, 0)
+    gaussians = gaussians_from_activated(means, quats, np.full((4, 3), 0.1), np.full(4, 0.5), np.ones((4, 3)))
+    gaussians = eqx.tree_at(lambda g: g.means, gaussians, gaussians.means.at[0, 1].set(np.nan))
+    file, origin = tmp_path / "scene.ply", np.array([5e5, 5e6, 0])
+    write_ply(file, gaussians, labels=np.array([7, 0, 2, 2]), origin=origin, antialiased=True)
+    code, out, err = say("info", str(file))
+    assert code == 0
+    for said in ("3 of 4", "degree 0", "antialiased", "0, 2", "(500006, 5000007, 8)", "500003"):
+        assert said in out, out
+    assert "1 of 4 Gaussians cannot be drawn" in err
+    assert "coordinates reach 5e+06" in err
+    code, _, err = say("info", str(file), "--picture", "cameras.png")
+    assert code == 2
+    assert "--picture: draws cameras" in err
+
+
+def test_info_of_a_file_that_is_no_scene_says_so(say, tmp_path):
     (tmp_path / "scene.ply").write_bytes(b"ply")
     code, _, err = say("info", str(tmp_path / "scene.ply"))
     assert code == 2
-    assert f"expected a dataset, found a PLY file; view it with gsjax view {tmp_path}" in err
+    assert "expected a PLY file, which starts with 'ply'" in err
 
 
 def test_info_says_what_is_there(say):

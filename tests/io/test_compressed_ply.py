@@ -205,7 +205,20 @@ def test_a_quantity_that_does_not_vary_in_its_chunk_is_exact(tmp_path):
     scene = make_scene(5)
     scene["means"][:] = 0.1, -20.3, 3e4
     write(path, scene)
-    np.testing.assert_array_equal(read_ply(path)[0].means, scene["means"].astype(np.float32))
+    with pytest.warns(UserWarning, match="relative to the origin"):
+        _, report = read_ply(path)
+    np.testing.assert_array_equal(report.places, scene["means"].astype(np.float32))
+
+
+def test_chunks_far_from_0_keep_the_fractions_of_their_places(tmp_path):
+    path, scene = tmp_path / "scene.ply", make_scene(300)
+    scene["means"] += 2.0**20  # float32 has steps of 0.125 there, chunks of 6 have steps of 0.003
+    write(path, scene)
+    with pytest.warns(UserWarning, match="relative to the origin"):
+        gaussians, report = read_ply(path)
+    within = 0.5 * chunk_widths(scene["means"]) * POSITION_STEP + 0.0625  # bounds are float32
+    assert (np.abs(report.places - scene["means"]) <= within).all()
+    assert len(np.unique(np.asarray(gaussians.means)[:, 0])) > 100
 
 
 def test_an_empty_scene_is_read(tmp_path):

@@ -13,6 +13,7 @@ from plyfile import PlyData, PlyElement
 from gsjax.geometry.spherical_harmonics import num_sh_bases
 from gsjax.io.ply import PlyError, read_ply, write_ply
 from gsjax.scene.gaussians import Gaussians
+from gsjax.scene.origin import in_world
 
 
 def random_gaussians(count, degree=0, features=0, seed=0):
@@ -67,14 +68,18 @@ def test_f_rest_is_channel_major(tmp_path, degree):
             np.testing.assert_array_equal(stored, gaussians.shN[:, basis, channel])
 
 
-def test_properties_stand_in_the_order_of_3dgs(tmp_path):
-    write_ply(tmp_path / "scene.ply", random_gaussians(1, degree=1))
-    names = PlyData.read(str(tmp_path / "scene.ply"))["vertex"].data.dtype.names
+@pytest.mark.parametrize("labels", [None, np.arange(1)])
+def test_properties_are_floats_in_the_order_of_3dgs(tmp_path, labels):
+    write_ply(tmp_path / "scene.ply", random_gaussians(1, degree=1), labels=labels)
+    header = (tmp_path / "scene.ply").read_bytes().split(b"end_header")[0].decode()
     rest = [f"f_rest_{i}" for i in range(9)]
-    assert list(names) == [
-        *("x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"),
-        *rest,
-        *("opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"),
+    assert [line for line in header.splitlines() if line.startswith("property")] == [
+        f"property float {name}"
+        for name in [
+            *("x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"),
+            *rest,
+            *("opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"),
+        ]
     ]
 
 
@@ -118,11 +123,145 @@ def test_rows_that_cannot_be_drawn_are_culled_and_counted(tmp_path):
         sh0=gaussians.sh0,
     )
     write_ply(tmp_path / "scene.ply", gaussians, labels=np.arange(6))
-    loaded, report = read_ply(tmp_path / "scene.ply")
+    with pytest.warns(UserWarning, match=r"scene\.ply: 3 of 6 Gaussians cannot be drawn .* are left out"):
+        loaded, report = read_ply(tmp_path / "scene.ply")
     assert (report.stored, report.culled) == (6, 3)
     np.testing.assert_array_equal(report.labels, [0, 2, 5])
     np.testing.assert_array_equal(report.rows, [0, 2, 5])
     np.testing.assert_array_equal(loaded.means, gaussians.means[jnp.array([0, 2, 5])])
+
+
+def changed(path, gaussians, **columns):
+    """A PLY of these Gaussians with some properties replaced, by name, in their own types."""
+    write_ply(path, gaussians)
+    old = PlyData.read(str(path), mmap=False)["vertex"].data
+    types = {name: old.dtype[name] for name in old.dtype.names}
+    types |= {name: column.dtype for name, column in columns.items()}
+    new = np.empty(gaussians.num, list(types.items()))
+    for name in types:
+        new[name] = columns[name] if name in columns else old[name]
+    PlyData([PlyElement.describe(new, "vertex")]).write(str(path))
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_infinities_that_mean_something_are_drawn_as_what_they_mean(tmp_path, dtype):
+    path, gaussians = tmp_path / "scene.ply", random_gaussians(5)
+    logits = np.array([np.inf, -np.inf, 0.5, np.nan, 1e300 if dtype is np.float64 else np.inf], dtype)
+    flat = np.array([0.0, 0, -np.inf, 0, -1], dtype)
+    changed(path, gaussians, opacity=logits, scale_1=flat)
+    with pytest.warns(UserWarning, match=r"1 of 5 .* cannot be drawn .* and 1 of 5 .* are invisible"):
+        loaded, report = read_ply(path)
+    assert (report.stored, report.culled, report.invisible) == (5, 1, 1)
+    np.testing.assert_array_equal(report.rows, [0, 2, 4])
+    np.testing.assert_allclose(loaded.opacities, [1, 0.62246, 1], atol=2e-6)
+    np.testing.assert_allclose(loaded.scales[:, 1], [1, 0, np.exp(-1)], atol=1e-9)
+    assert np.isfinite(loaded.log_scales).all()
+    assert np.isfinite(loaded.logit_opacities).all()
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [("x", -np.inf), ("scale_0", np.inf), ("f_dc_1", np.inf), ("rot_0", -np.inf)]
+)
+def test_other_infinities_cannot_be_drawn(tmp_path, name, value):
+    path = tmp_path / "scene.ply"
+    changed(path, random_gaussians(2), **{name: np.array([0.5, value], np.float32)})
+    with pytest.warns(UserWarning, match="1 of 2 Gaussians cannot be drawn"):
+        assert read_ply(path)[1].culled == 1
+
+
+UTM = np.array([500_000.0, 5_000_000.0, 300.0])
+
+
+def test_places_far_from_0_are_written_as_double_and_read_relative_to_an_origin(tmp_path):
+    path, gaussians = tmp_path / "scene.ply", random_gaussians(50)
+    write_ply(path, gaussians, origin=UTM)
+    stored = PlyData.read(str(path))["vertex"].data
+    assert [stored.dtype[name].str for name in ("x", "z", "nx", "f_dc_0", "opacity")] == [
+        *("<f8", "<f8", "<f4", "<f4", "<f4"),
+    ]
+    places = np.stack([stored[axis] for axis in "xyz"], axis=1)
+    np.testing.assert_allclose(places, np.asarray(gaussians.means, np.float64) + UTM, rtol=0, atol=1e-8)
+    with pytest.warns(UserWarning, match=r"reach 5e\+06, where float32 has steps of 0\.5; .* the origin \(5"):
+        loaded, report = read_ply(path)
+    assert report.origin is not None
+    np.testing.assert_allclose(in_world(np.asarray(loaded.means), report.origin), places, rtol=0, atol=1e-6)
+    np.testing.assert_array_equal(report.places, places)
+
+
+def test_float32_far_from_0_is_said_to_have_lost_places(tmp_path):
+    path, gaussians = tmp_path / "scene.ply", random_gaussians(50)
+    places = (np.asarray(gaussians.means) + UTM).astype(np.float32)
+    far = dict(zip("xyz", places.T, strict=True))
+    changed(path, gaussians, **far)
+    with pytest.warns(UserWarning, match="of float32, which has lost what is smaller than these steps"):
+        loaded, report = read_ply(path)
+    np.testing.assert_array_equal(in_world(np.asarray(loaded.means), report.origin), places)
+
+
+def test_near_0_nothing_is_taken_off(tmp_path):
+    path, gaussians = tmp_path / "scene.ply", random_gaussians(50)
+    shift = np.array([10.0, 0, -20])
+    write_ply(path, gaussians, origin=shift)
+    loaded, report = read_ply(path)
+    assert report.origin is None
+    assert PlyData.read(str(path))["vertex"].data.dtype["x"] == np.float32
+    np.testing.assert_allclose(loaded.means, gaussians.means + shift, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("comments", "antialiased"),
+    [
+        ([], False),
+        (["Exported from Brush", "SH degree: 3", "SplatRenderMode: mip"], True),
+        (["SplatRenderMode: default"], False),
+        (["  SPLATRENDERMODE:  MIP  "], True),
+        (["antialiased 1"], True),
+        (["antialiased 0"], False),
+        (["antialiased 1", "SplatRenderMode: default"], False),
+        (["SplatRenderMode: default", "antialiased 1"], True),
+        (["train_flags antialiasing"], True),
+        (["not antialiased 1", "SplatRenderMode: banana"], False),
+    ],
+)
+def test_comments_of_other_programs_say_how_to_draw(tmp_path, comments, antialiased):
+    path = tmp_path / "scene.ply"
+    write_ply(path, random_gaussians(2))
+    ply = PlyData.read(str(path), mmap=False)
+    PlyData(ply.elements, comments=comments).write(str(path))
+    assert read_ply(path)[1].antialiased == antialiased
+
+
+@pytest.mark.parametrize("antialiased", [True, False])
+def test_how_to_draw_is_written_as_brush_writes_it(tmp_path, antialiased):
+    path = tmp_path / "scene.ply"
+    write_ply(path, random_gaussians(2), antialiased=antialiased)
+    assert PlyData.read(str(path)).comments == (["SplatRenderMode: mip"] if antialiased else [])
+    assert read_ply(path)[1].antialiased == antialiased
+
+
+def test_labels_within_a_file_of_an_earlier_version_are_read(tmp_path):
+    changed(tmp_path / "scene.ply", random_gaussians(3), label=np.array([2, 0, 1], np.int32))
+    _, report = read_ply(tmp_path / "scene.ply")
+    np.testing.assert_array_equal(report.labels, [2, 0, 1])
+    assert report.extra == ()
+
+
+def test_labels_of_an_earlier_scene_go_with_it(tmp_path):
+    path = tmp_path / "scene.ply"
+    write_ply(path, random_gaussians(3), labels=np.arange(3))
+    write_ply(path, random_gaussians(3))
+    assert read_ply(path)[1].labels is None
+    assert [file.name for file in tmp_path.iterdir()] == ["scene.ply"]
+
+
+@pytest.mark.parametrize("content", ["other length", "floats", "not an archive", "pickled"])
+def test_labels_that_do_not_fit_are_left_out_with_a_warning(tmp_path, content):
+    path, beside = tmp_path / "scene.ply", tmp_path / "scene_labels.npz"
+    write_ply(path, random_gaussians(3))
+    arrays = {"other length": np.arange(4), "floats": np.zeros(3), "pickled": np.array([{}, 1, 2])}
+    beside.write_bytes(b"hello") if content not in arrays else np.savez(beside, labels=arrays[content])
+    with pytest.warns(UserWarning, match=r"scene_labels\.npz: expected 3 integers .* they are left out"):
+        assert read_ply(path)[1].labels is None
 
 
 def test_labels_of_another_length_are_refused(tmp_path):

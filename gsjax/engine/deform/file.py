@@ -7,9 +7,10 @@ from pathlib import Path
 import equinox as eqx
 import jax
 import numpy as np
+from jaxtyping import Float
 
 from gsjax.engine.messages import Notes
-from gsjax.io.checkpoints import CheckpointError, load_checkpoint, save_checkpoint
+from gsjax.io.checkpoints import CheckpointError, load_checkpoint, load_metadata, save_checkpoint
 from gsjax.methods.deform import DeformResult, Moving
 from gsjax.scene.deformation import Nodes
 
@@ -17,14 +18,23 @@ NAME = "deformation.npz"
 _AGAIN = "reconstruct it again with this version of gsjax"
 
 
-def write_deformation(path: str | os.PathLike, result: DeformResult) -> None:
+def write_deformation(
+    path: str | os.PathLike, result: DeformResult, origin: Float[np.ndarray, "3"] | None = None
+) -> None:
     """Write a deforming scene to `path`, a checkpoint (`gsjax.io.checkpoints`); atomic.
 
     Args:
         path: the file; its suffix is `.npz` by custom.
         result: the scene.
+        origin: what it is relative to, where the recording lies far from 0; kept beside it.
     """
-    save_checkpoint(path, result)
+    save_checkpoint(path, result, {} if origin is None else {"origin": origin.tolist()})
+
+
+def origin_of(path: str | os.PathLike) -> Float[np.ndarray, "3"] | None:
+    """What the scene that `write_deformation` wrote is relative to; None where that is 0."""
+    origin = load_metadata(path).get("origin")
+    return None if origin is None else np.array(origin, np.float64)
 
 
 def read_deformation(path: str | os.PathLike) -> DeformResult:

@@ -10,6 +10,7 @@ from gsjax.engine.folder import RunFolder
 from gsjax.engine.messages import Notes
 from gsjax.io.atomic import write_npz
 from gsjax.methods.deform import DeformingScene, Problem, refined_viewmats, times_of
+from gsjax.scene.origin import cameras_in_world
 
 NAME = "poses.npz"
 """Refined view matrices of all frames and cameras, in the folder of a run."""
@@ -34,7 +35,8 @@ def as_refined(
     learned = times_of(problem.frames)
     found = refined_viewmats(given, data.times, scene.twists, learned, problem.radius)
     sequence = replace(data.sequence, viewmats=found)
-    arrays = {"viewmats": found, "frame_ids": sequence.frame_ids, "camera_ids": sequence.camera_ids}
+    arrays = {"viewmats": cameras_in_world(found, sequence.origin)}
+    arrays |= {"frame_ids": sequence.frame_ids, "camera_ids": sequence.camera_ids}
     write_npz(folder.path / NAME, arrays)
     notes.add(
         f"Poses were refined ({NAME}), and frames are judged with the refined poses. The pose of a held-out "

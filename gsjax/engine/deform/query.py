@@ -14,6 +14,7 @@ from jaxtyping import Array, Bool, Float
 from rich.console import Console
 from rich.progress import track
 
+from gsjax.engine.files import write_scene
 from gsjax.engine.folder import OF_QUERY, replaced_folder
 from gsjax.engine.messages import Notes
 from gsjax.engine.pictures import frame_rate
@@ -22,7 +23,6 @@ from gsjax.engine.recording import parse_frames
 from gsjax.geometry.cameras import Camera
 from gsjax.io.atomic import write_json, write_npz
 from gsjax.io.pictures import write_png
-from gsjax.io.ply import write_ply
 from gsjax.io.video import VideoWriter
 from gsjax.methods.deform import DeformResult, feature_prompt, text_prompt
 from gsjax.methods.deform.query import most_likely, prompt_probabilities, region_feature
@@ -69,12 +69,19 @@ class _Seen(NamedTuple):
 class QueryableScene(Queryable):
     """A scene that deforms."""
 
-    def __init__(self, path: Path, result: DeformResult, weights: Path | None = None):
+    def __init__(
+        self,
+        path: Path,
+        result: DeformResult,
+        weights: Path | None = None,
+        origin: Float[np.ndarray, "3"] | None = None,
+    ):
         """
         Args:
             path: of the run.
             result: its scene.
             weights: folder of CLIP's weights (default: where they were).
+            origin: what the scene is relative to.
 
         Raises:
             ValueError: the scene has no features with a meaning.
@@ -93,6 +100,7 @@ class QueryableScene(Queryable):
             meaning.hint(weights),
             np.arange(gaussians.num),
             gaussians.num,
+            origin=origin,
             frame_ids=tuple(result.timeline.frame_ids.tolist()),
         )
 
@@ -216,7 +224,7 @@ def label_everything(
     with replaced_folder(folder, OF_QUERY) as new:
         arrays = {"labels": labels, "probabilities": likely, "names": result.names}
         write_npz(new / "selection.npz", arrays)
-        write_ply(new / "recolored.ply", recolored(there, shades[labels]), labels=labels)
+        write_scene(new / "recolored.ply", recolored(there, shades[labels]), labels, origin=scene.origin)
         info = {
             "text": None,
             "point": None,

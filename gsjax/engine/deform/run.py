@@ -24,6 +24,7 @@ from gsjax.engine.deform.results import summarize
 from gsjax.engine.deform.scores import judge
 from gsjax.engine.drive import drive
 from gsjax.engine.ending import exit_code, finish
+from gsjax.engine.files import write_scene
 from gsjax.engine.folder import RunFolder, expect_dataset
 from gsjax.engine.locks import releasing_locks
 from gsjax.engine.machine import describe as describe_machine
@@ -32,7 +33,6 @@ from gsjax.engine.options import RESUME_MAY_CHANGE, OfDataset, checked
 from gsjax.engine.progress import Progress, Schedule, load_run, means_of, note_if_cut_short, watch
 from gsjax.engine.recording import located, open_recording
 from gsjax.engine.teaching.choice import NO_TEACHER, TeacherChoice, TeacherOptions
-from gsjax.io.ply import write_ply
 from gsjax.methods.deform import PRESETS, Deform, DeformConfig
 from gsjax.methods.deform.method import PLAN
 from gsjax.methods.deform.update import LOSSES
@@ -101,8 +101,8 @@ def run(options: Options) -> int:
         watch(ticks, progress, schedule, folder, console, budget=budget)
         run, result = ticks.run, ticks.result
         data, refined = as_refined(folder, problem, run.params, data, notes)
-        write_deformation(folder.path / NAME, result)
-        write_ply(folder.scene, jax.device_get(result.at(0.0)))
+        write_deformation(folder.path / NAME, result, sequence.origin)
+        write_scene(folder.scene, jax.device_get(result.at(0.0)), origin=sequence.origin)
         with stage(console, "scoring held-out frames"):
             judged = judge(folder, result, run.plans[PLAN], data, options.tools, budget)
         note_if_cut_short(progress, schedule, run.step, notes)

@@ -51,7 +51,16 @@ class QueryableField(Queryable):
             run = replace(run, stored=replace(run.stored, field=field, rows=None))
         source = run.stored.source
         self.run, self._source = run, source
-        super().__init__(run.path, source.kind, source.hint(run.weights), run.rows, run.num_rows, run.labels)
+        super().__init__(
+            run.path,
+            source.kind,
+            source.hint(run.weights),
+            run.rows,
+            run.num_rows,
+            run.labels,
+            run.origin,
+            run.rasterize_mode == "antialiased",
+        )
 
     def frame_of(self, question: Question) -> int:
         if question.camera is not None:

@@ -9,7 +9,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Float, Int
 
 from gsjax.data.photographs import Photographs
 from gsjax.engine.distill.file import FOLDER, NAME, read_field
@@ -18,6 +18,7 @@ from gsjax.engine.files import read_drawable, read_options
 from gsjax.engine.folder import is_run
 from gsjax.engine.messages import Notes, describe
 from gsjax.engine.records import digest
+from gsjax.io.ply import PlyReport
 from gsjax.methods.distill import DistillResult
 from gsjax.methods.protocols import LanguageEncoder
 from gsjax.scene.gaussians import Gaussians
@@ -55,6 +56,7 @@ class FieldRun:
         rows: row of the file of each Gaussian.
         num_rows: number of rows in the file, including Gaussians that cannot be drawn.
         labels: label of each Gaussian, where the file has them.
+        origin: what places are relative to, where the file's lie far from 0.
         photographs: of the scene; None where these are no longer there.
         weights: folder of CLIP's weights (default: where they were).
     """
@@ -66,6 +68,7 @@ class FieldRun:
     rows: Int[np.ndarray, "n"]
     num_rows: int
     labels: Int[np.ndarray, "n"] | None
+    origin: Float[np.ndarray, "3"] | None
     photographs: Photographs | None
     weights: Path | None = None
 
@@ -112,7 +115,7 @@ def open_field_run(
     """
     stored = read_field(folder / NAME)
     file = _scene_file(folder, stored, now.scene, notes)
-    gaussians, report = read_drawable(file, notes)
+    gaussians, report = read_drawable(file)
     if stored.rows is None and len(stored.field.encoding) != gaussians.num:
         raise ValueError(
             f"{folder}: expected a scene with the field's {len(stored.field.encoding)} Gaussians, found "
@@ -120,8 +123,9 @@ def open_field_run(
         )
     gaussians = jax.tree.map(jnp.asarray, gaussians)
     stored = replace(stored, means=gaussians.means)
-    shown = _photographs(folder, stored, file, gaussians, now.images, notes) if photographs else None
-    of_file = (report.rows, report.stored, report.labels)
+    read = gaussians, report
+    shown = _photographs(folder, stored, file, read, now.images, notes) if photographs else None
+    of_file = (report.rows, report.stored, report.labels, report.origin)
     return FieldRun(folder, stored, file, gaussians, *of_file, shown, now.weights)
 
 
@@ -146,7 +150,12 @@ def _scene_file(folder: Path, stored: DistillResult, given: Path | None, notes: 
 
 
 def _photographs(
-    folder: Path, stored: DistillResult, file: Path, gaussians: Gaussians, images: str | None, notes: Notes
+    folder: Path,
+    stored: DistillResult,
+    file: Path,
+    read: tuple[Gaussians, PlyReport],
+    images: str | None,
+    notes: Notes,
 ) -> Photographs | None:
     """The photographs that the field learned from; None, and a warning, where they cannot be read.
 
@@ -161,7 +170,7 @@ def _photographs(
                 f"{folder / NAME}: expected the training photographs' names, found others ({error}); "
                 "distil it again with this version of gsjax"
             ) from error
-        return open_scene(options, gaussians).photographs
+        return open_scene(options, read).photographs
     except (ValueError, OSError) as error:
         if images is not None:
             raise ValueError(f"--images {images}: {describe(error)}") from error

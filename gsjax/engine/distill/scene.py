@@ -11,15 +11,18 @@ import numpy as np
 import tyro
 
 from gsjax.data.open import ReadOptions
+from gsjax.data.origin import relative_to_origin
 from gsjax.data.photographs import Photographs, photographs_of
-from gsjax.engine.files import read_arrays, reopen
+from gsjax.engine.files import about_scene, read_arrays, reopen
 from gsjax.engine.folder import expect_run
 from gsjax.engine.options import HeldOutFrames, Selection
 from gsjax.engine.photographs import choose_photographs, photographs_of_run, smaller, split
 from gsjax.engine.records import read_record
-from gsjax.io.ply import read_ply
+from gsjax.io.ply import PlyReport, read_ply
 from gsjax.scene.gaussians import Gaussians
+from gsjax.scene.origin import about
 
+Read = tuple[Gaussians, PlyReport]
 _AGAIN = "run it again with this version of gsjax"
 _OF_PHOTOGRAPHS = ("frames", "cameras", "eval_cameras", "test_every", "read")  # a run has chosen these
 
@@ -63,12 +66,12 @@ class FieldScene:
     rasterize_mode: str = "classic"
 
 
-def open_scene(options: SceneOptions, gaussians: Gaussians | None = None) -> FieldScene:
+def open_scene(options: SceneOptions, read_scene: Read | None = None) -> FieldScene:
     """The scene and its photographs.
 
     Args:
         options: which scene and photographs.
-        gaussians: the scene's, if they were read already.
+        read_scene: its Gaussians and the report about them, if they were read already.
 
     Raises:
         ValueError, OSError: they do not exist, or options are given that the run has chosen itself.
@@ -78,7 +81,7 @@ def open_scene(options: SceneOptions, gaussians: Gaussians | None = None) -> Fie
         if options.images is None:
             raise ValueError(f"{path}: a PLY file has no photographs; give a folder of them with --images")
         chosen = {name: getattr(options, name) for name in ("frames", "cameras", "eval_cameras")}
-        scene = scene_of_file(path, options.images, options.read, options.test_every, gaussians, **chosen)
+        scene = scene_of_file(path, options.images, options.read, options.test_every, read_scene, **chosen)
     else:
         expect_run(path, "`gsjax fit`, `gsjax track` or `gsjax parts`, or a PLY file")
         given = [n for n in _OF_PHOTOGRAPHS if getattr(options, n) != getattr(SceneOptions(path), n)]
@@ -87,43 +90,43 @@ def open_scene(options: SceneOptions, gaussians: Gaussians | None = None) -> Fie
             raise ValueError(
                 f"{flag}: {path} is a run, whose photographs are already selected and split; leave it out"
             )
-        scene = scene_of_run(path, options.images, gaussians)
+        scene = scene_of_run(path, options.images, read_scene)
     if not scene.gaussians.num:
         raise ValueError(f"{scene.file}: expected Gaussians, found none")
     return scaled(scene, options.scale)
 
 
-def scene_of_run(path: Path, images: str | None = None, gaussians: Gaussians | None = None) -> FieldScene:
+def scene_of_run(path: Path, images: str | None = None, read_scene: Read | None = None) -> FieldScene:
     """The scene of a run of `gsjax fit`, `gsjax track` (its first frame) or `gsjax parts` (its canonical
     frame).
 
     Args:
         path: the run's folder.
         images: where its photographs are now (default: where they were).
-        gaussians: the scene's, if they were read already.
+        read_scene: its Gaussians and the report about them, if they were read already.
 
     Raises:
         FileNotFoundError, ValueError: there is no such run, or it has no scene, or no photographs that can be
             read.
     """
     if (path / "canonical" / "scene.ply").is_file():
-        return scene_of_run(path / "canonical", images, gaussians)
+        return scene_of_run(path / "canonical", images, read_scene)
     record = read_record(path)
     file = path / "scene.ply"
     if not file.is_file():
         raise FileNotFoundError(
             f"{path}: expected a scene.ply, found none: the run is still going on, or failed"
         )
-    gaussians = _read(file) if gaussians is None else gaussians
+    gaussians, report = _read(file) if read_scene is None else read_scene
     if record.kind == "track":
         if images is not None:
             raise ValueError("--images: a run of `gsjax track` knows its recording; leave it out")
         recording, _ = reopen(path / "config.yml", _AGAIN)
-        first = recording.judged.select(frames=slice(0, 1))
+        first = about_scene(recording, report.origin).judged.select(frames=slice(0, 1))
         indices, count = list(range(first.num_cameras)), recording.tracked.num_cameras
         return FieldScene(file, gaussians, photographs_of(first), indices[:count], indices[count:])
     photographs = photographs_of_run(record.config, images)
-    photographs = _as_learned(photographs, path / "cameras.npz")
+    photographs = relative_to_origin(_as_learned(photographs, path / "cameras.npz"), report.origin)
     mode = "antialiased" if record.config["fit"].get("antialiased") else "classic"
     return FieldScene(file, gaussians, photographs, *_split(photographs, record.config["test_every"]), mode)
 
@@ -133,7 +136,7 @@ def scene_of_file(
     images: str,
     read: ReadOptions,
     test_every: int,
-    gaussians: Gaussians | None = None,
+    read_scene: Read | None = None,
     **chosen,
 ) -> FieldScene:
     """A PLY file with photographs of the same world.
@@ -143,15 +146,16 @@ def scene_of_file(
         images: a dataset.
         read: options of its reader.
         test_every: hold out every n-th photograph where the data has no split.
-        gaussians: the scene's, if they were read already.
+        read_scene: its Gaussians and the report about them, if they were read already.
         **chosen: as for `choose_photographs`.
 
     Raises:
         PlyError, DataError, ValueError: one of them cannot be read.
     """
-    photographs = choose_photographs(images, read, **chosen)
-    gaussians = _read(file) if gaussians is None else gaussians
-    return FieldScene(file, gaussians, photographs, *_split(photographs, test_every))
+    gaussians, report = _read(file) if read_scene is None else read_scene
+    photographs = relative_to_origin(choose_photographs(images, read, **chosen), report.origin)
+    mode = "antialiased" if report.antialiased else "classic"
+    return FieldScene(file, gaussians, photographs, *_split(photographs, test_every), mode)
 
 
 def scaled(scene: FieldScene, scale: float) -> FieldScene:
@@ -168,8 +172,9 @@ def _split(photographs: Photographs, every: int) -> tuple[list[int], list[int]]:
     return chosen.tolist(), held_out.tolist()
 
 
-def _read(file: Path) -> Gaussians:
-    return jax.tree.map(jnp.asarray, read_ply(file)[0])
+def _read(file: Path) -> Read:
+    gaussians, report = read_ply(file)
+    return jax.tree.map(jnp.asarray, gaussians), report
 
 
 def _as_learned(photographs: Photographs, file: Path) -> Photographs:
@@ -179,5 +184,5 @@ def _as_learned(photographs: Photographs, file: Path) -> Photographs:
     arrays = read_arrays(file, ("names", "viewmats"), _AGAIN)
     found = dict(zip(arrays["names"].tolist(), arrays["viewmats"], strict=True))
     posed = zip(photographs.names, photographs.viewmats, strict=True)
-    viewmats = [found.get(name, viewmat) for name, viewmat in posed]
+    viewmats = [about(found[name], photographs.origin) if name in found else given for name, given in posed]
     return replace(photographs, viewmats=np.stack(viewmats).astype(np.float64))

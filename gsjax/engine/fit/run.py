@@ -6,12 +6,14 @@ from typing import Literal
 
 import jax
 import numpy as np
+from jaxtyping import Float
 from rich.console import Console
 
 from gsjax.data.photographs import Photographs
 from gsjax.engine.budget import Budget
 from gsjax.engine.drive import Drive, drive
 from gsjax.engine.ending import ended, exit_code, finish
+from gsjax.engine.files import write_scene
 from gsjax.engine.fit.costs import affordable
 from gsjax.engine.fit.ending import Ending, some_of
 from gsjax.engine.fit.judge import Judge
@@ -29,13 +31,13 @@ from gsjax.engine.photographs import choose_photographs, read_frames, smaller, s
 from gsjax.engine.progress import Progress, load_run, watch
 from gsjax.engine.recording import located
 from gsjax.io.atomic import write_npz
-from gsjax.io.ply import write_ply
 from gsjax.methods.fit import Fit, FitConfig, Model, Problem, refined_frames
 from gsjax.methods.fit.model import in_slots
 from gsjax.methods.fit.padding import sizes_of
 from gsjax.optim.method import Run
 from gsjax.scene.frame import Frame
 from gsjax.scene.gaussians import Gaussians
+from gsjax.scene.origin import cameras_in_world
 
 _UNLIMITED = 1_000_000  # steps
 _MAY_CHANGE = (*RESUME_MAY_CHANGE, "tensorboard", "save_every")
@@ -127,9 +129,10 @@ def run(options: Options) -> int:
         budget.hurried = stopped is not None
         _note_oddities(options, config, progress, gaussians, stopped is None, notes)
         found_frames = refined_frames(problem, run.params)
-        write_cameras(folder, [photographs.names[i] for i in chosen], found_frames, run.params)
+        names = [photographs.names[i] for i in chosen]
+        write_cameras(folder, names, found_frames, run.params, photographs.origin)
         gaussians, light = ending.pruned(gaussians, found_frames, config)
-        write_ply(folder.scene, gaussians)
+        write_scene(folder.scene, gaussians, origin=photographs.origin, antialiased=config.antialiased)
         # In the slots of the fit, so that its programs draw it.
         shown = in_slots(gaussians, run.params.gaussians.num) if gaussians.num else gaussians
         scores = ending.scored(shown, (photographs.names[chosen[0]], fitted[0]), folder)
@@ -256,15 +259,27 @@ def _note_oddities(
         )
 
 
-def write_cameras(folder: RunFolder, names: list[str], frames: list[Frame], model: Model) -> None:
+def write_cameras(
+    folder: RunFolder,
+    names: list[str],
+    frames: list[Frame],
+    model: Model,
+    origin: Float[np.ndarray, "3"] | None = None,
+) -> None:
     """Write cameras.npz, if cameras or exposures were learned: names [V], viewmats [V,4,4] (world to camera,
-    OpenCV axes; those of the frames), exposures [V,3,4] (the affine maps of colours)."""
+    OpenCV axes; those of the frames), exposures [V,3,4] (the affine maps of colours).
+
+    Args:
+        folder: of the run.
+        names: of the photographs.
+        frames: their frames, with the cameras as learned.
+        model: what was learned.
+        origin: what cameras are relative to; it is put back.
+    """
     if model.twists is None and model.exposures is None:
         return
-    found = {
-        "names": np.array(names),
-        "viewmats": np.concatenate([frame.cameras.viewmat for frame in frames]),
-    }
+    viewmats = np.concatenate([frame.cameras.viewmat for frame in frames])
+    found = {"names": np.array(names), "viewmats": cameras_in_world(viewmats, origin)}
     if model.exposures is not None:
         exposures = np.asarray(model.exposures)
         found["exposures"] = np.eye(3, 4) + exposures - exposures.mean(0)

@@ -5,7 +5,7 @@ import shutil
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 from itertools import chain, count
 from pathlib import Path
 from time import perf_counter
@@ -17,12 +17,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from gsjax.engine.files import write_scene
 from gsjax.engine.machine import describe as describe_machine
 from gsjax.engine.messages import Notes, reason
-from gsjax.engine.parts.saved import PartsRun, read_parts
+from gsjax.engine.parts.saved import PartsRun, read_parts_about
 from gsjax.geometry.cameras import Camera, resized
 from gsjax.io.atomic import atomic_write, write_json
-from gsjax.io.ply import write_ply
 from gsjax.io.video import VideoWriter
 from gsjax.methods.parts.film import Film, Layer, film_gaussians
 from gsjax.methods.parts.limits import Beyond, beyond_captured, describe_beyond
@@ -69,7 +69,8 @@ def edited(script: Script, saved: PartsRun) -> tuple[Film, list[str]]:
     Raises:
         ValueError, OSError: there is no such part or other run, or the edits cannot be applied.
     """
-    known = cache(read_parts)  # each other run is read once
+    # Each other run is read once.
+    known = cache(partial(read_parts_about, origin=saved.recording.judged.origin))
     film = apply(script, saved.layer, saved.names, known)
     recorded, now = saved.layer, film[0].trajectory
     doubts = []
@@ -163,7 +164,7 @@ def write_film(
     shutil.rmtree(folder / _PLY, ignore_errors=True)
     with atomic_write(folder / SCRIPT) as temporary:
         temporary.write_text(to_yaml(script), encoding="utf-8")
-    sequence = saved.recording.judged
+    sequence, origin = saved.recording.judged, saved.recording.judged.origin
     view = sequence.camera(0, sequence.camera_ids.index(camera))
     fps = script.fps or 1 / float(np.median(np.diff(saved.recording.tracked.times)))
     seconds, stopped = [], False
@@ -171,7 +172,7 @@ def write_film(
         try:
             for shot in watch(shots(film, view, saved), len(film[0].trajectory.times)):
                 if ply:
-                    write_ply(folder / _PLY / f"{len(seconds):06d}.ply", shot.gaussians)
+                    write_scene(folder / _PLY / f"{len(seconds):06d}.ply", shot.gaussians, origin=origin)
                 video.write(shot.image)
                 seconds.append(shot.seconds)
         except KeyboardInterrupt as interrupt:

@@ -4,9 +4,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 from rich.console import Console
 
 from gsjax.engine.ending import ended
+from gsjax.engine.files import write_scene
 from gsjax.engine.folder import RunFolder
 from gsjax.engine.machine import describe as describe_machine
 from gsjax.engine.messages import Notes, reason
@@ -19,9 +21,9 @@ from gsjax.engine.recording import Recording
 from gsjax.engine.scores import Scores, camera_metrics
 from gsjax.geometry.rotations import quats_to_matrices
 from gsjax.io.atomic import write_npz
-from gsjax.io.ply import write_ply
 from gsjax.methods.parts import PartScene, PartsResult, Start, Trajectory
 from gsjax.optim.method import Run
+from gsjax.scene.origin import in_world
 
 
 def finished(
@@ -54,8 +56,9 @@ def finished(
     if stopped is not None:
         why = reason(stopped).rstrip(".")
         notes.add(f"This run is not complete: it was stopped after {len(frames)} frames by {why}.")
-    write_parts(folder.path / "parts.npz", scene, trajectory, found.anchor)
-    write_ply(folder.scene, scene.gaussians, labels=np.asarray(scene.labels))
+    origin = recording.tracked.origin
+    write_parts(folder.path / "parts.npz", scene, trajectory, found.anchor, origin)
+    write_scene(folder.scene, scene.gaussians, np.asarray(scene.labels), origin=origin)
     joints, scores = found.joints(), Scores(None, None)
     if complete:
         film = Film(folder, recording, recording.tracked.num_frames, np.arange(scene.num_parts))
@@ -66,6 +69,8 @@ def finished(
             notes.warn(f"scoring was stopped after {scores.num_frames} frames by {reason(error)}")
             progress.stopped = error if isinstance(error, KeyboardInterrupt) else None
     rows, against_truth = part_rows(scene, trajectory, joints), {}
+    for row in rows if origin is not None else ():
+        row["point"] = None if row["point"] is None else in_world(np.array(row["point"]), origin).tolist()
     if complete:
         against_truth = score_parts(
             scene, trajectory, joints, rows, recording, found.anchor, found.blend, notes
@@ -108,19 +113,31 @@ def finished(
     }
 
 
-def write_parts(path: Path, scene: PartScene, trajectory: Trajectory, anchor: int) -> None:
+def write_parts(
+    path: Path,
+    scene: PartScene,
+    trajectory: Trajectory,
+    anchor: int,
+    origin: Float[np.ndarray, "3"] | None = None,
+) -> None:
     """Write parts.npz. At time t, a point x with weights w is at sum_p w_p (R_p (x - c_p) + c_p + t_p); part
     0 is the background, which does not move. All in metres, seconds and the world's axes.
 
     anchor (frame index), means0 [N,3], weights [N,P], labels [N], centres [P,3], R [T,P,3,3], t [T,P,3],
     times [T].
+
+    Args:
+        path: the file.
+        scene, trajectory: the parts and their motion.
+        anchor: index of the canonical frame.
+        origin: what places are relative to; it is put back.
     """
     arrays = {
         "anchor": np.array(anchor),
-        "means0": scene.gaussians.means,
+        "means0": in_world(np.asarray(scene.gaussians.means), origin),
         "weights": scene.weights,
         "labels": scene.labels,
-        "centres": scene.centers,
+        "centres": in_world(np.asarray(scene.centers), origin),
         "R": quats_to_matrices(trajectory.poses.quats),
         "t": trajectory.poses.translations,
         "times": trajectory.times,

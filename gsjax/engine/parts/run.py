@@ -13,6 +13,7 @@ from rich.console import Console
 
 from gsjax.data import Sequence
 from gsjax.engine.ending import exit_code, finish
+from gsjax.engine.files import read_drawable
 from gsjax.engine.fit.run import Options as FitOptions
 from gsjax.engine.fit.run import run as run_fit
 from gsjax.engine.folder import RunFolder, expect_dataset, expect_run, is_run
@@ -26,7 +27,6 @@ from gsjax.engine.parts.start import FIT, detect_motion
 from gsjax.engine.progress import Progress
 from gsjax.engine.recording import Recording, chosen_recording, located, parse_frames
 from gsjax.engine.records import digest
-from gsjax.io.ply import read_ply
 from gsjax.methods.fit import FitConfig
 from gsjax.methods.parts import (
     Anchor,
@@ -40,6 +40,7 @@ from gsjax.methods.protocols import Segmenter
 from gsjax.perception.sam import load_sam
 from gsjax.perception.segmenters import PieceSegmenter
 from gsjax.scene.gaussians import Gaussians
+from gsjax.scene.origin import moved_to
 
 _EVERYTHING = 0.6  # fraction of pixels that change above which everything seems to move
 
@@ -82,9 +83,9 @@ def run(options: Options) -> int:
         if options.resume:
             folder.check_config(settings, but=RESUME_MAY_CHANGE)
         scene = None if options.scene is None else _ply_of(options.scene)
-        gaussians = None if scene is None else _read_scene(scene)
-        seconds: dict[str, float] = {}
         tracked = recording.tracked
+        gaussians = None if scene is None else _read_scene(scene, tracked, notes)
+        seconds: dict[str, float] = {}
         with stage(console, "detecting motion"):
             anchor, moved = detect_motion(tracked, options.parts, options.anchor)
         masks = _masks(tracked, anchor, moved, options)
@@ -97,7 +98,7 @@ def run(options: Options) -> int:
             scene = _fitted(settings, folder, anchor, recording, console)
             if scene is None:
                 return 130
-            gaussians = _read_scene(scene)
+            gaussians = _read_scene(scene, tracked, notes)
         seconds["canonical"], at = perf_counter() - at, perf_counter()
         with stage(console, "discovering parts in all views"):
             key = jax.random.key(options.parts.seed)
@@ -195,8 +196,12 @@ def _ply_of(path: Path) -> Path:
     return path
 
 
-def _read_scene(path: Path) -> Gaussians:
-    return jax.tree.map(jnp.asarray, read_ply(path)[0])
+def _read_scene(path: Path, sequence: Sequence, notes: Notes) -> Gaussians:
+    """The Gaussians of a PLY file, relative to the origin of the recording."""
+    gaussians, report = read_drawable(path)
+    if report.antialiased:
+        notes.warn(f"{path} is to be drawn antialiased, and parts are not: small Gaussians look brighter")
+    return jax.tree.map(jnp.asarray, moved_to(gaussians, report.origin, sequence.origin))
 
 
 def _fit_options(options: Options, path: Path, anchor: Anchor, recording: Recording) -> FitOptions:

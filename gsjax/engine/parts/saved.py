@@ -10,14 +10,16 @@ import jax.numpy as jnp
 import jaxlie
 import numpy as np
 import yaml
+from jaxtyping import Float
 
-from gsjax.engine.files import check_arrays, chosen_camera, read_arrays, read_scene, reopen
+from gsjax.engine.files import about_scene, check_arrays, chosen_camera, read_arrays, read_scene, reopen
 from gsjax.engine.folder import expect_run
 from gsjax.engine.recording import Recording
 from gsjax.methods.parts import PartScene, order_of_frames, trajectory_of
 from gsjax.methods.parts.film import Layer
 from gsjax.methods.parts.timeline import Names
 from gsjax.scene.handles import Blend, HandlePose
+from gsjax.scene.origin import in_world, moved_to, relative_to
 
 _FILES = ("parts.npz", "scene.ply", "metrics.json")
 _ARRAYS = {
@@ -67,9 +69,9 @@ def open_parts_run(path: Path) -> PartsRun:
         FileNotFoundError: there is no such folder, it is no run's, or a file of it is missing.
         ValueError: a file is not as the run wrote it, or its recording cannot be opened.
     """
-    layer, names, complete = _read(path)
+    layer, names, complete, origin = _read(path)
     recording, blend = reopen(path / "config.yml", _AGAIN, _blend)
-    return PartsRun(path, layer, names, complete, recording, blend)
+    return PartsRun(path, layer, names, complete, about_scene(recording, origin), blend)
 
 
 def blend_of(path: Path) -> Blend:
@@ -90,11 +92,28 @@ def read_parts(path: str | Path) -> tuple[Layer, Names]:
     Raises:
         FileNotFoundError, ValueError: as for `open_parts_run`.
     """
-    layer, names, _ = _read(Path(path))
+    layer, names, *_ = _read(Path(path))
     return layer, names
 
 
-def _read(path: Path) -> tuple[Layer, dict[str, int], bool]:
+def read_parts_about(path: str | Path, origin: Float[np.ndarray, "3"] | None) -> tuple[Layer, Names]:
+    """As `read_parts`, relative to the origin of another run.
+
+    Args:
+        path: the folder.
+        origin: that of the other run.
+
+    Raises:
+        FileNotFoundError, ValueError: as for `open_parts_run`.
+    """
+    layer, names, _, own = _read(Path(path))
+    scene = layer.scene
+    centers = jnp.asarray(relative_to(in_world(np.asarray(scene.centers), own), origin), float)
+    scene = PartScene(moved_to(scene.gaussians, own, origin), scene.weights, centers)
+    return Layer(scene, layer.trajectory), names
+
+
+def _read(path: Path) -> tuple[Layer, dict[str, int], bool, Float[np.ndarray, "3"] | None]:
     expect_run(path, made_by="`gsjax parts`")
     missing = [name for name in _FILES if not (path / name).is_file()]
     if missing:
@@ -110,7 +129,8 @@ def _read(path: Path) -> tuple[Layer, dict[str, int], bool]:
     num, parts = arrays["weights"].shape
     anchor, frames = int(arrays["anchor"]), len(arrays["times"])
     names, followed = _of_metrics(path / "metrics.json", frames)
-    gaussians = read_scene(path, num, "parts.npz", _AGAIN)
+    gaussians, origin = read_scene(path, num, "parts.npz", _AGAIN)
+    arrays["centres"] = relative_to(arrays["centres"], origin)
     # The other frames hold the poses of the anchor.
     done = np.sort([anchor, *order_of_frames(frames, anchor)[: followed - 1]])
     R, t, times = (jnp.asarray(arrays[name][done], float) for name in ("R", "t", "times"))
@@ -118,7 +138,7 @@ def _read(path: Path) -> tuple[Layer, dict[str, int], bool]:
     poses = HandlePose(jaxlie.SO3.from_matrix(R).wxyz, t)
     names = {name: part for name, part in names.items() if part < parts}
     layer = Layer(PartScene(gaussians, weights, centers), trajectory_of(times, poses))
-    return layer, names, len(done) == frames
+    return layer, names, len(done) == frames, origin
 
 
 def _kind(file: Path) -> str | None:

@@ -30,6 +30,7 @@ from gsjax.io.pictures import write_png
 from gsjax.io.video import VideoWriter
 from gsjax.methods.grasping import Grasp, Gripper, best_grasp
 from gsjax.optim.compiler import host_options
+from gsjax.scene.origin import in_world
 from gsjax.viz.colors import captioned
 
 _WRITTEN = ("grasps.npz", "video.mp4", "frame_*.png")
@@ -89,7 +90,9 @@ def _write(
 ) -> None:
     """Write grasps.npz, the video and one of its frames."""
     times = recording.tracked.times[: saved.tracking.num_frames]
-    arrays = {"poses": grasps.pose, "widths": grasps.width, "scores": grasps.score}
+    poses = np.array(grasps.pose, np.float64)
+    poses[..., :3, 3] = in_world(poses[..., :3, 3], recording.tracked.origin)
+    arrays = {"poses": poses, "widths": grasps.width, "scores": grasps.score}
     write_npz(folder / "grasps.npz", {"times": times, **arrays, "feasible": grasps.feasible})
     middle = saved.tracking.num_frames // 2
     with VideoWriter(folder / "video.mp4", frame_rate(times)) as video:

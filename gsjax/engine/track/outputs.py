@@ -1,33 +1,37 @@
 """Files of a tracked recording: trajectory, scene and plots."""
 
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 
+from gsjax.engine.files import write_scene
 from gsjax.engine.folder import RunFolder
 from gsjax.engine.recording import FirstMask, Recording
 from gsjax.engine.scores import Scores
 from gsjax.engine.summary import Media
 from gsjax.engine.track.loop import Tracking
 from gsjax.io.pictures import write_png
-from gsjax.io.ply import write_ply
 from gsjax.metrics.tracking import ObjectScore, relative_motion
+from gsjax.scene.origin import in_world
 from gsjax.viz import plots
 from gsjax.viz.colors import overlay_labels
 
 
-def write_tracking(folder: RunFolder, tracking: Tracking, times: np.ndarray) -> None:
+def write_tracking(
+    folder: RunFolder, tracking: Tracking, times: np.ndarray, origin: Float[np.ndarray, "3"] | None = None
+) -> None:
     """Write trajectory.npz and scene.ply; this comes before scoring, which may be stopped.
 
     Args:
         folder: of the run.
         tracking: the scene and its poses.
         times: [T] of the frames, seconds.
+        origin: what places are relative to; it is put back, and means are then float64.
     """
     # Parts of one object are one label in the files.
     label_ids, label_of = np.unique(tracking.scene.label_ids, return_inverse=True)
     labels = label_of[np.asarray(tracking.scene.labels)].astype(np.int32)
     folder.write_trajectory(
-        means=tracking.means().astype(np.float32),
+        means=in_world(tracking.means().astype(np.float32), origin),
         quats=tracking.quats().astype(np.float32),
         normals=np.asarray(tracking.scene.normals, np.float32),
         labels=labels,
@@ -37,7 +41,7 @@ def write_tracking(folder: RunFolder, tracking: Tracking, times: np.ndarray) -> 
         times=times[: tracking.num_frames],
         update_s=np.asarray(tracking.update_s),
     )
-    write_ply(folder.scene, tracking.scene.gaussians, labels=labels)
+    write_scene(folder.scene, tracking.scene.gaussians, labels, origin=origin)
 
 
 def _of_objects(flags: list[np.ndarray], label_of: np.ndarray) -> Bool[np.ndarray, "T K"]:

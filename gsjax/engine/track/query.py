@@ -27,6 +27,7 @@ from gsjax.io.video import VideoWriter
 from gsjax.methods.protocols import LanguageEncoder
 from gsjax.methods.track import find_object
 from gsjax.perception.closed_vocabulary import ClosedVocabulary
+from gsjax.scene.origin import in_world
 from gsjax.viz.colors import highlight, label_color, to_uint8
 
 _CLOSE = 0.02  # a smaller margin is called a close call
@@ -83,7 +84,7 @@ def ask_for_object(options: ObjectQuery, console: Console) -> None:
                     "indices": answer.rows,
                     "scores": np.array(list(answer.scores.values()), np.float32),
                     "names": np.array(list(answer.scores)),
-                    "means": saved.tracking.means()[:, answer.rows],
+                    "means": in_world(saved.tracking.means()[:, answer.rows], saved.recording.tracked.origin),
                     "times": recording.tracked.times[: saved.tracking.num_frames],
                 },
             )

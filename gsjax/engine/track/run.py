@@ -111,7 +111,7 @@ def run(options: Options) -> int:
         loop = {"budget_ms": options.budget_ms, "like": rehearsal.tick, "saved": saver}
         follow(tracking, first, recording.tracked, options.track, console, **loop)
         seconds |= tracking.seconds()
-        write_tracking(folder, tracking, recording.tracked.times)
+        write_tracking(folder, tracking, recording.tracked.times, recording.tracked.origin)
         _note_if_stopped(tracking, recording, notes)
         found, media, failed = _judge(
             folder, tracking, recording, mask, seconds, notes, console, options.budget_ms

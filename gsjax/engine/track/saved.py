@@ -6,12 +6,15 @@ from pathlib import Path
 
 import jax
 import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
 
-from gsjax.engine.files import chosen_camera, read_arrays, read_scene, reopen
+from gsjax.engine.files import about_scene, chosen_camera, read_arrays, read_scene, reopen
 from gsjax.engine.folder import expect_run
 from gsjax.engine.recording import Recording
 from gsjax.engine.track.loop import Tracking
 from gsjax.methods.track import Pose, TrackedScene
+from gsjax.scene.origin import relative_to
 
 _AGAIN = "track again with this version of gsjax, or name another folder"
 
@@ -56,8 +59,8 @@ def open_run(path: Path) -> SavedRun:
     missing = [n for n in ("trajectory.npz", "scene.ply", "metrics.json") if not (path / n).is_file()]
     if missing:
         raise FileNotFoundError(f"{path}: expected a complete run, found no {missing[0]}; {_AGAIN}")
-    tracking = read_tracking(path)
-    recording, _ = reopen(path / "config.yml", _AGAIN)
+    tracking, origin = _read_tracking(path)
+    recording = about_scene(reopen(path / "config.yml", _AGAIN)[0], origin)
     if recording.tracked.num_frames < tracking.num_frames:
         found = f"{recording.tracked.num_frames} frames where the run has {tracking.num_frames}"
         raise ValueError(f"{path}: expected its recording as it was, found {found}; restore it, or {_AGAIN}")
@@ -72,11 +75,18 @@ def read_tracking(path: Path) -> Tracking:
     Raises:
         ValueError: they do not match, or one of them cannot be read.
     """
+    return _read_tracking(path)[0]
+
+
+def _read_tracking(path: Path) -> tuple[Tracking, Float[np.ndarray, "3"] | None]:
+    """The same, and the origin that it is relative to."""
     wanted = ("means", "quats", "normals", "labels", "label_ids", "lost", "turn_known")
     arrays = read_arrays(path / "trajectory.npz", wanted, _AGAIN)
     means, quats, labels = arrays["means"], arrays["quats"], arrays["labels"]
     count, moving = means.shape[1], quats.shape[1]
-    gaussians = read_scene(path, count, "trajectory.npz", _AGAIN)
+    gaussians, origin = read_scene(path, count, "trajectory.npz", _AGAIN)
+    if origin is not None:
+        means = relative_to(means, origin).astype(np.float32)
     if len(labels) != count:
         raise ValueError(f"{path}: expected {count} labels in trajectory.npz, found {len(labels)}; {_AGAIN}")
     scene = TrackedScene(
@@ -89,7 +99,8 @@ def read_tracking(path: Path) -> Tracking:
     poses = jax.device_get(
         [Pose(jnp.asarray(m[:moving]), jnp.asarray(q)) for m, q in zip(means, quats, strict=True)]
     )
-    return Tracking(scene, poses, lost=[*arrays["lost"][1:]], turn_known=[*arrays["turn_known"][1:]])
+    flags = {name: [*arrays[name][1:]] for name in ("lost", "turn_known")}
+    return Tracking(scene, poses, **flags), origin
 
 
 def _read_metrics(file: Path, scene: TrackedScene) -> tuple[int | None, dict[int, str]]:

@@ -6,6 +6,7 @@ import shutil
 import numpy as np
 import pytest
 
+from gsjax.io.labels import labels_beside
 from gsjax.io.ply import read_ply, write_ply
 from tests.cli.distill.conftest import CAN, told_of
 
@@ -33,8 +34,9 @@ def test_a_scene_is_found_by_what_is_in_it(gsjax, field, scene, tmp_path):
     moved = shutil.move(field, run / "field")
     change(moved, lambda about: about["scene"].update(file=str(run / "scene.ply")))
     gaussians, _ = read_ply(scene[0])
-    write_ply(run / "scene.ply", gaussians)
-    shutil.copy(scene[0], run / "canonical" / "scene.ply")
+    write_ply(run / "scene.ply", gaussians, antialiased=True)
+    for file in (scene[0], labels_beside(scene[0])):
+        shutil.copy(file, run / "canonical")
     code, said = gsjax("query", moved, "can", "--camera", 0)
     assert code == 0, said
     assert "has changed since" not in said

@@ -50,13 +50,14 @@ def test_a_scene_is_read_once(fitted, asked, notes, monkeypatch):
 
 
 def test_a_field_alone_is_asked_of_the_scene_that_is_named(fitted, asked, tmp_path, notes, view):
-    write_ply(fitted / "scene.ply", some(), labels=np.arange(30) % 3)  # not as it was
+    write_ply(fitted / "scene.ply", some(), labels=np.arange(30) % 3, antialiased=True)  # not as it was
     scene, _ = open_viewable(fitted, notes)
     assert any("has changed since the field in" in note for note in notes.all)
     mine = tmp_path / "mine"
     mine.mkdir()
     shutil.copy(asked / "field.npz", mine)
-    shutil.move(fitted / "scene.ply", tmp_path / "moved.ply")
+    for ending in (".ply", "_labels.npz"):
+        shutil.move(fitted / f"scene{ending}", tmp_path / f"moved{ending}")
     code, said = view(mine, "--port", 0)
     assert code == 2
     assert "give it with --scene" in said
@@ -80,10 +81,10 @@ def test_what_was_found_is_kept_and_nothing_written_over(fitted, asked, notes, m
     def full(*args, **options):
         raise OSError("no space")
 
-    monkeypatch.setattr("gsjax.engine.query.write_ply", full)
+    monkeypatch.setattr("gsjax.engine.query.write_scene", full)
     with pytest.raises(OSError, match="no space"):
         asking.save(selected, "x", 0)
-    assert sorted(asked.joinpath("extracted").iterdir()) == paths
+    assert sorted(asked.joinpath("extracted").glob("*.ply")) == paths
 
 
 def test_who_reads_texts_is_loaded_once(fitted, asked, notes, monkeypatch):

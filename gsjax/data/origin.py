@@ -1,0 +1,80 @@
+"""Recordings and photographs whose coordinates lie far from 0: read relative to an origin of their own."""
+
+import functools
+import warnings
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any, ParamSpec, TypeVar
+
+import numpy as np
+from jaxtyping import Float
+
+from gsjax.data.errors import DataWarning
+from gsjax.data.objects import PointModel, Truth
+from gsjax.data.photographs import Photographs
+from gsjax.data.sequence import Sequence
+from gsjax.scene.origin import about, far_origin, in_words
+
+Data = TypeVar("Data", Photographs, Sequence)
+Given = ParamSpec("Given")
+
+
+def near_origin(read: Callable[Given, Data]) -> Callable[Given, Data]:
+    """A reader whose data, where they lie far from 0, are relative to an `origin`; it warns of that.
+
+    Args:
+        read: reads photographs or a recording in the coordinates of the files.
+    """
+
+    @functools.wraps(read)
+    def reader(*args: Given.args, **options: Given.kwargs) -> Data:
+        data = read(*args, **options)
+        centers = np.linalg.solve(data.viewmats, np.array([0.0, 0.0, 0.0, 1.0])[:, None])[..., :3, 0]
+        cloud = data.cloud if isinstance(data, Photographs) else None
+        origin = far_origin(centers.reshape(-1, 3), [] if cloud is None else [cloud.points])
+        if origin is None:
+            return data
+        words = in_words(centers.reshape(-1, 3), origin)
+        warnings.warn(f"{data.name}: {words}, and put back in what is written", DataWarning, stacklevel=2)
+        return relative_to_origin(data, origin)
+
+    return reader
+
+
+def relative_to_origin(data: Data, origin: Float[np.ndarray, "3"] | None) -> Data:
+    """The same data relative to another origin; None for the coordinates of the files."""
+    old, new = (np.zeros(3) if each is None else each for each in (data.origin, origin))
+    shift = new - old
+    if not shift.any():
+        return data
+    changed: dict[str, Any] = {"origin": origin, "viewmats": about(data.viewmats, shift)}
+    if isinstance(data, Photographs):
+        if data.cloud is not None:
+            changed["cloud"] = replace(data.cloud, points=np.asarray(data.cloud.points, np.float64) - shift)
+    else:
+        changed["truth"] = None if data.truth is None else _moved_truth(data.truth, shift)
+        changed["models"] = tuple(_moved_model(model, shift) for model in data.models)
+    return replace(data, **changed)
+
+
+def _moved_truth(truth: Truth, shift: Float[np.ndarray, "3"]) -> Truth:
+    tracks = None if truth.tracks is None else truth.tracks - shift
+    joints = tuple(joint and replace(joint, point=joint.point - shift) for joint in truth.joints)
+    return replace(truth, poses=_moved_poses(truth.poses, shift), joints=joints, tracks=tracks)
+
+
+def _moved_model(model: PointModel, shift: Float[np.ndarray, "3"]) -> PointModel:
+    pose = None if model.pose is None else _moved_poses(model.pose, shift)
+    plane = model.plane
+    if plane is not None:  # n.x + d = 0
+        plane = np.append(plane[:3], plane[3] + plane[:3] @ shift)
+    return replace(model, pose=pose, plane=plane)
+
+
+def _moved_poses(
+    poses: Float[np.ndarray, "*batch 4 4"], shift: Float[np.ndarray, "3"]
+) -> Float[np.ndarray, "*batch 4 4"]:
+    """Transforms from an object to the world, of a world whose origin was moved by `shift`."""
+    moved = np.array(poses, np.float64)
+    moved[..., :3, 3] -= shift
+    return moved

@@ -1,0 +1,35 @@
+"""What a PLY file of Gaussians holds, as `gsjax info` prints it."""
+
+from pathlib import Path
+
+import numpy as np
+
+from gsjax.io.ply import read_ply
+from gsjax.scene.origin import in_world
+
+
+def describe_scene(file: Path) -> dict[str, str]:
+    """Facts about the Gaussians of a PLY file; what cannot be drawn is warned of.
+
+    Raises:
+        PlyError: it holds no Gaussians.
+    """
+    gaussians, report = read_ply(file)
+    facts = {"Gaussians": f"{gaussians.num:,}"}
+    if report.stored != gaussians.num:
+        facts["Gaussians"] += f" of {report.stored:,}"
+    facts["colours"] = f"spherical harmonics of degree {gaussians.sh_degree}"
+    if gaussians.num:
+        means = in_world(np.asarray(gaussians.means), report.origin)
+        low, high = np.percentile(means, [1, 99], axis=0)
+        facts["places"] = " to ".join(f"({', '.join(f'{x:.2f}' for x in end)})" for end in (low, high))
+        facts["sizes"] = "{:.2g} to {:.2g}".format(*np.percentile(gaussians.scales, [1, 99]))
+        facts["opacities"] = "{:.2f} to {:.2f}".format(*np.percentile(gaussians.opacities, [1, 99]))
+    if report.origin is not None:
+        facts["origin"] = f"({', '.join(f'{value:.12g}' for value in report.origin)})"
+    facts["drawn"] = "antialiased" if report.antialiased else "classic"
+    if report.labels is not None:
+        facts["labels"] = ", ".join(map(str, np.unique(report.labels)[:8])) or "none"
+    if report.extra:
+        facts["not read"] = ", ".join(report.extra)
+    return facts

@@ -1,0 +1,56 @@
+"""Labels of Gaussians, in a file beside their PLY: readers of 3DGS refuse or misread an integer property."""
+
+import os
+import warnings
+import zipfile
+import zlib
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Int, Integer
+
+from gsjax.io.atomic import write_npz
+
+ENDING = "_labels.npz"
+_NAME = "labels"
+
+
+def labels_beside(path: str | os.PathLike) -> Path:
+    """The file of the labels of a PLY: scene_labels.npz of scene.ply."""
+    path = Path(path)
+    return path.with_name(path.stem + ENDING)
+
+
+def write_labels(path: str | os.PathLike, labels: Integer[np.ndarray, "N"]) -> None:
+    """Write the labels of the PLY at `path` beside it, atomically.
+
+    Args:
+        path: the PLY.
+        labels: one for each of its rows.
+    """
+    write_npz(labels_beside(path), {_NAME: np.asarray(labels, np.int32)})
+
+
+def read_labels(path: str | os.PathLike, count: int) -> Int[np.ndarray, "N"] | None:
+    """The labels beside the PLY at `path`, one for each row; None without, and, with a warning, where they do
+    not fit it.
+
+    Args:
+        path: the PLY.
+        count: number of its rows.
+    """
+    file = labels_beside(path)
+    if not file.is_file():
+        return None
+    expected = f"expected {count} integers called {_NAME}, one for each Gaussian of {Path(path).name}"
+    try:
+        with np.load(file, allow_pickle=False) as saved:
+            found = saved[_NAME]
+    except (ValueError, KeyError, TypeError, EOFError, OSError, zipfile.BadZipFile, zlib.error):
+        said = "a file without them"
+    else:
+        if found.shape == (count,) and np.issubdtype(found.dtype, np.integer):
+            return found.astype(np.int32)
+        said = f"{found.dtype} of shape {found.shape}"
+    warnings.warn(f"{file}: {expected}, found {said}; they are left out", UserWarning, stacklevel=1)
+    return None

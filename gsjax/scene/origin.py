@@ -1,0 +1,95 @@
+"""Coordinates far from the origin, such as UTM or earth-centred ones: float32 would round a scene there to
+steps of centimetres or metres, so they are held relative to an origin of their own, which is in float64."""
+
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from gsjax.geometry.cameras import NEAR
+from gsjax.scene.gaussians import Gaussians
+
+FAR = 1e3
+"""A scene is far if its distance from the origin is this many times its size: float32 then rounds places to
+some 1e-4 of the scene, about a tenth of a pixel."""
+_MOST = 0.9  # quantile of distances that is the size, so that a few stray points do not count
+
+
+def far_origin(
+    places: Float[np.ndarray, "n 3"], others: Sequence[Float[np.ndarray, "m 3"]] = ()
+) -> Float[np.ndarray, "3"] | None:
+    """An origin near the middle of `places`, in round numbers; None if they are not far from the present one.
+
+    Args:
+        places: of cameras or Gaussians, float64.
+        others: further places of the same scene, which add to its size.
+    """
+    finite = [each[np.isfinite(each).all(1)] for each in (places, *others)]
+    if not len(finite[0]):
+        return None
+    middle = np.median(finite[0], axis=0)
+    sizes = [np.quantile(np.linalg.norm(each - middle, axis=1), _MOST) for each in finite if len(each)]
+    size = max(*sizes, NEAR)
+    if np.abs(middle).max() <= FAR * size:
+        return None
+    step = 10.0 ** np.floor(np.log10(size))
+    return np.round(middle / step) * step
+
+
+def about(
+    viewmats: Float[np.ndarray, "*batch 4 4"], origin: Float[np.ndarray, "3"] | None
+) -> Float[np.ndarray, "*batch 4 4"]:
+    """View matrices of the same cameras for coordinates relative to `origin`; as they are if it is None.
+
+    Args:
+        viewmats: world to camera, float64.
+        origin: in the coordinates of `viewmats`.
+    """
+    if origin is None:
+        return viewmats
+    moved = np.array(viewmats, np.float64)
+    moved[..., :3, 3] += moved[..., :3, :3] @ origin
+    return moved
+
+
+def cameras_in_world(
+    viewmats: Float[np.ndarray, "*batch 4 4"], origin: Float[np.ndarray, "3"] | None
+) -> Float[np.ndarray, "*batch 4 4"]:
+    """View matrices for coordinates relative to an origin, for those of the data: the inverse of `about`."""
+    return viewmats if origin is None else about(viewmats, -origin)
+
+
+def in_world(
+    places: Float[np.ndarray, "*batch 3"], origin: Float[np.ndarray, "3"] | None
+) -> Float[np.ndarray, "*batch 3"]:
+    """Places relative to an origin, in the coordinates of the data: float64, or as they are if it is None."""
+    return places if origin is None else np.asarray(places, np.float64) + origin
+
+
+def relative_to(
+    places: Float[np.ndarray, "*batch 3"], origin: Float[np.ndarray, "3"] | None
+) -> Float[np.ndarray, "*batch 3"]:
+    """Places in the coordinates of the data, relative to an origin: the inverse of `in_world`."""
+    return places if origin is None else np.asarray(places, np.float64) - origin
+
+
+def moved_to(
+    gaussians: Gaussians, was: Float[np.ndarray, "3"] | None, now: Float[np.ndarray, "3"] | None
+) -> Gaussians:
+    """Gaussians relative to the origin `was`, relative to the origin `now`; None is that of the data."""
+    if was is None and now is None:
+        return gaussians
+    means = relative_to(in_world(np.asarray(gaussians.means), was), now)
+    return eqx.tree_at(lambda g: g.means, gaussians, jnp.asarray(means, gaussians.means.dtype))
+
+
+def in_words(places: Float[np.ndarray, "n 3"], origin: Float[np.ndarray, "3"]) -> str:
+    """What is said of coordinates that are taken relative to an origin."""
+    largest = np.abs(places[np.isfinite(places).all(1)]).max()
+    step = np.spacing(np.float32(largest))
+    return (
+        f"coordinates reach {largest:.4g}, where float32 has steps of {step:.2g}; they are taken relative to "
+        f"the origin ({', '.join(f'{value:.12g}' for value in origin)})"
+    )
