@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from gsjax.data.errors import DataError, DataWarning
-from gsjax.data.files import read_image, read_mask
+from gsjax.data.files import read_image
 from gsjax.data.frame_folders import (
     DEFAULT_RATE_HZ,
     check_one_size,
@@ -23,6 +23,7 @@ from gsjax.data.frame_folders import (
     warn_about_single_frame,
 )
 from gsjax.data.lens import intrinsics_matrix
+from gsjax.data.masks import read_mask
 from gsjax.data.sequence import Sequence
 from gsjax.data.tool_masks import LABEL_NAMES, Tool, check_tool, find_masks, tool_labels
 from gsjax.data.video import Video, describe_video

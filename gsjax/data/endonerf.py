@@ -18,7 +18,7 @@ from jaxtyping import Float
 
 from gsjax.data import poses_bounds
 from gsjax.data.errors import DataError, DataWarning
-from gsjax.data.files import read_arrays, read_depth, read_image, read_json, read_mask
+from gsjax.data.files import read_arrays, read_depth, read_image, read_json
 from gsjax.data.frame_folders import (
     DEFAULT_RATE_HZ,
     check_one_size,
@@ -27,6 +27,7 @@ from gsjax.data.frame_folders import (
     pictures_beside,
     warn_about_single_frame,
 )
+from gsjax.data.masks import read_mask
 from gsjax.data.objects import Truth
 from gsjax.data.sequence import Sequence
 from gsjax.data.tool_masks import LABEL_NAMES, TOOL, Tool, check_tool, find_masks, tool_labels

@@ -19,9 +19,7 @@ import numpy as np
 from gsjax import extras
 from gsjax.data.errors import DataError, DataWarning
 from gsjax.data.files import picture_size, read_image
-
-SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
-"""File extensions of photographs, in lower case."""
+from gsjax.data.pictures import SUFFIXES, is_picture, refuse_unread
 
 _SMALLEST_MODEL = 3  # photographs: two fix no scale, and almost any two have some matches
 _ENOUGH_FOR_CENTER = 20  # photographs per camera
@@ -110,16 +108,14 @@ def list_photographs(folder: Path) -> list[str]:
     """
     if not folder.is_dir():
         raise DataError(folder, "a folder of photographs or a video", "nothing there", "Check the path.")
-    names = sorted(
-        path.relative_to(folder).as_posix()
-        for path in folder.rglob("*")
-        if path.suffix.lower() in SUFFIXES and path.is_file() and not path.name.startswith(".")
-    )
+    files = [path for path in folder.rglob("*") if path.is_file()]
+    names = sorted(path.relative_to(folder).as_posix() for path in files if is_picture(path))
+    expected = f"{_SMALLEST_MODEL} photographs or more ({', '.join(SUFFIXES)})"
+    refuse_unread(folder, expected, files, others=len(names))
     bad = {name: reason for name in names if (reason := _unreadable(folder / name)) is not None}
     good = [name for name in names if name not in bad]
     if len(good) < _SMALLEST_MODEL:
         found = f"{len(good) or 'none'}" + (f", and {len(bad)} that cannot be read" if bad else "")
-        expected = f"{_SMALLEST_MODEL} photographs or more ({', '.join(SUFFIXES)})"
         raise DataError(folder, expected, found, "Give the folder that holds them.")
     if bad:
         first = next(iter(bad.values()))
