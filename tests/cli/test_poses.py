@@ -125,6 +125,15 @@ def test_folders_that_cannot_be_used(say, tmp_path):
         "nowhere: expected a folder of photographs or a video" in say(tmp_path / "nowhere", "--out", out)[1]
     )
     assert "b.jpg: expected a video" in say(tmp_path / "empty/b.jpg", "--out", out)[1]
+    (tmp_path / "phone").mkdir()
+    for name in ("1.HEIC", "2.heic"):
+        (tmp_path / "phone" / name).write_bytes(b"")
+    said = say(tmp_path / "phone", "--out", out)[1]
+    assert "phone: expected 3 photographs or more" in said
+    assert "found 2 in a format that is not read (HEIC: " in said
+    assert "Convert to JPEG or PNG first" in said
+    dots.save(tmp_path / "phone/a.png", np.zeros((20, 20, 3), np.uint8))
+    assert "besides 1 pictures, 2 in a format that is not read" in say(tmp_path / "phone", "--out", out)[1]
     assert not (tmp_path / "new").exists()
     said = say(tmp_path / "empty", "--out", tmp_path / "empty")[1]
     assert "the photographs themselves are there; name another folder" in said
