@@ -21,7 +21,7 @@ from gsjax.data.colmap_files import AGAIN, CameraEntry, ImageEntry, read_cameras
 from gsjax.data.errors import DataError, DataWarning
 from gsjax.data.files import BLACK, background_behind, picture_size, read_image
 from gsjax.data.lens import scaled_intrinsics, undistort
-from gsjax.data.masks import read_valid_pixels
+from gsjax.data.masks import read_shades
 from gsjax.data.names import find_file, portable
 from gsjax.data.photographs import Cloud, Photographs
 from gsjax.data.pictures import refuse_unread
@@ -209,7 +209,7 @@ def _photographs(
     def load_mask(i: int) -> np.ndarray | None:
         if (mask := masks[i]) is None:
             return None
-        valid = read_valid_pixels(mask, *sizes[i]).astype(np.uint8)
+        valid = (read_shades(mask, *sizes[i]) != 0).astype(np.uint8)
         return ideal[i][1](valid, cv2.INTER_NEAREST) > 0
 
     return Photographs(

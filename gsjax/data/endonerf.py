@@ -27,7 +27,7 @@ from gsjax.data.frame_folders import (
     pictures_beside,
     warn_about_single_frame,
 )
-from gsjax.data.masks import read_mask
+from gsjax.data.masks import read_shades
 from gsjax.data.objects import Truth
 from gsjax.data.sequence import Sequence
 from gsjax.data.tool_masks import LABEL_NAMES, TOOL, Tool, check_tool, find_masks, tool_labels
@@ -95,7 +95,7 @@ def read_endonerf(
     eyes = _find_eyes(root, images, frames, baseline_m, meta)
 
     def load_mask(path: Path) -> np.ndarray:
-        return tool_labels(read_mask(path, width, height), tool)
+        return tool_labels(read_shades(path, width, height), tool)
 
     def load_depth(path: Path) -> np.ndarray:
         return _within_percentiles(read_depth(path, unit, width, height), depth_percentiles)

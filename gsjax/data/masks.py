@@ -1,22 +1,24 @@
-"""Masks in pictures: labels of pixels, and which pixels count."""
+"""Masks in pictures: labels of pixels, and shades of black and white."""
 
 import io
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, Int, UInt8
+from jaxtyping import Int, UInt8
 
 from gsjax.data.errors import DataError
 from gsjax.data.files import check_size, decode, read_complete
 
 _KIND, _EXPECTED = "a mask", "one label per pixel"
 _HALF = 128  # of alpha
+_WHITE = 255
 _ADVICE = "Save one label per pixel, as a single-channel PNG."
 
 
 def read_mask(path: Path, width: int, height: int) -> Int[np.ndarray, "height width"]:
     """Integer labels, int32: the values of a picture of one channel or of three equal ones, 0 where it is
-    transparent, or the indices of a palette of colours.
+    transparent, or the indices of a palette, unless that is of shades of grey in no order, as programs make
+    of grey pictures to save space.
 
     Args:
         path: the file.
@@ -25,35 +27,54 @@ def read_mask(path: Path, width: int, height: int) -> Int[np.ndarray, "height wi
     Raises:
         DataError: the file is missing, truncated, has channels that differ, or is of another size.
     """
-    labels = _labels(path, width, height)
+    indices, palette = _indexed(path)
+    if _is_shuffled_grey(palette):
+        labels = _shades(path, width, height)
+    else:
+        check_size(path, indices, width, height)
+        labels = _with_black_as_zero(indices, palette)
     if labels.ndim == 3:
-        raise DataError(path, _EXPECTED, f"{labels.shape[2]} channels that differ", _ADVICE)
+        raise _differ(path, labels)
     return labels.astype(np.int32)
 
 
-def read_valid_pixels(path: Path, width: int, height: int) -> Bool[np.ndarray, "height width"]:
-    """Which pixels count: those whose label is not 0. A picture of black and one colour serves as well.
+def read_shades(path: Path, width: int, height: int) -> Int[np.ndarray, "height width"]:
+    """Shades of grey, int32, of a mask in black and white. In one of black and a colour, or with a palette of
+    colours, whatever is not black is white.
 
     Args:
         path: the file.
         width, height: expected size, pixels.
 
     Raises:
-        DataError: as for `read_mask`, or there is more than one colour besides black.
+        DataError: as for `read_mask`, or there is more than one colour besides black, without a palette.
     """
-    labels = _labels(path, width, height)
-    if labels.ndim == 2:
-        return labels != 0
-    colored = labels.any(-1)
-    if len(np.unique(labels[colored], axis=0)) > 1:
-        raise DataError(path, _EXPECTED, f"{labels.shape[2]} channels that differ", _ADVICE)
-    return colored
+    shades = _shades(path, width, height)
+    if shades.ndim == 3:
+        white, (indices, palette) = shades.any(-1), _indexed(path)
+        if len(palette):
+            white = indices != 0 if white.all() else white
+        elif len(np.unique(shades[white], axis=0)) > 1:
+            raise _differ(path, shades)
+        shades = np.where(white, _WHITE, 0)
+    return shades.astype(np.int32)
 
 
-def _labels(path: Path, width: int, height: int) -> np.ndarray:
-    """Labels [H,W]; or colours [H,W,3] if channels differ."""
-    indices = _palette_labels(path)
-    raw = decode(path, _KIND) if indices is None else indices
+def _with_black_as_zero(indices: np.ndarray, palette: np.ndarray) -> np.ndarray:
+    """The indices; where 0 does not occur, that of black is 0. Palettes that are fixed, as those of web
+    browsers, have black elsewhere."""
+    used = np.unique(indices)
+    black = [i for i in used.tolist() if i < len(palette) and not palette[i].any()]
+    return np.where(indices == black[0], 0, indices) if used[0] != 0 and len(black) == 1 else indices
+
+
+def _differ(path: Path, colors: np.ndarray) -> DataError:
+    return DataError(path, _EXPECTED, f"{colors.shape[2]} channels that differ", _ADVICE)
+
+
+def _shades(path: Path, width: int, height: int) -> np.ndarray:
+    """The values of a picture [H,W]; or its colours [H,W,3] if channels differ."""
+    raw = decode(path, _KIND)
     check_size(path, raw, width, height)
     if raw.dtype.kind not in "ui":
         raise DataError(path, _EXPECTED, f"{raw.dtype}", _ADVICE)
@@ -75,22 +96,22 @@ def _opaque(path: Path, colors: np.ndarray, alpha: np.ndarray) -> np.ndarray:
     return np.where(opaque[..., None], colors, 0)
 
 
-def _palette_labels(path: Path) -> np.ndarray | None:
-    """The indices of a picture with a palette; None if it has none, or one of shades of grey that are not in
-    their order, as programs make of grey pictures to save space."""
+def _indexed(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """The indices of a picture and its palette [n,3]; both are empty without a palette."""
     from PIL import Image, UnidentifiedImageError
 
+    none = np.zeros((0, 0), np.uint8), np.zeros((0, 3), np.uint8)
     content = read_complete(path, _KIND)
     try:
         with Image.open(io.BytesIO(content)) as image:
             if image.mode != "P":
-                return None
-            palette = np.reshape(image.getpalette("RGB"), (-1, 3))
-            return None if _is_shuffled_grey(palette) else np.asarray(image)
+                return none
+            return np.asarray(image), np.reshape(image.getpalette("RGB"), (-1, 3))
     except (UnidentifiedImageError, OSError, SyntaxError, Image.DecompressionBombError):
-        return None  # whoever decodes it tells
+        return none  # whoever decodes it tells
 
 
 def _is_shuffled_grey(palette: UInt8[np.ndarray, "n 3"]) -> bool:
+    """Whether the indices of a palette mean nothing; so it is without one."""
     shades = list(dict.fromkeys(palette[:, 0].tolist()))
-    return bool((palette == palette[:, :1]).all()) and shades != sorted(shades)
+    return bool((palette == palette[:, :1]).all()) and (not shades or shades != sorted(shades))

@@ -31,7 +31,7 @@ from gsjax.data.files import (
     read_json,
 )
 from gsjax.data.lens import Lens, scaled_intrinsics, undistort
-from gsjax.data.masks import read_valid_pixels
+from gsjax.data.masks import read_shades
 from gsjax.data.names import find_file, portable
 from gsjax.data.photographs import Photographs
 from gsjax.data.pictures import SUFFIXES, refuse_unread
@@ -307,7 +307,7 @@ def _photographs(root, frames, cloud, background, depth_unit_m) -> Photographs:
     def load_mask(i: int) -> np.ndarray | None:
         if frames[i].mask is None:
             return None
-        mask = read_valid_pixels(frames[i].mask, *frames[i].size).astype(np.uint8)
+        mask = (read_shades(frames[i].mask, *frames[i].size) != 0).astype(np.uint8)
         return ideal[i][1](mask, cv2.INTER_NEAREST) > 0
 
     def load_depth(i: int) -> np.ndarray | None:

@@ -6,7 +6,7 @@ import pytest
 from PIL import Image
 
 from gsjax.data import DataError
-from gsjax.data.masks import read_mask, read_valid_pixels
+from gsjax.data.masks import read_mask, read_shades
 
 WIDTH, HEIGHT = 12, 8
 LABELS = (np.arange(WIDTH * HEIGHT) % 3).astype(np.uint8).reshape(HEIGHT, WIDTH)
@@ -44,7 +44,6 @@ def read(tmp_path):
         ((128, 64, 128, 0, 0, 0, 70, 70, 70), {0: 0, 1: 1, 2: 2}),  # black is no label here
         ((0, 0, 0, 51, 51, 51, 102, 102, 102), {0: 0, 1: 1, 2: 2}),
         ((0, 0, 0, 255, 255, 255, 255, 255, 255), {0: 0, 1: 1, 2: 2}),
-        ((255, 255, 255, 0, 0, 0, 90, 90, 90), {0: 255, 1: 0, 2: 90}),  # a grey picture, saved small
     ],
 )
 def test_indices_of_a_palette_are_labels(read, palette, of):
@@ -70,16 +69,42 @@ def test_indices_of_a_palette_are_labels(read, palette, of):
 )
 def test_one_channel_or_equal_ones(read, picture, labels):
     np.testing.assert_array_equal(read(picture), labels)
-    np.testing.assert_array_equal(read(picture, read_valid_pixels), labels != 0)
+    np.testing.assert_array_equal(read(picture, read_shades), labels)
+
+
+def test_a_grey_picture_that_was_saved_small_has_its_shades(read):
+    expected = np.vectorize({0: 255, 1: 0, 2: 90}.get)(LABELS)
+    np.testing.assert_array_equal(read(indexed(LABELS, (255, 255, 255, 0, 0, 0, 90, 90, 90))), expected)
+
+
+def test_black_of_a_fixed_palette_is_0(read):
+    """As Pillow converts colours by default."""
+    web = Image.fromarray(stacked(WHITE, WHITE, WHITE)).convert("P")
+    assert web.getpixel((0, 0)) != 0
+    np.testing.assert_array_equal(read(web) != 0, WHITE > 0)
+    np.testing.assert_array_equal(read(web, read_shades), WHITE)
+    np.testing.assert_array_equal(read(Image.fromarray(stacked(WHITE, 0, 0)).convert("P")) != 0, WHITE > 0)
+
+
+@pytest.mark.parametrize(
+    ("palette", "of"),
+    [
+        (DAVIS, {0: 0, 1: 255, 2: 255}),
+        ((0, 0, 0, 51, 51, 51, 255, 255, 255), {0: 0, 1: 51, 2: 255}),
+        ((255, 255, 255, 0, 0, 0, 90, 90, 90), {0: 255, 1: 0, 2: 90}),
+    ],
+)
+def test_shades_of_a_palette(read, palette, of):
+    np.testing.assert_array_equal(read(indexed(LABELS, palette), read_shades), np.vectorize(of.get)(LABELS))
 
 
 def test_black_and_one_colour_tell_what_counts_but_are_no_labels(read):
     red = stacked(0, 0, WHITE)
-    np.testing.assert_array_equal(read(red, read_valid_pixels), WHITE > 0)
+    np.testing.assert_array_equal(read(red, read_shades), WHITE)
     with pytest.raises(DataError, match="expected one label per pixel, found 3 channels that differ"):
         read(red)
     with pytest.raises(DataError, match="expected one label per pixel, found 3 channels that differ"):
-        read(stacked(0, 90 * LABELS, WHITE), read_valid_pixels)
+        read(stacked(0, 90 * LABELS, WHITE), read_shades)
 
 
 def test_black_before_transparency_means_nothing(read):
