@@ -28,11 +28,8 @@ def read_mask(path: Path, width: int, height: int) -> Int[np.ndarray, "height wi
         DataError: the file is missing, truncated, has channels that differ, or is of another size.
     """
     indices, palette = _indexed(path)
-    if _is_shuffled_grey(palette):
-        labels = _shades(path, width, height)
-    else:
-        check_size(path, indices, width, height)
-        labels = _with_black_as_zero(indices, palette)
+    labels = _shades(path, width, height) if _is_shuffled_grey(palette) else indices
+    check_size(path, labels, width, height)
     if labels.ndim == 3:
         raise _differ(path, labels)
     return labels.astype(np.int32)
@@ -58,14 +55,6 @@ def read_shades(path: Path, width: int, height: int) -> Int[np.ndarray, "height 
             raise _differ(path, shades)
         shades = np.where(white, _WHITE, 0)
     return shades.astype(np.int32)
-
-
-def _with_black_as_zero(indices: np.ndarray, palette: np.ndarray) -> np.ndarray:
-    """The indices; where 0 does not occur, that of black is 0. Palettes that are fixed, as those of web
-    browsers, have black elsewhere."""
-    used = np.unique(indices)
-    black = [i for i in used.tolist() if i < len(palette) and not palette[i].any()]
-    return np.where(indices == black[0], 0, indices) if used[0] != 0 and len(black) == 1 else indices
 
 
 def _differ(path: Path, colors: np.ndarray) -> DataError:
@@ -106,7 +95,7 @@ def _indexed(path: Path) -> tuple[np.ndarray, np.ndarray]:
         with Image.open(io.BytesIO(content)) as image:
             if image.mode != "P":
                 return none
-            return np.asarray(image), np.reshape(image.getpalette("RGB"), (-1, 3))
+            return np.asarray(image), np.array(image.getpalette("RGB"), np.uint8).reshape(-1, 3)
     except (UnidentifiedImageError, OSError, SyntaxError, Image.DecompressionBombError):
         return none  # whoever decodes it tells
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from gsjax.data.errors import DataError, DataWarning
 
-SUFFIXES = (".png", ".jpg", ".jpeg", ".jpe", ".jfif", ".tif", ".tiff", ".bmp", ".webp")
+SUFFIXES = (".png", ".jpg", ".jpeg", ".jpe", ".jfif", ".tif", ".tiff", ".bmp", ".webp", ".avif")
 """File extensions of the pictures that all readers and commands take, in lower case."""
 
 _CONVERT = (
@@ -18,7 +18,7 @@ _DEVELOP = (
     "Develop to JPEG, PNG or TIFF first, for example with darktable-cli, RawTherapee or ImageMagick, and "
     "give the new files."
 )
-_OTHERS = {"HEIC": (".heic", ".heics", ".heif", ".heifs", ".hif"), "AVIF": (".avif", ".avifs")}
+_OTHERS = {"HEIC": (".heic", ".heics", ".heif", ".heifs", ".hif"), "AVIF": (".avifs",)}
 _OTHERS |= {"JPEG XL": (".jxl",), "JPEG 2000": (".jp2", ".j2k", ".jpx"), "GIF": (".gif",), "PSD": (".psd",)}
 _RAW = (
     *(".dng", ".cr2", ".cr3", ".crw", ".nef", ".nrw", ".arw", ".sr2", ".srf", ".raf", ".orf", ".rw2", ".rwl"),
@@ -37,6 +37,7 @@ _HEADS = {
         _DEVELOP,
     ),
 }
+_WEB = re.compile(rb"RIFF....WEBP|....ftypavi[fs]", re.DOTALL)
 _JPEG, _PNG = b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n"
 _MARKER = re.compile(rb"\xff[^\x00\xff]")
 _AFTER_SCAN = re.compile(rb"\xff[^\x00\xd0-\xd7\xff]")  # neither a stuffed 0xff nor a restart mark
@@ -64,6 +65,12 @@ def unread_format(path: Path, head: bytes = b"") -> tuple[str, str] | None:
         return None
     by_head = next((told for pattern, told in _HEADS.items() if pattern.match(head)), None)
     return by_head or _UNREAD.get(path.suffix.lower())
+
+
+def is_web_format(path: Path) -> bool:
+    """Whether a file is WebP or AVIF by its first bytes, which programs read less often than JPEG and PNG."""
+    with path.open("rb") as file:
+        return _WEB.match(file.read(16)) is not None
 
 
 def is_raw(path: Path, head: bytes) -> bool:

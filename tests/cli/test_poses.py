@@ -6,6 +6,7 @@ import sys
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from gsjax.cli import main
 from gsjax.data import open_photographs
@@ -109,6 +110,21 @@ def test_a_video(say, tmp_path):
     aligned = align_cameras(scene.viewmats, truth)
     assert aligned.turned_deg.max() < 1
     assert aligned.moved.max() < 0.02 * aligned.extent
+
+
+def test_pictures_in_formats_that_colmap_lacks(say, photographs, tmp_path):
+    """They are read as any other, whatever their extension, and come out as they went in."""
+    folder, out = tmp_path / "photos", tmp_path / "out"
+    shutil.copytree(photographs, folder)
+    for name, suffix in (("0", ".webp"), ("1", ".png")):
+        with Image.open(folder / f"{name}.png") as picture:
+            picture.load()
+        (folder / f"{name}.png").unlink()
+        picture.save(folder / f"{name}{suffix}", "WEBP", lossless=True)
+    code, said = say(folder, "--out", out)
+    assert code == 0, said
+    assert open_photographs(out).names == ("0.webp", *(f"{i}.png" for i in range(1, COUNT)))
+    assert (out / "images/0.webp").read_bytes() == (folder / "0.webp").read_bytes()
 
 
 def test_folders_that_cannot_be_used(say, tmp_path):

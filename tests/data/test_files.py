@@ -176,6 +176,7 @@ HEIC = b"\0\0\0\x18ftypheic\0\0\0\0mif1heic" + bytes(99)
         ),
         ("a.jpg", HEIC, "found HEIC, a format that is not read. Convert"),
         ("a.heif", b"anything", "found HEIC, a format that is not read. Convert"),
+        ("a.avif", b"\0\0\0\x18ftypavif" + bytes(99), "found AVIF, a format that is not read. Convert"),
         ("a.jxl", b"\xff\x0a" + bytes(99), "found JPEG XL, a format that is not read. Convert"),
         ("a.CR3", b"\0\0\0\x18ftypcrx \0\0", "found camera raw, a format that is not read. Develop to JPEG"),
         (

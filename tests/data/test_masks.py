@@ -77,19 +77,11 @@ def test_a_grey_picture_that_was_saved_small_has_its_shades(read):
     np.testing.assert_array_equal(read(indexed(LABELS, (255, 255, 255, 0, 0, 0, 90, 90, 90))), expected)
 
 
-def test_black_of_a_fixed_palette_is_0(read):
-    """As Pillow converts colours by default."""
-    web = Image.fromarray(stacked(WHITE, WHITE, WHITE)).convert("P")
-    assert web.getpixel((0, 0)) != 0
-    np.testing.assert_array_equal(read(web) != 0, WHITE > 0)
-    np.testing.assert_array_equal(read(web, read_shades), WHITE)
-    np.testing.assert_array_equal(read(Image.fromarray(stacked(WHITE, 0, 0)).convert("P")) != 0, WHITE > 0)
-
-
 @pytest.mark.parametrize(
     ("palette", "of"),
     [
         (DAVIS, {0: 0, 1: 255, 2: 255}),
+        ((9, 9, 200, 0, 0, 0, 200, 9, 9), {0: 255, 1: 0, 2: 255}),
         ((0, 0, 0, 51, 51, 51, 255, 255, 255), {0: 0, 1: 51, 2: 255}),
         ((255, 255, 255, 0, 0, 0, 90, 90, 90), {0: 255, 1: 0, 2: 90}),
     ],

@@ -152,7 +152,7 @@ def test_the_error_for_a_video_says_how_to_find_poses(tmp_path):
 
 
 @pytest.mark.parametrize("place", ["", "images"])
-@pytest.mark.parametrize("suffix", [".HEIC", ".heif", ".NEF", ".avif"])
+@pytest.mark.parametrize("suffix", [".HEIC", ".heif", ".NEF", ".jxl"])
 def test_photographs_in_formats_that_are_not_read_are_counted(tmp_path, place, suffix):
     (tmp_path / place).mkdir(exist_ok=True)
     for name in "ab":
