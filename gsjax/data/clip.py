@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from gsjax.data.errors import DataError, DataWarning
-from gsjax.data.files import read_image, read_mask
+from gsjax.data.files import read_image
 from gsjax.data.frame_folders import (
     DEFAULT_RATE_HZ,
     check_one_size,
@@ -23,6 +23,7 @@ from gsjax.data.frame_folders import (
     warn_about_single_frame,
 )
 from gsjax.data.lens import intrinsics_matrix
+from gsjax.data.masks import read_shades
 from gsjax.data.sequence import Sequence
 from gsjax.data.tool_masks import LABEL_NAMES, Tool, check_tool, find_masks, tool_labels
 from gsjax.data.video import Video, describe_video
@@ -70,7 +71,7 @@ def read_clip(
     files = pictures_beside(folder, count, source.name) if folder else []
 
     def load_mask(t: int) -> np.ndarray:
-        return tool_labels(read_mask(files[t], width, height), tool)
+        return tool_labels(read_shades(files[t], width, height), tool)
 
     if files:
         check_tool(load_mask, count, tool, files[0].parent)

@@ -18,7 +18,7 @@ from jaxtyping import Float
 
 from gsjax.data import poses_bounds
 from gsjax.data.errors import DataError, DataWarning
-from gsjax.data.files import read_arrays, read_depth, read_image, read_json, read_mask
+from gsjax.data.files import read_arrays, read_depth, read_image, read_json
 from gsjax.data.frame_folders import (
     DEFAULT_RATE_HZ,
     check_one_size,
@@ -27,6 +27,7 @@ from gsjax.data.frame_folders import (
     pictures_beside,
     warn_about_single_frame,
 )
+from gsjax.data.masks import read_shades
 from gsjax.data.objects import Truth
 from gsjax.data.origin import near_origin, relative_to_origin
 from gsjax.data.sequence import Sequence
@@ -97,7 +98,7 @@ def read_endonerf(
     eyes = _find_eyes(root, images, frames, baseline_m, meta)
 
     def load_mask(path: Path) -> np.ndarray:
-        return tool_labels(read_mask(path, width, height), tool)
+        return tool_labels(read_shades(path, width, height), tool)
 
     def load_depth(path: Path) -> np.ndarray:
         return _within_percentiles(read_depth(path, unit, width, height), depth_percentiles)

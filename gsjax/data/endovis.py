@@ -21,7 +21,7 @@ from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 
 from gsjax.data.errors import DataError, DataWarning
-from gsjax.data.files import read_image, read_json, read_mask
+from gsjax.data.files import read_image, read_json, read_text
 from gsjax.data.frame_folders import (
     check_one_size,
     frame_numbers,
@@ -30,7 +30,9 @@ from gsjax.data.frame_folders import (
     warn_about_single_frame,
 )
 from gsjax.data.lens import intrinsics_matrix, scaled_intrinsics
+from gsjax.data.masks import read_mask
 from gsjax.data.sequence import Sequence
+from gsjax.data.text import fields
 
 RATE_HZ = 2.0
 LEFT, RIGHT = "left_frames", "right_frames"
@@ -174,12 +176,9 @@ def _warn_left_out(root: Path, advice: str) -> None:
 
 def _read_calibration(path: Path) -> dict[str, list[str]]:
     """The words that follow each key."""
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except UnicodeDecodeError as error:
-        raise DataError(path, "lines of text", f"binary data ({error})", "Fetch the file again.") from None
+    lines = read_text(path, "lines of text").split("\n")
     parts = (line.split("//")[0].partition(":") for line in lines)
-    return {key.strip(): words.split() for key, colon, words in parts if colon}
+    return {key.strip(): fields(words) for key, colon, words in parts if colon}
 
 
 def _numbers(path: Path, values: dict[str, list[str]], key: str, count: int) -> list[float]:

@@ -1,6 +1,9 @@
-"""Reading single files with checks: JSON, arrays, images, depth and masks."""
+"""Reading single files with checks: text, JSON, arrays, images and depth."""
 
+import io
 import json
+import re
+import warnings
 import zipfile
 import zlib
 from pathlib import Path
@@ -8,16 +11,44 @@ from typing import Any
 
 import cv2
 import numpy as np
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Float, UInt8
 
 from gsjax.data.errors import DataError, MissingFile
+from gsjax.data.pictures import is_cut_off, is_raw, unread_format
+from gsjax.data.text import decoded
 
 SATURATED_DEPTH = 65535
 """The largest 16-bit value: converters clip to it, and the Kinect writes it where it measured nothing."""
 
-# OpenCV decodes the missing rest of a truncated file as grey, so end markers are checked here.
-_END_MARKS = {b"\x89PNG": b"IEND", b"\xff\xd8": b"\xff\xd9"}
-_TAIL = 64
+Color = tuple[float, float, float]
+"""RGB, 0 to 1."""
+
+_HEAD = 32  # bytes that tell a format
+_LOOKED_AT = 4
+BLACK: Color = (0.0, 0.0, 0.0)
+WHITE: Color = (1.0, 1.0, 1.0)
+_LONE_BACKSLASH = re.compile(r'(?<!\\)\\(?![\\"])')
+
+
+def read_text(path: Path, expected: str = "text") -> str:
+    """The text of a file, with lines that end in a newline.
+
+    Args:
+        path: the file, in UTF-8, UTF-16 or UTF-32, or else in a Western code page.
+        expected: what the file should be, for messages.
+
+    Raises:
+        DataError: the file is missing or not text.
+    """
+    try:
+        content = path.read_bytes()
+    except (FileNotFoundError, NotADirectoryError, IsADirectoryError):
+        advice = "Check the folder; was it copied completely?"
+        raise DataError(path, expected, "no such file", advice) from None
+    try:
+        return decoded(content)
+    except ValueError as error:
+        raise DataError(path, expected, f"binary data ({error})", "Fetch the file again.") from None
 
 
 def read_json(path: Path) -> Any:
@@ -26,14 +57,20 @@ def read_json(path: Path) -> Any:
     Raises:
         DataError: the file is missing or is not JSON.
     """
+    text = read_text(path, "a JSON file")
     try:
-        return json.loads(path.read_text())
-    except FileNotFoundError:
-        raise DataError(
-            path, "a JSON file", "no such file", "Check the folder; was it copied completely?"
-        ) from None
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        return _parsed(text)
+    except (json.JSONDecodeError, RecursionError) as error:
         raise DataError(path, "a JSON file", f"bad JSON ({error})", "Fetch the file again.") from None
+
+
+def _parsed(text: str) -> Any:
+    try:
+        return json.loads(text)
+    except json.JSONDecodeError as error:
+        if not error.msg.startswith("Invalid \\"):
+            raise
+    return json.loads(_LONE_BACKSLASH.sub(r"\\\\", text))  # paths of Windows that were written as they are
 
 
 def read_arrays(path: Path) -> dict[str, np.ndarray]:
@@ -61,7 +98,7 @@ def image_size(path: Path) -> tuple[int, int]:
     Raises:
         DataError: the file is missing, truncated, or not an image.
     """
-    height, width = _decode(path, cv2.IMREAD_UNCHANGED).shape[:2]
+    height, width = decode(path, "an image").shape[:2]
     return width, height
 
 
@@ -74,29 +111,55 @@ def picture_size(path: Path) -> tuple[int, int]:
     from PIL import Image, UnidentifiedImageError
 
     try:
-        with Image.open(path) as image:
-            return image.size
-    except FileNotFoundError:
+        with path.open("rb") as file:
+            head = file.read(_HEAD)
+            if is_raw(path, head):
+                raise _not_read(path, "an image", head)
+            with Image.open(file) as image:
+                return image.size
+    except (FileNotFoundError, IsADirectoryError, NotADirectoryError):
         raise _no_such_file(path, "an image") from None
     except (UnidentifiedImageError, OSError, Image.DecompressionBombError) as error:
-        found = f"something else ({path.stat().st_size} bytes; {error})"
-        raise DataError(path, "an image", found, "Fetch the file again.") from None
+        raise _not_read(path, "an image", head, f"{path.stat().st_size} bytes; {error}") from None
 
 
-def read_image(path: Path, width: int, height: int) -> UInt8[np.ndarray, "height width 3"]:
+def background_behind(paths: list[Path], background: Color = WHITE) -> Color | None:
+    """The background to show photographs before: `background` if some are transparent, else None.
+
+    Few of those that have transparency at all are looked at; of the others, none is read.
+
+    Args:
+        paths: the photographs.
+        background: RGB, 0 to 1.
+
+    Raises:
+        DataError: one that is looked at is unreadable.
+    """
+    able = [path for path in paths if _has_transparency(path)]
+    some = able[:: max(1, len(able) // _LOOKED_AT)]
+    return background if any(_is_transparent(_read_channels(path)) for path in some) else None
+
+
+def read_image(
+    path: Path, width: int, height: int, background: Color = BLACK
+) -> UInt8[np.ndarray, "height width 3"]:
     """An 8-bit colour image, RGB, in its stored orientation: cameras are calibrated for the stored pixels,
-    so the EXIF orientation is ignored.
+    so the EXIF orientation is ignored. What is transparent shows the background: the colours stored there
+    mean nothing.
 
     Args:
         path: the file.
         width, height: expected size, pixels.
+        background: RGB, 0 to 1, behind what is transparent.
 
     Raises:
         DataError: the file is missing, truncated, not an image, or of another size.
     """
-    image = _decode(path, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
-    _check_size(path, image, width, height)
-    return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
+    pixels = read_rgba(path, width, height)
+    if not _is_transparent(pixels):
+        return np.ascontiguousarray(pixels[..., :3])
+    alpha = pixels[..., 3:] / 255
+    return np.round(alpha * pixels[..., :3] + (1 - alpha) * 255 * np.array(background)).astype(np.uint8)
 
 
 def read_rgba(path: Path, width: int, height: int) -> UInt8[np.ndarray, "height width channels"]:
@@ -109,8 +172,13 @@ def read_rgba(path: Path, width: int, height: int) -> UInt8[np.ndarray, "height 
     Raises:
         DataError: the file is missing, truncated, not an image, or of another size.
     """
-    image = _decode(path, cv2.IMREAD_UNCHANGED)
-    _check_size(path, image, width, height)
+    image = _read_channels(path)
+    check_size(path, image, width, height)
+    return image
+
+
+def _read_channels(path: Path) -> UInt8[np.ndarray, "height width channels"]:
+    image = decode(path, "an image")
     if image.dtype == np.uint16:
         image = np.round(image / 257).astype(np.uint8)
     if image.dtype != np.uint8:
@@ -120,6 +188,21 @@ def read_rgba(path: Path, width: int, height: int) -> UInt8[np.ndarray, "height 
     if image.shape[2] == 3:
         return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
     return cv2.cvtColor(image, cv2.COLOR_BGRA2RGBA)
+
+
+def _is_transparent(pixels: UInt8[np.ndarray, "height width channels"]) -> bool:
+    return pixels.shape[-1] == 4 and bool((pixels[..., 3] < 255).any())
+
+
+def _has_transparency(path: Path) -> bool:
+    """Whether a photograph has a channel or a colour for it, by its header."""
+    from PIL import Image, UnidentifiedImageError
+
+    try:
+        with Image.open(path) as image:
+            return image.has_transparency_data
+    except (UnidentifiedImageError, OSError, Image.DecompressionBombError):
+        return False  # whoever reads it tells
 
 
 def read_depth(path: Path, unit_m: float, width: int, height: int) -> Float[np.ndarray, "height width"]:
@@ -135,8 +218,8 @@ def read_depth(path: Path, unit_m: float, width: int, height: int) -> Float[np.n
     Raises:
         DataError: the file is missing, truncated, not a 16-bit single-channel image, or of another size.
     """
-    raw = _decode(path, cv2.IMREAD_UNCHANGED, "a depth image")
-    _check_size(path, raw, width, height)
+    raw = decode(path, "a depth image")
+    check_size(path, raw, width, height)
     if raw.dtype != np.uint16 or raw.ndim != 2:
         found = f"{raw.dtype} with {1 if raw.ndim == 2 else raw.shape[2]} channels"
         raise DataError(path, "depth as one 16-bit channel", found, "Save depth as a 16-bit PNG.")
@@ -144,40 +227,79 @@ def read_depth(path: Path, unit_m: float, width: int, height: int) -> Float[np.n
     return np.where(raw == SATURATED_DEPTH, np.float32(0), depth)
 
 
-def read_mask(path: Path, width: int, height: int) -> Int[np.ndarray, "height width"]:
-    """Integer labels, int32. A mask saved with three equal channels is accepted.
+def decode(path: Path, kind: str) -> np.ndarray:
+    """The pixels of a picture as they are stored, of any type: [H,W], or [H,W,3] or [H,W,4] in the order
+    blue, green, red, alpha. Colours of a palette are looked up.
 
     Args:
         path: the file.
-        width, height: expected size, pixels.
+        kind: what it is, for messages.
 
     Raises:
-        DataError: the file is missing, truncated, has channels that differ, or is of another size.
+        DataError: the file is missing, truncated, or not a picture that is read.
     """
-    raw = _decode(path, cv2.IMREAD_UNCHANGED, "a mask")
-    _check_size(path, raw, width, height)
-    if raw.ndim == 3:
-        colors = raw[..., :3]
-        if (colors != colors[..., :1]).any():
-            advice = "Save one label per pixel, as a single-channel PNG."
-            raise DataError(path, "one label per pixel", f"{raw.shape[2]} channels that differ", advice)
-        raw = colors[..., 0]
-    return raw.astype(np.int32)
+    content = read_complete(path, kind)
+    image = None if _has_transparent_grey(content) else _decoded_by_opencv(content)
+    image = _decoded_by_pillow(content) if image is None else image
+    if image is None:
+        raise _not_read(path, kind, content[:_HEAD], f"{len(content)} bytes")
+    return image
 
 
-def _decode(path: Path, flags: int, kind: str = "an image") -> np.ndarray:
+def _has_transparent_grey(content: bytes) -> bool:
+    """Whether a PNG picture of at most 8 bits has a transparent shade of grey, which OpenCV ignores."""
+    is_grey = content.startswith(b"\x89PNG") and content[24:25] <= b"\x08" and content[25:26] == b"\0"
+    return is_grey and b"tRNS" in content[:4096]
+
+
+def _decoded_by_opencv(content: bytes) -> np.ndarray | None:
+    try:
+        return cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
+    except cv2.error:
+        return None
+
+
+def _decoded_by_pillow(content: bytes) -> np.ndarray | None:
+    """Pixels of formats that OpenCV lacks, for example those of plug-ins; None if Pillow lacks them too."""
+    from PIL import Image
+
+    try:
+        with warnings.catch_warnings(), Image.open(io.BytesIO(content)) as image:
+            warnings.simplefilter("ignore")  # of damaged files, which become errors
+            channels = "RGBA" if image.has_transparency_data else "RGB"
+            pixels = np.asarray(image.convert(channels))
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError):
+        return None
+    return cv2.cvtColor(pixels, cv2.COLOR_RGBA2BGRA if channels == "RGBA" else cv2.COLOR_RGB2BGR)
+
+
+def read_complete(path: Path, kind: str) -> bytes:
+    """The bytes of a picture.
+
+    Args:
+        path: the file.
+        kind: what it is, for messages.
+
+    Raises:
+        DataError: the file is missing, empty, truncated, or a camera's raw data.
+    """
     try:
         content = path.read_bytes()
     except (FileNotFoundError, NotADirectoryError, IsADirectoryError):
         raise _no_such_file(path, kind) from None
-    cut_off = any(
-        content.startswith(head) and end not in content[-_TAIL:] for head, end in _END_MARKS.items()
-    )
-    image = None if cut_off or not content else cv2.imdecode(np.frombuffer(content, np.uint8), flags)
-    if image is None:
-        what = "a file that is cut off" if cut_off else "something else"
+    if is_raw(path, content[:_HEAD]):
+        raise _not_read(path, kind, content[:_HEAD])
+    if not content or is_cut_off(content):
+        what = "a file that is cut off" if content else "something else"
         raise DataError(path, kind, f"{what} ({len(content)} bytes)", "Fetch the file again.")
-    return image
+    return content
+
+
+def _not_read(path: Path, kind: str, head: bytes, why: str = "") -> DataError:
+    """The error for a file that no decoder takes."""
+    if (unread := unread_format(path, head)) is not None:
+        return DataError(path, kind, f"{unread[0]}, a format that is not read", unread[1])
+    return DataError(path, kind, f"something else ({why})", "Fetch the file again.")
 
 
 def _no_such_file(path: Path, kind: str) -> MissingFile:
@@ -185,7 +307,14 @@ def _no_such_file(path: Path, kind: str) -> MissingFile:
     return MissingFile(path, kind, "no such file", advice)
 
 
-def _check_size(path: Path, image: np.ndarray, width: int, height: int) -> None:
+def check_size(path: Path, image: np.ndarray, width: int, height: int) -> None:
+    """Raises DataError unless a picture has the expected size.
+
+    Args:
+        path: the file, for messages.
+        image: its pixels.
+        width, height: expected size, pixels.
+    """
     if image.shape[:2] != (height, width):
         found = f"{image.shape[1]}x{image.shape[0]}"
         raise DataError(

@@ -6,8 +6,7 @@ from pathlib import Path
 
 from gsjax.data.errors import DataError, DataWarning
 from gsjax.data.files import picture_size
-
-SUFFIXES = (".png", ".jpg", ".jpeg")
+from gsjax.data.pictures import is_picture, refuse_unread
 
 DEFAULT_RATE_HZ = 30.0
 """Frame rate assumed if the data has no times."""
@@ -16,11 +15,17 @@ _NUMBER = re.compile(r"\d+")
 
 
 def pictures(folder: Path) -> list[Path]:
-    """The pictures in a folder, sorted by name; none if it does not exist."""
-    if not folder.is_dir():
-        return []
-    visible = (p for p in folder.iterdir() if p.suffix.lower() in SUFFIXES and not p.name.startswith("."))
-    return sorted(path for path in visible if path.is_file())
+    """The pictures in a folder, sorted by name; none if it does not exist.
+
+    Warns with DataWarning if there are also pictures in a format that is not read.
+
+    Raises:
+        DataError: there are pictures, but none in a format that is read.
+    """
+    files = [path for path in folder.iterdir() if path.is_file()] if folder.is_dir() else []
+    found = sorted(path for path in files if is_picture(path))
+    refuse_unread(folder, "pictures", files, others=len(found))
+    return found
 
 
 def pictures_beside(folder: Path, count: int, frames: str) -> list[Path]:

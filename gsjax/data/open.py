@@ -17,11 +17,11 @@ from gsjax.data.errors import DataError
 from gsjax.data.open3d_rgbd import is_open3d, read_open3d
 from gsjax.data.panoptic import read_panoptic
 from gsjax.data.photographs import Photographs, photographs_of
+from gsjax.data.pictures import is_picture, refuse_unread
 from gsjax.data.push_t import read_push_t
 from gsjax.data.sequence import Sequence
 from gsjax.data.seven_scenes import read_seven_scenes
 from gsjax.data.simulated import articulated, bar, hard_parts, tabletop, tissue
-from gsjax.data.structure_from_motion import SUFFIXES
 from gsjax.data.tool_masks import Tool
 from gsjax.data.tum import read_tum
 from gsjax.geometry.cameras import NEAR
@@ -59,6 +59,8 @@ class ReadOptions:
     (right, up, back). Default: endonerf if masks and depth lie beside the images; otherwise required."""
     images: str = "images"
     """Folder of the photographs or frames, in the COLMAP, LLFF and EndoNeRF layouts."""
+    model: str | None = None
+    """Folder of the reconstruction (COLMAP), such as sparse/1; default: the one with the most photographs."""
     masks: str | None = None
     """Folder of the tool masks, beside a video or in a folder of frames without poses."""
     tool: Tool = "white"
@@ -187,8 +189,8 @@ _PHOTOGRAPHS = (
     _PhotographLayout(
         "COLMAP",
         "sparse/0/cameras.bin",
-        lambda root: any(colmap.find(root / place) for place in colmap.PLACES),
-        lambda root, options: colmap.read_colmap(root, options.images),
+        lambda root: bool(colmap.find_models(root)),
+        lambda root, options: colmap.read_colmap(root, options.images, options.model),
     ),
     _PhotographLayout(
         "LLFF",
@@ -265,11 +267,13 @@ def _unknown(root: Path, marks: dict[str, str], options: ReadOptions) -> DataErr
     if (missing := colmap.find_missing_file(root)) is not None:
         advice = "Was the folder copied completely?"
         return DataError(missing, "a file of the reconstruction", "no such file", advice)
+    expected = f"poses of the photographs ({', '.join(layout.mark for layout in _PHOTOGRAPHS)})"
     for folder in (root, root / options.images):
-        count = sum(path.suffix.lower() in SUFFIXES for path in folder.iterdir()) if folder.is_dir() else 0
+        files = [*folder.iterdir()] if folder.is_dir() else []
+        count = sum(map(is_picture, files))
         if count:
-            expected = f"poses of the photographs ({', '.join(layout.mark for layout in _PHOTOGRAPHS)})"
             return DataError(root, expected, f"{count} photographs without poses", _find_poses(folder))
+        refuse_unread(folder, expected, files)
     expected = ", ".join(f"{mark} ({layout} layout)" for mark, layout in marks.items())
     names = sorted(entry.name for entry in root.iterdir())
     found = ", ".join(names[:8]) + (", ..." if len(names) > 8 else "") if names else "an empty folder"

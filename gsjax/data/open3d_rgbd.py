@@ -9,7 +9,6 @@ The folder has no intrinsics (Open3D reads them from a file that the user suppli
 them. A pose belongs to the frame whose file name has its number: folders often hold only every third frame.
 """
 
-import re
 import warnings
 from pathlib import Path
 
@@ -17,11 +16,13 @@ import numpy as np
 from jaxtyping import Float
 
 from gsjax.data.errors import DataError, DataWarning
-from gsjax.data.files import image_size, read_depth, read_image
+from gsjax.data.files import image_size, read_depth, read_image, read_text
 from gsjax.data.frame_folders import DEFAULT_RATE_HZ
 from gsjax.data.lens import intrinsics_matrix
 from gsjax.data.origin import near_origin
+from gsjax.data.pictures import is_picture
 from gsjax.data.sequence import Sequence
+from gsjax.data.text import fields
 from gsjax.data.validation import check_poses
 
 DEPTH_UNIT_M = 0.001
@@ -32,7 +33,6 @@ _TRAJECTORIES = (
     "test_scene/trajectory.log",
     "fragments/trajectory.log",
 )
-_NUMBER = re.compile(r"(\d+)\.(?:png|jpe?g)", re.IGNORECASE)
 
 
 def is_open3d(root: Path) -> bool:
@@ -113,17 +113,17 @@ def _numbered(folder: Path) -> dict[int, Path]:
     """The pictures of a folder, by the number in their name."""
     if not folder.is_dir():
         return {}
-    return {int(match[1]): file for file in folder.iterdir() if (match := _NUMBER.fullmatch(file.name))}
+    numbered = (file for file in folder.iterdir() if is_picture(file) and file.stem.isdecimal())
+    return {int(file.stem): file for file in numbered}
 
 
 def _read_log(path: Path) -> dict[int, Float[np.ndarray, "4 4"]]:
     """Poses by frame number; those that are not finite are left out."""
     expected = "blocks of one line of three integers and four lines of four numbers"
+    lines = read_text(path, "a trajectory").split("\n")
     try:
-        values = np.array(path.read_text().split(), np.float64)
-    except (FileNotFoundError, IsADirectoryError):
-        raise DataError(path, "a trajectory", "no such file", "Give another file.") from None
-    except (ValueError, UnicodeDecodeError) as error:
+        values = np.array([field for line in lines for field in fields(line)], np.float64)
+    except ValueError as error:
         raise DataError(path, expected, f"something else ({error})", "Fetch the file again.") from None
     if values.size % 19 or not values.size:
         raise DataError(

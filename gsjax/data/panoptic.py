@@ -19,8 +19,10 @@ import cv2
 import numpy as np
 
 from gsjax.data.errors import DataError, DataWarning
-from gsjax.data.files import SATURATED_DEPTH, read_arrays, read_depth, read_image, read_json, read_mask
+from gsjax.data.files import SATURATED_DEPTH, read_arrays, read_depth, read_image, read_json
 from gsjax.data.frame_folders import DEFAULT_RATE_HZ
+from gsjax.data.masks import read_mask
+from gsjax.data.names import portable
 from gsjax.data.objects import Truth
 from gsjax.data.origin import near_origin
 from gsjax.data.sequence import Sequence
@@ -204,7 +206,8 @@ def _checked(path: Path, meta: dict[str, Any]) -> dict[str, Any]:
             expected = f"cameras {meta['cam_id'][0]} as in frame 0"
             raise DataError(path, expected, f"{ids} in frame {t}", _ADVICE_META)
     arrays = {key: _stack(path, key, meta[key], side) for key, side in (("k", 3), ("w2c", 4))}
-    return meta | arrays | {"cam_id": [int(i) for i in meta["cam_id"][0]], "file": [path] * cameras}
+    names = {"fn": [[portable(name) for name in frame] for frame in meta["fn"]]}
+    return meta | arrays | names | {"cam_id": [int(i) for i in meta["cam_id"][0]], "file": [path] * cameras}
 
 
 def _check_cameras(meta: dict[str, Any], present: list[int]) -> None:

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from gsjax.data.errors import DataError
-from gsjax.data.files import picture_size, read_arrays, read_image
+from gsjax.data.files import BLACK, background_behind, picture_size, read_arrays, read_image
 from gsjax.data.frame_folders import pictures
 from gsjax.data.lens import scaled_intrinsics
 from gsjax.data.origin import near_origin
@@ -35,7 +35,7 @@ _TO_OPENCV = {
 
 @near_origin
 def read_llff(path: str | Path, axes: Axes, images: str = "images") -> Photographs:
-    """Photographs sorted by name, one per row of poses_bounds.npy.
+    """Photographs sorted by name, one per row of poses_bounds.npy; transparent ones are shown before white.
 
     Args:
         path: the folder.
@@ -54,13 +54,15 @@ def read_llff(path: str | Path, axes: Axes, images: str = "images") -> Photograp
         expected, found = f"{len(viewmats)} photographs in {folder}, one per row", f"{len(paths)}"
         raise DataError(file, expected, found, "Give the name of their folder, or fetch them again.")
     actual = np.array([picture_size(photograph) for photograph in paths])
+    background = background_behind(paths)
     return Photographs(
         name=root.resolve().name,
         names=tuple(photograph.name for photograph in paths),
         sizes=actual,
         Ks=_intrinsics(paths, focals, sizes, actual),
         viewmats=viewmats,
-        load_image=lambda i: read_image(paths[i], *actual[i].tolist()),
+        load_image=lambda i: read_image(paths[i], *actual[i].tolist(), background or BLACK),
+        background=background,
         locate=lambda kind, i: str(paths[i]),
     )
 

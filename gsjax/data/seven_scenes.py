@@ -19,9 +19,12 @@ import numpy as np
 from jaxtyping import Float
 
 from gsjax.data.errors import DataError, DataWarning
-from gsjax.data.files import read_depth, read_image
+from gsjax.data.files import read_depth, read_image, read_text
+from gsjax.data.names import find_file
 from gsjax.data.origin import near_origin
+from gsjax.data.pictures import SUFFIXES
 from gsjax.data.sequence import Sequence
+from gsjax.data.text import fields
 from gsjax.data.validation import check_poses
 from gsjax.geometry.cameras import intrinsics
 
@@ -118,7 +121,7 @@ def _read_frames(root: Path) -> tuple[list[int], Float[np.ndarray, "t 4 4"], lis
     missing: list[str] = []
     for match in sorted(names, key=lambda match: int(match[1])):
         pose, stem = _read_matrix(root / match[0], 4), match[0].removesuffix(".pose.txt")
-        image = next((p for end in ("png", "jpg") if (p := root / f"{stem}.color.{end}").is_file()), None)
+        image = find_file(root, f"{stem}.color", SUFFIXES)
         depth = root / f"{stem}.depth.png"
         if not np.isfinite(pose).all():
             lost.append(stem)
@@ -151,10 +154,10 @@ def _read_frames(root: Path) -> tuple[list[int], Float[np.ndarray, "t 4 4"], lis
 def _read_matrix(path: Path, side: int) -> Float[np.ndarray, "side side"]:
     """A square matrix of numbers in a text file; Microsoft's spellings of NaN and infinity become NaN."""
     expected, advice = f"{side} lines of {side} numbers", "Fetch the file again, or remove that frame."
+    lines = _MICROSOFT_NAN.sub("nan", read_text(path, expected)).split("\n")
     try:
-        lines = _MICROSOFT_NAN.sub("nan", path.read_text()).splitlines()
-        matrix = np.array([line.split() for line in lines if line.strip()], np.float64)
-    except (ValueError, UnicodeDecodeError) as error:
+        matrix = np.array([row for line in lines if (row := fields(line))], np.float64)
+    except ValueError as error:
         raise DataError(path, expected, f"something else ({error})", advice) from None
     if matrix.shape != (side, side):
         raise DataError(path, expected, f"shape {matrix.shape}", advice)

@@ -14,14 +14,13 @@ from pathlib import Path
 from time import perf_counter
 from typing import Any, Literal, NamedTuple
 
+import cv2
 import numpy as np
 
 from gsjax import extras
 from gsjax.data.errors import DataError, DataWarning
-from gsjax.data.files import picture_size, read_image
-
-SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
-"""File extensions of photographs, in lower case."""
+from gsjax.data.files import WHITE, picture_size, read_image
+from gsjax.data.pictures import SUFFIXES, is_picture, is_web_format, refuse_unread
 
 _SMALLEST_MODEL = 3  # photographs: two fix no scale, and almost any two have some matches
 _ENOUGH_FOR_CENTER = 20  # photographs per camera
@@ -110,16 +109,14 @@ def list_photographs(folder: Path) -> list[str]:
     """
     if not folder.is_dir():
         raise DataError(folder, "a folder of photographs or a video", "nothing there", "Check the path.")
-    names = sorted(
-        path.relative_to(folder).as_posix()
-        for path in folder.rglob("*")
-        if path.suffix.lower() in SUFFIXES and path.is_file() and not path.name.startswith(".")
-    )
+    files = [path for path in folder.rglob("*") if path.is_file()]
+    names = sorted(path.relative_to(folder).as_posix() for path in files if is_picture(path))
+    expected = f"{_SMALLEST_MODEL} photographs or more ({', '.join(SUFFIXES)})"
+    refuse_unread(folder, expected, files, others=len(names))
     bad = {name: reason for name in names if (reason := _unreadable(folder / name)) is not None}
     good = [name for name in names if name not in bad]
     if len(good) < _SMALLEST_MODEL:
         found = f"{len(good) or 'none'}" + (f", and {len(bad)} that cannot be read" if bad else "")
-        expected = f"{_SMALLEST_MODEL} photographs or more ({', '.join(SUFFIXES)})"
         raise DataError(folder, expected, found, "Give the folder that holds them.")
     if bad:
         first = next(iter(bad.values()))
@@ -156,6 +153,7 @@ def reconstruct_cameras(
     """
     pycolmap = _pycolmap()
     database, seconds = work / "database.db", {}
+    folder = _as_colmap_reads(folder, names, work / "readable")
     exhaustive = config.matching == "exhaustive" or (
         config.matching == "auto" and not in_order and len(names) <= config.exhaustive_up_to
     )
@@ -227,6 +225,22 @@ def _unreadable(path: Path) -> str | None:
     except DataError as error:
         return str(error)
     return None
+
+
+def _as_colmap_reads(folder: Path, names: Sequence[str], copy: Path) -> Path:
+    """The folder of the photographs, or one of links and copies if some are in a format that COLMAP lacks."""
+    lacking = {name for name in names if is_web_format(folder / name)}
+    if not lacking:
+        return folder
+    for name in names:
+        source, target = (folder / name).resolve(), copy / name
+        target.parent.mkdir(parents=True, exist_ok=True)
+        if name in lacking:  # COLMAP tells formats by content
+            picture = read_image(source, *picture_size(source), WHITE)
+            target.write_bytes(cv2.imencode(".png", cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))[1].tobytes())
+        else:
+            target.symlink_to(source)
+    return copy
 
 
 def _extract(pycolmap, database: Path, folder: Path, names: Sequence[str], config: MotionConfig) -> None:

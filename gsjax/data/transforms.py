@@ -10,7 +10,6 @@ train_filenames, ...           nerfstudio's splits: files in none of the lists a
 ply_file_path                  nerfstudio's sparse points
 """
 
-import os
 import warnings
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -21,19 +20,29 @@ from jaxtyping import Float
 
 from gsjax.data.clouds import read_cloud
 from gsjax.data.errors import DataError, DataWarning
-from gsjax.data.files import picture_size, read_depth, read_json, read_mask, read_rgba
+from gsjax.data.files import (
+    BLACK,
+    WHITE,
+    Color,
+    background_behind,
+    picture_size,
+    read_depth,
+    read_image,
+    read_json,
+)
 from gsjax.data.lens import Lens, scaled_intrinsics, undistort
+from gsjax.data.masks import read_shades
+from gsjax.data.names import find_file, portable
 from gsjax.data.origin import near_origin
 from gsjax.data.photographs import Photographs
+from gsjax.data.pictures import SUFFIXES, refuse_unread
 from gsjax.data.validation import check_poses
 from gsjax.geometry.cameras import intrinsics, viewmat_from_opengl
 
 SPLITS = ("train", "val", "test")
-WHITE = (1.0, 1.0, 1.0)
 _DEPTH_UNIT_M = 0.001  # nerfstudio's default
 _MODELS = dict.fromkeys(("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV"), False)
 _MODELS["OPENCV_FISHEYE"] = True
-_SUFFIXES = (".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG")
 
 
 class _Frame(NamedTuple):
@@ -52,7 +61,7 @@ class _Frame(NamedTuple):
 def read_transforms(
     path: str | Path,
     *,
-    background: tuple[float, float, float] = WHITE,
+    background: Color = WHITE,
     depth_unit_m: float = _DEPTH_UNIT_M,
 ) -> Photographs:
     """The photographs listed in a transforms.json, or in a transforms_train.json and its siblings.
@@ -86,7 +95,7 @@ def read_transforms(
         for number, entry in enumerate(meta["frames"]):
             frame = _Entry(file, number, meta, entry)
             image = frame.image(root)
-            own_split = split or named.get(Path(entry["file_path"]))
+            own_split = split or named.get(_listed(entry["file_path"]))
             if named and own_split is None:
                 unnamed += 1
                 continue
@@ -99,7 +108,7 @@ def read_transforms(
                 continue
             frames.append(frame.read(root, image, pose, own_split))
         if cloud is None and meta.get("ply_file_path") is not None:
-            cloud = read_cloud(root / str(meta["ply_file_path"]))
+            cloud = read_cloud(_beside(root, str(meta["ply_file_path"])))
     _report_left_out(root, listed, missing, lost, unnamed, len(frames))
     return _photographs(root, frames, cloud, background, depth_unit_m)
 
@@ -124,6 +133,16 @@ def _files(path: Path) -> tuple[Path, dict[Path, str | None]]:
     return path, files
 
 
+def _listed(name: Any) -> Path:
+    """A name in a form in which different spellings are equal."""
+    return Path(portable(str(name)))
+
+
+def _beside(root: Path, name: str) -> Path:
+    """Path of a file that a name refers to, whether it exists or not."""
+    return find_file(root, name) or root / name
+
+
 def _named_splits(file: Path, meta: dict[str, Any]) -> dict[Path, str]:
     """The split of each photograph that the file assigns to one."""
     named = {}
@@ -132,14 +151,14 @@ def _named_splits(file: Path, meta: dict[str, Any]) -> dict[Path, str]:
         if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
             expected = f"{split}_filenames, a list of names"
             raise DataError(file, expected, repr(names)[:80], "Correct or remove it.")
-        named |= {Path(name): split for name in names}
+        named |= {_listed(name): split for name in names}
     if named and not meta.get("train_filenames"):
         found = (
             f"only {' and '.join(key for key in (f'{split}_filenames' for split in SPLITS) if meta.get(key))}"
         )
         advice = "Add it, or remove the other lists."
         raise DataError(file, "train_filenames as well as the other lists", found, advice)
-    known = {Path(str(entry.get("file_path"))) for entry in meta["frames"] if isinstance(entry, dict)}
+    known = {_listed(entry.get("file_path")) for entry in meta["frames"] if isinstance(entry, dict)}
     if unknown := [str(name) for name in named if name not in known]:
         expected = "names of frames in train_filenames, val_filenames and test_filenames"
         found = f"{len(unknown)} that no frame has, for example {unknown[0]}"
@@ -178,9 +197,7 @@ class _Entry(NamedTuple):
         """Path of its photograph, whose name may lack the extension; None if there is no such file."""
         if not isinstance(self.entry, dict) or not isinstance(self.entry.get("file_path"), str):
             raise self.error("file_path and transform_matrix", repr(self.entry)[:80], "Correct the file.")
-        path = root / self.entry["file_path"]
-        choices = (path, *(path.with_name(path.name + suffix) for suffix in _SUFFIXES))
-        return next((choice for choice in choices if os.path.isfile(choice)), None)
+        return find_file(root, self.entry["file_path"], SUFFIXES)
 
     def pose(self) -> Float[np.ndarray, "4 4"] | None:
         """World to camera, OpenCV axes; None if it is not finite."""
@@ -204,7 +221,7 @@ class _Entry(NamedTuple):
     def read(self, root: Path, image: Path, pose: np.ndarray, split: str | None) -> _Frame:
         width, height = picture_size(image)
         return _Frame(
-            self.entry["file_path"],
+            portable(self.entry["file_path"]),
             split,
             pose,
             self.lens(width, height),
@@ -220,7 +237,7 @@ class _Entry(NamedTuple):
         name = self.value(key)
         if name is not None and not isinstance(name, str):
             raise self.error(f"{key}, a name", repr(name), "Correct the file.")
-        return root / name if name else None
+        return _beside(root, name) if name else None
 
     def lens(self, width: int, height: int) -> Lens:
         """The camera, for a photograph of this size."""
@@ -272,6 +289,8 @@ def _report_left_out(
     if unnamed:
         left_out.append(f"{unnamed} in none of the train, val and test lists")
     if not kept:
+        folder = (root / portable(missing[0])).parent if missing else root
+        refuse_unread(folder, "photographs", folder.iterdir() if folder.is_dir() else ())
         found = f"{listed} listed, {' and '.join(left_out)}"
         raise DataError(root, "a photograph with a pose", found, "Check the folder.")
     if left_out:
@@ -279,25 +298,18 @@ def _report_left_out(
         warnings.warn(message, DataWarning, stacklevel=4)
 
 
-def _is_transparent(pixels: np.ndarray) -> bool:
-    return pixels.shape[-1] == 4 and bool((pixels[..., 3] < 255).any())
-
-
 def _photographs(root, frames, cloud, background, depth_unit_m) -> Photographs:
     ideal = [undistort(frame.lens, *frame.size) for frame in frames]
-    behind = np.array(background)
+    shown_before = background_behind([frame.image for frame in frames], background)
+    behind = shown_before or BLACK
 
     def load_image(i: int) -> np.ndarray:
-        pixels = read_rgba(frames[i].image, *frames[i].size)
-        if pixels.shape[-1] == 4:
-            alpha = pixels[..., 3:] / 255
-            pixels = np.round(alpha * pixels[..., :3] + (1 - alpha) * 255 * behind).astype(np.uint8)
-        return ideal[i][1](pixels, cv2.INTER_LINEAR)
+        return ideal[i][1](read_image(frames[i].image, *frames[i].size, behind), cv2.INTER_LINEAR)
 
     def load_mask(i: int) -> np.ndarray | None:
         if frames[i].mask is None:
             return None
-        mask = (read_mask(frames[i].mask, *frames[i].size) != 0).astype(np.uint8)
+        mask = (read_shades(frames[i].mask, *frames[i].size) != 0).astype(np.uint8)
         return ideal[i][1](mask, cv2.INTER_NEAREST) > 0
 
     def load_depth(i: int) -> np.ndarray | None:
@@ -310,8 +322,6 @@ def _photographs(root, frames, cloud, background, depth_unit_m) -> Photographs:
     }
     times = np.array([np.nan if frame.time is None else frame.time for frame in frames])
     moving = np.isfinite(times).all() and np.ptp(times) > 0
-    some = frames[:: max(1, len(frames) // 3)]
-    transparent = any(_is_transparent(read_rgba(frame.image, *frame.size)) for frame in some)
     return Photographs(
         name=root.resolve().name,
         names=tuple(frame.name for frame in frames),
@@ -324,6 +334,6 @@ def _photographs(root, frames, cloud, background, depth_unit_m) -> Photographs:
         times=times if moving else None,
         splits=tuple(frame.split or "train" for frame in frames) if has["split"] else None,
         cloud=cloud,
-        background=tuple(background) if transparent else None,
+        background=shown_before,
         locate=lambda kind, i: str(getattr(frames[i], kind)),
     )

@@ -20,9 +20,11 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from gsjax.data.association import associate
 from gsjax.data.errors import DataError, DataWarning
-from gsjax.data.files import image_size, read_depth, read_image
+from gsjax.data.files import image_size, read_depth, read_image, read_text
+from gsjax.data.names import find_file
 from gsjax.data.origin import near_origin
 from gsjax.data.sequence import Sequence
+from gsjax.data.text import fields
 from gsjax.geometry.distortion import undistort_map
 
 MAX_SKEW_S = 0.02
@@ -122,7 +124,8 @@ class _Listed(NamedTuple):
     def read(cls, root: Path, name: str) -> "_Listed":
         """Read a list, leaving out files that do not exist, with a warning that counts them."""
         stamps, rows = _read_lines(root / name, "stamp file", columns=2)
-        exists = np.array([(root / row[0]).is_file() for row in rows])
+        files = [find_file(root, row[0]) for row in rows]
+        exists = np.array([file is not None for file in files])
         if not exists.any():
             found = f"none of {len(rows)}, for example no {rows[0][0]}"
             raise DataError(root / name, "files that exist", found, _COMPLETE)
@@ -130,28 +133,22 @@ class _Listed(NamedTuple):
             message = f"{root / name}: {np.sum(~exists)} of {len(rows)} files do not exist and are left out"
             warnings.warn(message, DataWarning, stacklevel=4)
         numbers = np.flatnonzero(exists)
-        return cls(numbers, stamps[exists], [root / rows[i][0] for i in numbers])
+        return cls(numbers, stamps[exists], [file for file in files if file is not None])
 
 
 def _read_lines(path: Path, form: str, columns: int) -> tuple[Float[np.ndarray, "n"], list[list[str]]]:
     """Stamps in increasing order, and the fields after each; lines that repeat a stamp are left out, with a
     warning that counts them."""
-    try:
-        lines = path.read_text().splitlines()
-    except FileNotFoundError:
-        raise DataError(path, f"lines '{form}'", "no such file", _COMPLETE) from None
-    except UnicodeDecodeError as error:
-        raise DataError(path, f"lines '{form}'", f"binary data ({error})", "Fetch the file again.") from None
     stamps, rows = [], []
-    for number, line in enumerate(lines, start=1):
-        fields = line.partition("#")[0].replace(",", " ").split()
-        if not fields:
+    for number, line in enumerate(read_text(path, f"lines '{form}'").split("\n"), start=1):
+        row = fields(line.partition("#")[0])
+        if not row:
             continue
-        if len(fields) != columns or not _is_finite(fields[0]):
+        if len(row) != columns or not _is_finite(row[0]):
             expected, found = f"'{form}' in line {number}", repr(line[:80])
             raise DataError(path, expected, found, "Correct the line, or comment it out with #.")
-        stamps.append(float(fields[0]))
-        rows.append(fields[1:])
+        stamps.append(float(row[0]))
+        rows.append(row[1:])
     if not rows:
         raise DataError(path, f"lines '{form}'", "none", "Fetch the file again.")
     stamps, first = np.unique(stamps, return_index=True)

@@ -6,6 +6,7 @@ import sys
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from gsjax.cli import main
 from gsjax.data import open_photographs
@@ -111,6 +112,21 @@ def test_a_video(say, tmp_path):
     assert aligned.moved.max() < 0.02 * aligned.extent
 
 
+def test_pictures_in_formats_that_colmap_lacks(say, photographs, tmp_path):
+    """They are read as any other, whatever their extension, and come out as they went in."""
+    folder, out = tmp_path / "photos", tmp_path / "out"
+    shutil.copytree(photographs, folder)
+    for name, suffix in (("0", ".webp"), ("1", ".png")):
+        with Image.open(folder / f"{name}.png") as picture:
+            picture.load()
+        (folder / f"{name}.png").unlink()
+        picture.save(folder / f"{name}{suffix}", "WEBP", lossless=True)
+    code, said = say(folder, "--out", out)
+    assert code == 0, said
+    assert open_photographs(out).names == ("0.webp", *(f"{i}.png" for i in range(1, COUNT)))
+    assert (out / "images/0.webp").read_bytes() == (folder / "0.webp").read_bytes()
+
+
 def test_folders_that_cannot_be_used(say, tmp_path):
     (tmp_path / "empty").mkdir()
     out = tmp_path / "new/out"
@@ -125,6 +141,15 @@ def test_folders_that_cannot_be_used(say, tmp_path):
         "nowhere: expected a folder of photographs or a video" in say(tmp_path / "nowhere", "--out", out)[1]
     )
     assert "b.jpg: expected a video" in say(tmp_path / "empty/b.jpg", "--out", out)[1]
+    (tmp_path / "phone").mkdir()
+    for name in ("1.HEIC", "2.heic"):
+        (tmp_path / "phone" / name).write_bytes(b"")
+    said = say(tmp_path / "phone", "--out", out)[1]
+    assert "phone: expected 3 photographs or more" in said
+    assert "found 2 in a format that is not read (HEIC: " in said
+    assert "Convert to JPEG or PNG first" in said
+    dots.save(tmp_path / "phone/a.png", np.zeros((20, 20, 3), np.uint8))
+    assert "besides 1 pictures, 2 in a format that is not read" in say(tmp_path / "phone", "--out", out)[1]
     assert not (tmp_path / "new").exists()
     said = say(tmp_path / "empty", "--out", tmp_path / "empty")[1]
     assert "the photographs themselves are there; name another folder" in said

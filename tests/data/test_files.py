@@ -1,12 +1,22 @@
 """Single pictures in all formats that programs save."""
 
+import io
+
 import cv2
 import numpy as np
 import pytest
 from PIL import Image
 
 from gsjax.data import DataError
-from gsjax.data.files import picture_size, read_image, read_rgba
+from gsjax.data.files import (
+    background_behind,
+    image_size,
+    picture_size,
+    read_image,
+    read_json,
+    read_rgba,
+    read_text,
+)
 
 WIDTH, HEIGHT = 12, 8
 RAMP = np.arange(WIDTH * HEIGHT * 3, dtype=np.uint16).reshape(HEIGHT, WIDTH, 3)
@@ -86,3 +96,137 @@ def test_the_size_comes_from_the_file_header(tmp_path):
     assert picture_size(path) == (WIDTH, HEIGHT)
     with pytest.raises(DataError, match=r"b.png: expected an image, found no such file"):
         picture_size(tmp_path / "b.png")
+
+
+def jpeg(**options) -> bytes:
+    file = io.BytesIO()
+    Image.fromarray(np.tile(RAMP.astype(np.uint8), (5, 5, 1))).save(file, "JPEG", **options)
+    return file.getvalue()
+
+
+def with_thumbnail(content: bytes) -> bytes:
+    """EXIF with a JPEG of its own, whose end mark is not that of the photograph."""
+    thumbnail = jpeg(quality=20)
+    segment = b"Exif\0\0" + thumbnail
+    return content[:2] + b"\xff\xe1" + (len(segment) + 2).to_bytes(2, "big") + segment + content[2:]
+
+
+WHOLE = {
+    "baseline": jpeg(),
+    "progressive": jpeg(progressive=True),
+    "restart marks": jpeg(restart_marker_blocks=1),
+    "thumbnail": with_thumbnail(jpeg()),
+    "grey": cv2.imencode(".jpg", np.tile(RAMP[..., 0].astype(np.uint8), (5, 5)))[1].tobytes(),
+    "PNG": cv2.imencode(".png", np.tile(RAMP.astype(np.uint8), (5, 5, 1)))[1].tobytes(),
+}
+TAILS = {"zeros": bytes(3000), "0xff": b"\xff" * 100, "film": b"\0\0\0\x18ftypmp42" * 50, "picture": jpeg()}
+
+
+@pytest.mark.parametrize("form", WHOLE)
+@pytest.mark.parametrize("tail", TAILS)
+def test_bytes_behind_the_end_of_a_picture_do_not_matter(tmp_path, form, tail):
+    path = tmp_path / "a.jpg"
+    path.write_bytes(WHOLE[form])
+    alone = read_image(path, 5 * WIDTH, 5 * HEIGHT)
+    path.write_bytes(WHOLE[form] + TAILS[tail])
+    np.testing.assert_array_equal(read_image(path, 5 * WIDTH, 5 * HEIGHT), alone)
+
+
+@pytest.mark.parametrize("form", WHOLE)
+@pytest.mark.parametrize("tail", ["nothing", "zeros", "0xff"])
+def test_wherever_a_picture_is_cut_off_it_is_refused(tmp_path, form, tail):
+    """Also where a download had reserved the file's whole length."""
+    path, content = tmp_path / "a.jpg", WHOLE[form]
+    for length in range(30, len(content) - 13, 7):
+        path.write_bytes(content[:length] + TAILS.get(tail, b""))
+        with pytest.raises(DataError, match=r"expected an image, found a file that is cut off"):
+            read_image(path, 5 * WIDTH, 5 * HEIGHT)
+
+
+@pytest.mark.parametrize("mode", ["RGBA", "LA", "P", "L"])
+def test_what_is_transparent_shows_the_background(tmp_path, mode):
+    """Whatever way a picture has of saying so; and the readers know that there is such a picture."""
+    grey = np.full((HEIGHT, WIDTH, 4), 200, np.uint8)
+    grey[..., 3], grey[:4] = 255, (90, 90, 90, 0)
+    picture = Image.fromarray(grey)
+    if mode in ("P", "L"):
+        first = Image.fromarray(grey[..., :3]).convert("L")
+        first.convert(mode).save(tmp_path / "a.png", transparency=90)
+    else:
+        picture.convert(mode).save(tmp_path / "a.png")
+    read = read_image(tmp_path / "a.png", WIDTH, HEIGHT, (0.0, 0.0, 1.0))
+    assert (read[0, 0].tolist(), read[5, 5].tolist()) == ([0, 0, 255], [200, 200, 200])
+    assert read_image(tmp_path / "a.png", WIDTH, HEIGHT)[0, 0].tolist() == [0, 0, 0]
+    picture.convert("RGB").save(tmp_path / "b.png")
+    picture.convert("RGB").convert("RGBA").save(tmp_path / "c.png")
+    assert background_behind([tmp_path / "b.png", tmp_path / "a.png"]) == (1, 1, 1)
+    assert background_behind([tmp_path / "b.png", tmp_path / "c.png"]) is None
+
+
+HEIC = b"\0\0\0\x18ftypheic\0\0\0\0mif1heic" + bytes(99)
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "says"),
+    [
+        (
+            "a.HEIC",
+            HEIC,
+            "found HEIC, a format that is not read. Convert to JPEG or PNG first, .*heif-convert",
+        ),
+        ("a.jpg", HEIC, "found HEIC, a format that is not read. Convert"),
+        ("a.heif", b"anything", "found HEIC, a format that is not read. Convert"),
+        ("a.avif", b"\0\0\0\x18ftypavif" + bytes(99), "found AVIF, a format that is not read. Convert"),
+        ("a.jxl", b"\xff\x0a" + bytes(99), "found JPEG XL, a format that is not read. Convert"),
+        ("a.CR3", b"\0\0\0\x18ftypcrx \0\0", "found camera raw, a format that is not read. Develop to JPEG"),
+        (
+            "a.tif",
+            b"II*\0\x10\0\0\0CR\2\0" + bytes(99),
+            "found camera raw, a format that is not read. Develop",
+        ),
+        ("a.jpg", b"text", r"found something else \(.*\). Fetch the file again"),
+    ],
+)
+def test_formats_that_are_not_read_are_named(tmp_path, name, content, says):
+    path = tmp_path / name
+    path.write_bytes(content)
+    for read in (picture_size, lambda path: read_image(path, WIDTH, HEIGHT), image_size):
+        with pytest.raises(DataError, match=rf"{name}: expected an image, {says}"):
+            read(path)
+
+
+@pytest.mark.parametrize("name", ["a.NEF", "a.dng"])
+def test_the_thumbnail_of_raw_data_is_not_taken_for_the_photograph(tmp_path, name):
+    """Such files are TIFF, whose first picture decoders read."""
+    Image.fromarray(RAMP.astype(np.uint8)).save(tmp_path / name, "TIFF")
+    for read in (picture_size, lambda path: read_image(path, WIDTH, HEIGHT)):
+        with pytest.raises(DataError, match="found camera raw, a format that is not read"):
+            read(tmp_path / name)
+
+
+def test_a_jpeg_is_read_whatever_its_name(tmp_path):
+    (tmp_path / "a.HEIC").write_bytes(WHOLE["baseline"])
+    assert picture_size(tmp_path / "a.HEIC") == (5 * WIDTH, 5 * HEIGHT)
+    assert read_image(tmp_path / "a.HEIC", 5 * WIDTH, 5 * HEIGHT).any()
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16", "utf-16-be", "utf-32", "cp1252"])
+def test_text_of_any_encoding(tmp_path, encoding):
+    (tmp_path / "a.txt").write_bytes("höhe\r\nCafé 1\r\r\nenough of it to be told\r".encode(encoding))
+    assert read_text(tmp_path / "a.txt") == "höhe\nCafé 1\nenough of it to be told\n"
+
+
+@pytest.mark.parametrize(
+    "content", [b"\xff\xfe\x80", b"SQLite format 3\0" + bytes(99), b"\x89PNG\r\n\x1a\n\0"]
+)
+def test_what_is_no_text_is_refused(tmp_path, content):
+    (tmp_path / "a.txt").write_bytes(content)
+    with pytest.raises(DataError, match=r"a.txt: expected lines, found binary data \(.*\). Fetch"):
+        read_text(tmp_path / "a.txt", "lines")
+    with pytest.raises(DataError, match=r"b.txt: expected lines, found no such file"):
+        read_text(tmp_path / "b.txt", "lines")
+
+
+def test_json_with_backslashes_that_were_not_escaped(tmp_path):
+    (tmp_path / "a.json").write_text(r'{"a": "images\000.png", "b": "c\\d", "e": "f\"g", "h": "i\test"}')
+    assert read_json(tmp_path / "a.json") == {"a": r"images\000.png", "b": r"c\d", "e": 'f"g', "h": r"i\test"}

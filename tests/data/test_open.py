@@ -149,3 +149,23 @@ def test_the_error_for_a_video_says_how_to_find_poses(tmp_path):
     (tmp_path / "walk.MOV").write_bytes(b"any")
     with pytest.raises(DataError, match=r"found a video, which has no poses. .*gsjax poses .*walk.MOV --out"):
         open_photographs(tmp_path / "walk.MOV")
+
+
+@pytest.mark.parametrize("place", ["", "images"])
+@pytest.mark.parametrize("suffix", [".HEIC", ".heif", ".NEF", ".jxl"])
+def test_photographs_in_formats_that_are_not_read_are_counted(tmp_path, place, suffix):
+    (tmp_path / place).mkdir(exist_ok=True)
+    for name in "ab":
+        (tmp_path / place / f"{name}{suffix}").write_bytes(b"")
+    for opened in (open_photographs, open_sequence):
+        with pytest.raises(DataError, match=rf"found 2 in a format that is not read \(.*\{suffix}, \.\.\.\)"):
+            opened(tmp_path)
+
+
+def test_a_listed_photograph_of_which_there_is_only_raw_data(tmp_path):
+    (tmp_path / "a.CR2").write_bytes(b"")
+    (tmp_path / "transforms.json").write_text('{"frames": [{"file_path": "a.jpg"}]}')
+    with pytest.raises(
+        DataError, match=r"found 1 in a format that is not read \(camera raw: a.CR2\). Develop"
+    ):
+        open_photographs(tmp_path)

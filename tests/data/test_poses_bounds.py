@@ -2,7 +2,7 @@ import cv2
 import numpy as np
 import pytest
 
-from gsjax.data import DataError, read_dynerf, read_llff
+from gsjax.data import DataError, DataWarning, read_dynerf, read_llff
 from gsjax.data.poses_bounds import _read_rows
 from gsjax.geometry.cameras import look_at
 from tests.data import dots
@@ -190,3 +190,27 @@ def test_the_tissue(shared_data):
         pixels = local @ scene.Ks[i].T
         inside = (pixels[:, :2] > 0).all(-1) & (pixels[:, :2] < local[:, 2:] * scene.sizes[i]).all(-1)
         assert inside.mean() > 0.3
+
+
+def test_what_is_transparent_is_white_as_the_background(tmp_path):
+    root = build(tmp_path / "fern", "llff")
+    assert read_llff(root, "llff").background is None
+    clear = np.full((HEIGHT, WIDTH, 4), (255, 0, 255, 0), np.uint8)
+    clear[:9] = 10, 20, 30, 255
+    dots.save(root / "images/001.png", clear)
+    scene = read_llff(root, "llff")
+    assert scene.background == (1, 1, 1)
+    assert (scene.image(1)[0, 0].tolist(), scene.image(1)[9:].min()) == ([10, 20, 30], 255)
+
+
+def test_photographs_in_formats_that_are_not_read(tmp_path):
+    root = build(tmp_path / "fern", "llff")
+    (root / "images/003.HEIC").write_bytes(b"")
+    with pytest.warns(
+        DataWarning, match=r"besides 3 pictures, 1 in a format .*\(HEIC: 003.HEIC\) are left out"
+    ):
+        assert read_llff(root, "llff").num == 3
+    for photograph in (root / "images").glob("*.png"):
+        photograph.rename(photograph.with_suffix(".DNG"))
+    with pytest.raises(DataError, match=r"images: expected pictures, found 4 in a format that is not read"):
+        read_llff(root, "llff")

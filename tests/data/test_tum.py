@@ -180,7 +180,7 @@ def test_missing_and_empty_lists(folder, name):
     (folder.root / name).write_text("# nothing\n")
     with pytest.raises(DataError, match=rf"{name}: expected lines 'stamp .*found none"):
         open_sequence(folder.root)
-    (folder.root / name).write_bytes(b"\xff\xfe\x00\x80")
+    (folder.root / name).write_bytes(b"\xff\xfe\x80")
     with pytest.raises(DataError, match=rf"{name}: .*found binary data"):
         open_sequence(folder.root)
     (folder.root / name).unlink()

@@ -9,6 +9,8 @@ from typing import Any
 
 import yaml
 
+from gsjax.data.files import read_text
+
 CONFIG = "config.yaml"
 FIGURES = (".png", ".svg", ".jpg", ".webp")
 _WORDS = {str: "text", int: "a whole number", list: "a list", dict: "key: value pairs"}
@@ -56,8 +58,8 @@ def read_config(path: Path, root: Path) -> tuple[Config, tuple[Column, ...], Fig
         ValueError: the file is not YAML, or a key is invalid.
     """
     try:
-        found = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        found = yaml.safe_load(read_text(path, "YAML"))
+    except yaml.YAMLError as error:
         mark, problem = getattr(error, "problem_mark", None), getattr(error, "problem", None)
         fault = f"a fault in line {mark.line + 1}: {problem}" if mark else str(error)
         raise ValueError(f"{path}: expected YAML, found {fault}") from error
