@@ -1,15 +1,17 @@
-"""Videos that browsers can play: H.264, yuv420p, encoded by the ffmpeg bundled with imageio-ffmpeg."""
+"""Videos that browsers can play: H.264, yuv420p, encoded by the ffmpeg bundled with imageio-ffmpeg, which
+also lists the packets of any video."""
 
 import contextlib
 import os
 import subprocess
 import tempfile
 from pathlib import Path
+from typing import NamedTuple
 
 import cv2
 import imageio_ffmpeg
 import numpy as np
-from jaxtyping import Num, UInt8
+from jaxtyping import Float, Num, UInt8
 
 
 class VideoWriter:
@@ -136,6 +138,51 @@ def read_video_frames(path: str | os.PathLike) -> UInt8[np.ndarray, "T H W 3"]:
     if not frames:
         raise ValueError(f"{path}: expected a video, found a file without a readable frame")
     return np.stack(frames)
+
+
+class Packets(NamedTuple):
+    """The packets of a video's pictures, of which each mostly holds one.
+
+    Attributes:
+        times: presentation timestamps, seconds, sorted, [n].
+        skipped: number of packets that the file's edit list hides.
+        sound: whether all have a timestamp and content, none is marked as damaged, and none comes before the
+            first key frame.
+        codec: ffmpeg's name of the codec; "" if ffmpeg finds no pictures.
+    """
+
+    times: Float[np.ndarray, "n"]
+    skipped: int
+    sound: bool
+    codec: str
+
+
+_KEY, _CORRUPT, _DISCARD = 1, 2, 4  # flags of a packet
+_NO_STAMP = -(2**63)
+
+
+def list_packets(path: str | os.PathLike) -> Packets:
+    """The packets of the pictures in a video, without decoding them."""
+    what = ["-map", "0:V:0", "-c", "copy", "-copyinkf", "-f", "framecrc", "-"]
+    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-v", "error", "-i", f"file:{path}", *what]
+    listed = subprocess.run(command, capture_output=True, stdin=subprocess.DEVNULL, check=False)
+    unit, codec, rows = 0.0, "", []
+    for line in listed.stdout.decode(errors="replace").splitlines():
+        if line.startswith("#tb"):
+            seconds, _, parts = line.split(":")[1].partition("/")
+            unit = int(seconds) / int(parts)
+        elif line.startswith("#codec_id"):
+            codec = line.split(":")[1].strip()
+        elif not line.startswith("#"):
+            _, _, stamp, _, size, _, *more = (field.strip() for field in line.split(","))
+            flags = next((int(field[2:], 16) for field in more if field.startswith("F=")), _KEY)
+            rows.append((int(stamp), int(size), flags))
+    stamps, sizes, flags = np.array(rows, np.int64).reshape(-1, 3).T
+    shown = (flags & _DISCARD) == 0
+    key = stamps[(flags & _KEY) > 0]
+    sound = listed.returncode == 0 and not listed.stderr and len(key) > 0 and (stamps[shown] >= key[0]).all()
+    sound = sound and bool((stamps != _NO_STAMP).all() and (sizes > 0).all() and not (flags & _CORRUPT).any())
+    return Packets(np.sort(stamps[shown]) * unit, int(np.sum(~shown)), bool(sound), codec)
 
 
 def _to_bytes(frame: np.ndarray) -> np.ndarray:
