@@ -19,6 +19,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
+from gsjax.data.clouds import find_cloud, read_cloud
 from gsjax.data.errors import DataError, DataWarning
 from gsjax.data.files import picture_size, read_image, read_mask
 from gsjax.data.lens import Lens, scaled_intrinsics, undistort
@@ -96,6 +97,8 @@ def read_colmap(path: str | Path, images: str = "images") -> Photographs:
         if (model / f"points3D{suffix}").exists()
         else None
     )
+    if cloud is None and (points := find_cloud(model)) is not None:
+        cloud = read_cloud(points)
     usable = [image for image in registered if np.isfinite(image.viewmat).all()]
     kept = [image for image in usable if os.path.isfile(root / images / image.name)]
     left_out = []

@@ -11,6 +11,7 @@ from urllib.parse import parse_qsl
 import numpy as np
 
 from gsjax.data import clip, colmap, poses_bounds, transforms
+from gsjax.data.duplicates import without_duplicates
 from gsjax.data.endonerf import is_endonerf, is_unambiguous_endonerf, read_endonerf
 from gsjax.data.endovis import LEFT, is_endovis, read_endovis
 from gsjax.data.errors import DataError
@@ -176,6 +177,8 @@ def _flag(name: str) -> str:
 def open_photographs(path: str | Path, options: ReadOptions | None = None) -> Photographs:
     """Open the photographs in a folder, whose layout is recognised, or all frames of a recording.
 
+    Of photographs that are listed twice, one is left (see `gsjax.data.duplicates`).
+
     Raises:
         DataError: there is no such folder, or its layout is unknown.
         ValueError: as for `open_sequence`, or `axes` is required and missing.
@@ -189,11 +192,11 @@ def _photographs(path: str | Path, options: ReadOptions) -> Photographs:
     if text.startswith(SIMULATED_PREFIX):
         return photographs_of(open_sequence(text, options))
     if text.endswith(".json") and Path(path).is_file():
-        return _read("nerfstudio", transforms.read_transforms, Path(path), options)
+        return without_duplicates(_read("nerfstudio", transforms.read_transforms, Path(path), options))
     root = _folder(path)
     if (layout := _photograph_layout(root)) is not None:
         settled = {"axes": _axes(root, options)} if layout.read is poses_bounds.read_llff else {}
-        return _read(layout.name, layout.read, root, options, **settled)
+        return without_duplicates(_read(layout.name, layout.read, root, options, **settled))
     if is_recording(root):
         return photographs_of(open_sequence(root, options))
     raise _unknown(root, {layout.mark: layout.name for layout in _PHOTOGRAPHS} | _RECORDINGS, options)
