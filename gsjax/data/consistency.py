@@ -10,7 +10,8 @@ import os
 import warnings
 from collections import Counter
 from collections.abc import Callable, Iterator
-from itertools import combinations
+from functools import partial
+from itertools import combinations, islice
 from typing import NamedTuple
 
 import numpy as np
@@ -20,13 +21,13 @@ from gsjax.data.errors import DataWarning
 from gsjax.data.photographs import Photographs
 from gsjax.data.sequence import Sequence
 
-_MOST_VIEWS = 4
+_MOST_VIEWS, _MOST_PAIRS = 4, 3
 _POINTS = 600  # per view
 _FACTORS = np.geomspace(1e-3, 1e3, 271)  # 5 % apart
 _AGREES = 0.05  # relative difference of two depths of one surface
 _RIGHT = 1.25  # a smaller factor may be noise, or a calibration that is slightly off
 _LEAST_SHARE = 0.2  # of the points must agree with some factor, for a verdict
-_TIMES_AS_MANY = 3.0  # as without it
+_TIMES_AS_MANY = 2.0  # as without it
 _ANGLE = np.deg2rad(40)  # between views that may see the same surface
 _JUMP, _FEW = 20.0, 0.1  # in median steps; of all steps
 _SAME_PLACE = 1e-6  # of their distance from the origin
@@ -46,23 +47,20 @@ def check_recording(sequence: Sequence) -> None:
     Warns with DataWarning if depth is in another unit than the poses; if cameras look away from each other or
     stand at one place; if time jumps; or if a picture is listed for several frames.
     """
-    name, frames, cameras = sequence.name, sequence.num_frames, sequence.num_cameras
+    name, cameras = sequence.name, sequence.num_cameras
     _check_clock(name, sequence)
     _check_files(name, sequence)
     if cameras > 1:
         _check_places(name, sequence.viewmats[0], "cameras")
-    load = sequence.load_depth
-    if load is None:
+    if sequence.load_depth is None:
         return
-    if cameras > 1:
-        depths = ((c, _depth(lambda c=c: load(0, c))) for c in range(cameras))
-        known = [_View(sequence.Ks[0, c], sequence.viewmats[0, c], d) for c, d in depths if d is not None]
-        pairs = list(combinations(known[:_MOST_VIEWS], 2))
-    else:
-        pairs = list(
-            _moved_pairs(sequence.Ks[:, 0], sequence.viewmats[:, 0], [*range(frames)], lambda t: load(t, 0))
-        )
-    _warn_of_factor(name, _factor_of_pairs(pairs), "those of other views")
+    Ks, viewmats, load = sequence.Ks, sequence.viewmats, sequence.load_depth
+    pairs = (
+        _moved_pairs(Ks[:, 0], viewmats[:, 0], partial(_at, load))
+        if cameras == 1
+        else _simultaneous_pairs(Ks[0], viewmats[0], partial(load, 0))
+    )
+    _warn_of_factor(name, _factor_of_pairs(list(pairs)), "that of other views")
 
 
 def check_photographs(photographs: Photographs) -> None:
@@ -73,20 +71,39 @@ def check_photographs(photographs: Photographs) -> None:
     """
     name, cloud, load = photographs.name, photographs.cloud, photographs.load_depth
     _check_places(name, photographs.viewmats, "photographs")
-    if cloud is not None and len(cloud.points):
-        _check_directions(photographs)
+    points = np.zeros((0, 3)) if cloud is None else cloud.points
+    if len(points):
+        _check_directions(photographs, points)
     if load is None:
         return
     Ks, viewmats = photographs.Ks, photographs.viewmats
-    if cloud is not None and len(cloud.points) >= _POINTS:
-        some = np.unique(np.linspace(0, photographs.num - 1, _MOST_VIEWS).astype(int))
-        depths = ((i, _depth(lambda i=i: load(i))) for i in some)
-        views = [_View(Ks[i], viewmats[i], depth) for i, depth in depths if depth is not None]
-        if (factor := _factor_of_points(views, cloud.points)) is not None:
-            _warn_of_factor(name, factor, "the points that come with the poses")
-            return
-    pairs = list(_moved_pairs(Ks, viewmats, [*range(photographs.num)], load))
-    _warn_of_factor(name, _factor_of_pairs(pairs), "those of other views")
+    depths = ((i, _depth(partial(load, i))) for i in _spread(photographs.num))
+    views = [_View(Ks[i], viewmats[i], depth) for i, depth in depths if depth is not None]
+    factor, others = _factor_of_points(views, points), "the points that come with the poses"
+    if factor is None:
+        pairs = _moved_pairs(Ks, viewmats, load)
+        factor, others = _factor_of_pairs(list(pairs)), "that of other views"
+    _warn_of_factor(name, factor, others)
+
+
+def _at(load: Callable[[int, int], np.ndarray | None], t: int) -> np.ndarray | None:
+    return load(t, 0)
+
+
+def _spread(count: int, most: int = _MOST_VIEWS) -> list[int]:
+    """Some of so many views, evenly spread."""
+    return np.unique(np.linspace(0, count - 1, most).astype(int)).tolist()
+
+
+def _simultaneous_pairs(
+    Ks: Float[np.ndarray, "n 3 3"],
+    viewmats: Float[np.ndarray, "n 4 4"],
+    load: Callable[[int], np.ndarray | None],
+) -> Iterator[tuple[_View, _View]]:
+    """Pairs of the first cameras that have depth."""
+    depths = ((c, _depth(partial(load, c))) for c in range(len(Ks)))
+    known = (_View(Ks[c], viewmats[c], depth) for c, depth in depths if depth is not None)
+    return combinations(islice(known, _MOST_VIEWS), 2)
 
 
 def _depth(load: Callable[[], np.ndarray | None]) -> Float[np.ndarray, "height width"] | None:
@@ -104,7 +121,6 @@ def _depth(load: Callable[[], np.ndarray | None]) -> Float[np.ndarray, "height w
 def _moved_pairs(
     Ks: Float[np.ndarray, "n 3 3"],
     viewmats: Float[np.ndarray, "n 4 4"],
-    indices: list[int],
     load: Callable[[int], np.ndarray | None],
 ) -> Iterator[tuple[_View, _View]]:
     """Pairs of views that look in similar directions from places that are well apart."""
@@ -112,13 +128,13 @@ def _moved_pairs(
     apart = np.linalg.norm(centers - centers[0], axis=1).max(initial=0)
     if apart <= _SAME_PLACE * max(1.0, float(np.abs(centers).max())):
         return
-    for i in np.unique(np.linspace(0, len(indices) - 1, _MOST_VIEWS).astype(int)):
+    for i in _spread(len(centers), _MOST_PAIRS):
         distances = np.linalg.norm(centers - centers[i], axis=1)
         usable = (axes @ axes[i] > np.cos(_ANGLE)) & (distances > 0.02 * apart)
         if not usable.any():
             continue
         j = int(np.argmin(np.where(usable, np.abs(distances - 0.25 * apart), np.inf)))
-        depths = [_depth(lambda k=k: load(indices[k])) for k in (int(i), j)]
+        depths = [_depth(partial(load, k)) for k in (i, j)]
         if depths[0] is not None and depths[1] is not None:
             yield _View(Ks[i], viewmats[i], depths[0]), _View(Ks[j], viewmats[j], depths[1])
 
@@ -219,11 +235,10 @@ def _check_places(name: str, viewmats: Float[np.ndarray, "n 4 4"], noun: str) ->
         warnings.warn(f"{message}; {advice}", DataWarning, stacklevel=4)
 
 
-def _check_directions(photographs: Photographs) -> None:
-    """Warns if hardly any photograph has points in view."""
-    points = photographs.cloud.points[:: max(1, len(photographs.cloud.points) // _POINTS)]
-    some = np.unique(np.linspace(0, photographs.num - 1, 64).astype(int))
-    blind = 0
+def _check_directions(photographs: Photographs, points: Float[np.ndarray, "m 3"]) -> None:
+    """Warns if most photographs have no point in view."""
+    points = points[:: max(1, len(points) // _POINTS)]
+    some, blind = _spread(photographs.num, 64), 0
     for i in some:
         local = points @ photographs.viewmats[i, :3, :3].T + photographs.viewmats[i, :3, 3]
         local = local[local[:, 2] > 0]

@@ -1,7 +1,7 @@
 """Opens recordings and sets of photographs in any layout that has a reader."""
 
 import inspect
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from contextlib import suppress
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
@@ -147,7 +147,7 @@ def _read(
     path: Any,
     options: ReadOptions,
     *,
-    unused: set[str] = frozenset(),
+    unused: Collection[str] = (),
     **settled: Any,
 ) -> Data:
     """What a reader makes of a path and of the options that were given, which it takes by their names.
@@ -156,7 +156,7 @@ def _read(
         ValueError: an option is given that the reader has no argument for, or that the data has no use for.
     """
     given = {f.name for f in fields(options) if getattr(options, f.name) != f.default} - {"near"}
-    taken = (inspect.signature(read).parameters.keys() & {f.name for f in fields(options)}) - unused
+    taken = (inspect.signature(read).parameters.keys() & {f.name for f in fields(options)}) - set(unused)
     if refused := sorted(given - taken):
         expected = f"options of the {layout} layout ({', '.join(map(_flag, sorted({*taken, 'near'})))})"
         found = ", ".join(map(_flag, refused))

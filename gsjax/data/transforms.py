@@ -244,9 +244,10 @@ class _Entry(NamedTuple):
 
     def beside(self, root: Path, *keys: str) -> Path | None:
         """Path of the mask or depth image of its photograph, if it has one."""
-        name = self.value(*keys)
+        key = next((key for key in keys if self.value(key) is not None), keys[0])
+        name = self.value(key)
         if name is not None and not isinstance(name, str):
-            raise self.error(f"{' or '.join(keys)}, a name", repr(name), "Correct the file.")
+            raise self.error(f"{key}, a name", repr(name), "Correct the file.")
         return root / name if name else None
 
     def lens(self, width: int, height: int) -> Lens:

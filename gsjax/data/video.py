@@ -154,7 +154,7 @@ class Video:
             if not self._grab():
                 self._capture = None
                 return False
-        return abs(self._time(file) - wanted) <= near
+        return bool(abs(self._time(file) - wanted) <= near)
 
     def _seek(self, file: VideoFile, wanted: float, near: float) -> None:
         """Grab a frame at or before a time."""
@@ -179,7 +179,7 @@ class Video:
         if self._capture is None:
             return np.inf
         if not file.stamped:
-            return file.times[self._grabbed - 1] if self._grabbed <= file.frames else np.inf
+            return float(file.times[self._grabbed - 1]) if self._grabbed <= file.frames else np.inf
         return 1e-3 * self._capture.get(cv2.CAP_PROP_POS_MSEC) - self._first
 
 

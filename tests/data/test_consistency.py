@@ -64,7 +64,7 @@ def cloud_of(scene):
 @pytest.mark.parametrize(("factor", "says"), [(5.0, "5.0 times too large"), (0.2, "5.0 times too small")])
 def test_depth_in_another_unit_than_the_poses(table, moving, factor, says):
     for sequence in (table, table.select(cameras=(0, 1)), moving):
-        with pytest.warns(DataWarning, match=rf"depth looks {says}: .* --read.depth-unit-m"):
+        with pytest.warns(DataWarning, match=rf"depth looks {says}: .*--read.depth-unit-m"):
             check_recording(with_depth_times(sequence, factor))
         silent(check_recording, sequence)
 
