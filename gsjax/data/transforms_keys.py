@@ -40,7 +40,14 @@ _DATA = re.compile(
 
 
 def warn_of_unread(root: Path, file: Path, meta: Mapping[str, Any]) -> None:
-    """Warns of keys that look like data, by their names or as their values name files, and are not read."""
+    """Warns with DataWarning of keys that look like data, by their names or as their values name files, and
+    are not read.
+
+    Args:
+        root: the folder to which such names are relative.
+        file: the file, for the message.
+        meta: its contents.
+    """
     counts: dict[str, int] = {}
     for number, values in enumerate((meta, *meta["frames"])):
         for key, value in values.items() if isinstance(values, dict) else ():
@@ -50,12 +57,12 @@ def warn_of_unread(root: Path, file: Path, meta: Mapping[str, Any]) -> None:
                 counts[key] = counts.get(key, 0) + (number > 0)
     if counts:
         found = ", ".join(f"{key} (of {n} frames)" if n else key for key, n in counts.items())
-        advice = "what is read is listed in docs/data.md: rename them, or leave them out"
+        advice = "give them names that are (docs/data.md), or leave them out"
         warnings.warn(f"{file}: these keys are not read: {found}; {advice}", DataWarning, stacklevel=3)
 
 
 def warn_of_unknown_unit(file: Path, meta: Mapping[str, Any]) -> None:
-    """Warns of instant-ngp's depth without its unit, for which that program has no default."""
+    """Warns with DataWarning of instant-ngp's depth without its unit, which has no default there."""
     frames = [frame for frame in meta["frames"] if isinstance(frame, dict)]
     if any("depth_path" in frame for frame in frames) and not any(
         name in place for name in UNITS for place in (meta, *frames)

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 import cv2
-import imageio_ffmpeg
 import numpy as np
 from jaxtyping import Float, Num, UInt8
 
@@ -91,7 +90,7 @@ class _Encoder:
         self._messages = tempfile.TemporaryFile()  # noqa: SIM115  (`finish` closes it)
         # imageio-ffmpeg's own writer forks with a `preexec_fn`, which may deadlock with JAX's threads.
         self._process = subprocess.Popen(
-            [imageio_ffmpeg.get_ffmpeg_exe(), "-y", "-loglevel", "error", *source, *target, str(path)],
+            [_ffmpeg(), "-y", "-loglevel", "error", *source, *target, str(path)],
             stdin=subprocess.PIPE,
             stderr=self._messages,
             **_own_process_group(),
@@ -164,7 +163,7 @@ _NO_STAMP = -(2**63)
 def list_packets(path: str | os.PathLike) -> Packets:
     """The packets of the pictures in a video, without decoding them."""
     what = ["-map", "0:V:0", "-c", "copy", "-copyinkf", "-f", "framecrc", "-"]
-    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-v", "error", "-i", f"file:{path}", *what]
+    command = [_ffmpeg(), "-v", "error", "-i", f"file:{path}", *what]
     listed = subprocess.run(command, capture_output=True, stdin=subprocess.DEVNULL, check=False)
     unit, codec, rows = 0.0, "", []
     for line in listed.stdout.decode(errors="replace").splitlines():
@@ -193,6 +192,13 @@ def _to_bytes(frame: np.ndarray) -> np.ndarray:
     if not np.issubdtype(frame.dtype, np.floating):
         raise ValueError(f"frame: expected uint8 or floats 0 to 1, found dtype {frame.dtype}")
     return np.round(255 * np.clip(np.nan_to_num(frame), 0, 1)).astype(np.uint8)
+
+
+def _ffmpeg() -> str:
+    """The path of ffmpeg. Imported late, as most programs read and write no video."""
+    import imageio_ffmpeg
+
+    return imageio_ffmpeg.get_ffmpeg_exe()
 
 
 def _own_process_group() -> dict[str, int]:

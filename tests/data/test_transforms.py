@@ -375,7 +375,7 @@ def test_keys_that_look_like_data_are_named_if_they_are_not_read(folder):
         DataWarning, match=r"transforms.json: these keys are not read: depth_scale, k5, "
     ) as seen:
         folder.read()
-    assert "k5, normal_path (of 1 frames), extra (of 1 frames); what" in str(seen[0].message)
+    assert "k5, normal_path (of 1 frames), extra (of 1 frames); give" in str(seen[0].message)
     assert len(seen) == 1
 
 
