@@ -158,7 +158,7 @@ def _read(
     given = {f.name for f in fields(options) if getattr(options, f.name) != f.default} - {"near"}
     taken = (inspect.signature(read).parameters.keys() & {f.name for f in fields(options)}) - set(unused)
     if refused := sorted(given - taken):
-        expected = f"options of the {layout} layout ({', '.join(map(_flag, sorted({*taken, 'near'})))})"
+        expected = f"options for {layout} data ({', '.join(map(_flag, sorted({*taken, 'near'})))})"
         found = ", ".join(map(_flag, refused))
         raise ValueError(f"{path}: expected {expected}, found {found}. Leave it out.")
     data = read(path, **({name: getattr(options, name) for name in given} | settled))

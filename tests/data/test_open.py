@@ -140,7 +140,7 @@ def test_options_that_a_layout_has_no_use_for_are_refused_by_name(tmp_path, writ
     for name in OTHERS.keys() - set(uses):
         flag = "--read." + name.replace("_", "-")
         with pytest.raises(
-            ValueError, match=rf"expected options of the .*--read.near.*, found {flag}\. Leave"
+            ValueError, match=rf"expected options for .* data .*--read.near.*, found {flag}\. Leave"
         ):
             opened(tmp_path, ReadOptions(**needed | {name: OTHERS[name]}))
 
