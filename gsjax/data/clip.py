@@ -44,7 +44,8 @@ def read_clip(
     masks: str | None = None,
     tool: Tool = "white",
 ) -> Sequence:
-    """The frames of one static camera, 0, at the origin. Times are those of the video, or 30 Hz for a folder.
+    """The frames of one static camera, 0, at the origin. Times are those that the video states for each
+    frame, or 30 Hz for a folder.
 
     Without `K`, a horizontal field of view of 60 degrees and a centred principal point are assumed.
 
@@ -61,7 +62,8 @@ def read_clip(
             and frames differ; the tool covers everything in all of them; there is depth, which needs poses.
         ValueError: an option is invalid.
 
-    Warns with DataWarning if `K` is not given, masks look inverted, or there is only one frame.
+    Warns with DataWarning if frames of the video cannot be decoded, `K` is not given, masks look inverted, or
+    there is only one frame.
     """
     source = Path(path)
     frames = _folder_frames(source, images) if source.is_dir() else _video_frames(source)
@@ -119,11 +121,10 @@ class _Frames(NamedTuple):
 
 
 def _video_frames(path: Path) -> _Frames:
-    described = describe_video(path)
-    width, height, count, rate_hz = described
-    video = Video(path, width, height, count)
-    times, numbers = np.arange(count) / rate_hz, tuple(range(count))
-    return _Frames(width, height, times, numbers, video.frame, lambda t: f"{path}, frame {t}")
+    file = describe_video(path)
+    video = Video(path, file.width, file.height, file.frames, file)
+    numbers = tuple(range(file.frames))
+    return _Frames(file.width, file.height, file.times, numbers, video.frame, lambda t: f"{path}, frame {t}")
 
 
 def _folder_frames(root: Path, images: str) -> _Frames:

@@ -1,42 +1,185 @@
-"""Coloured points in PLY files."""
+"""Coloured points in files of many tools: PLY, PCD, lines of text, and arrays.
+
+x y z, and colours as red green blue (PLY of most tools), r g b, diffuse_red ... (Agisoft), f_dc_0 ... (3DGS),
+or one intensity (laser scanners). Integers are relative to the largest value of their type, floats to 1 or,
+where some are larger, to 255; alpha and all else is ignored.
+"""
 
 import warnings
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Float, Shaped
 
 from gsjax.data.errors import DataError, DataWarning
 from gsjax.data.photographs import Cloud
+from gsjax.geometry.spherical_harmonics import SH_C0
+
+NAMES = ("sparse_pc.ply", "points3D.ply")
+"""Files of points that nerfstudio and 3DGS write beside their poses without naming them there."""
 
 _GREY = 0.5  # for points without a colour
+_RGB = ("red", "green", "blue")
+_COLORS = (
+    _RGB,
+    ("r", "g", "b"),
+    tuple(f"diffuse_{name}" for name in _RGB),
+    tuple(f"scalar_{name}" for name in _RGB),
+    tuple(f"f_dc_{i}" for i in range(3)),
+    ("intensity",) * 3,
+    ("scalar_intensity",) * 3,
+)
+_OVERSHOOT = 1.5  # floats from 0 to 1 may end a little above 1
+_TEXT = (".xyz", ".txt", ".pts", ".csv", ".asc", ".xyzrgb")
+_COMPRESSED = "binary_compressed"
+
+Columns = Mapping[str, Shaped[np.ndarray, "points"]]
 
 
 def read_cloud(path: Path) -> Cloud:
-    """The points of a PLY file, grey if it has no colours. Points that are not finite are left out, with a
-    DataWarning.
+    """The points of a file (.ply, .pcd, .npy, or lines of text such as .xyz), grey if it has no colours.
+    Points that are not finite are left out, with a DataWarning.
 
     Raises:
-        DataError: the file is missing, truncated, or not a PLY file with x, y and z.
+        DataError: the file is missing, truncated, or not one of points with x, y and z.
     """
-    from plyfile import PlyData, PlyParseError
+    suffix = path.suffix.lower()
+    read = _READERS.get(suffix, _read_text if suffix in _TEXT else _read_ply)
+    from plyfile import PlyParseError
 
     try:
-        vertices = PlyData.read(str(path))["vertex"]
-        points = np.stack([vertices[axis] for axis in "xyz"], axis=-1).astype(np.float64)
-        names = {prop.name for prop in vertices.properties}
-        colors = np.full(points.shape, _GREY)
-        if {"red", "green", "blue"} <= names:
-            colors = np.stack([vertices[name] for name in ("red", "green", "blue")], axis=-1)
-            colors = colors / (255 if np.issubdtype(colors.dtype, np.integer) else 1)
+        columns = {name.lower(): column for name, column in read(path).items()}
+        points = np.stack([columns[axis] for axis in "xyz"], axis=-1).astype(np.float64)
+        colors = _colors(columns, len(points))
     except (FileNotFoundError, IsADirectoryError):
         advice = "Restore it, or remove the reference to it."
         raise DataError(path, "a point cloud", "no such file", advice) from None
     except (PlyParseError, KeyError, ValueError, TypeError, EOFError, OverflowError, MemoryError) as error:
-        raise DataError(
-            path, "a PLY file with x, y, z", f"something else ({error})", "Fetch it again."
-        ) from None
+        expected = f"{_KINDS[read]} with x, y, z"
+        raise DataError(path, expected, f"something else ({error})", "Fetch it again.") from None
     finite = np.isfinite(points).all(-1) & np.isfinite(colors).all(-1)
     if not finite.all():
         some = f"{(~finite).sum()} of {len(finite)} points"
         warnings.warn(f"{path}: {some} are not finite and are left out", DataWarning, stacklevel=2)
     return Cloud(points[finite], np.clip(colors[finite], 0, 1))
+
+
+def find_cloud(*folders: Path) -> Path | None:
+    """The first file of `NAMES` that lies in one of these folders; None if there is none."""
+    choices = (folder / name for folder in folders for name in NAMES)
+    return next((choice for choice in choices if choice.is_file()), None)
+
+
+def _colors(columns: Columns, count: int) -> Float[np.ndarray, "points 3"]:
+    """RGB, mostly from 0 to 1."""
+    names = next((names for names in _COLORS if all(name in columns for name in names)), None)
+    if names is None:
+        return np.full((count, 3), _GREY)
+    colors = np.stack([columns[name] for name in names], axis=-1)
+    if names[0] == "f_dc_0":
+        return 0.5 + SH_C0 * colors.astype(np.float64)
+    if colors.dtype == np.int8:  # bytes, by an exporter without unsigned ones
+        colors = colors.view(np.uint8)
+    return colors.astype(np.float64) / _largest(colors)
+
+
+def _largest(colors: Shaped[np.ndarray, "points 3"]) -> float:
+    """The value of full brightness."""
+    highest = np.max(colors, initial=0, where=np.isfinite(colors))
+    if np.issubdtype(colors.dtype, np.integer):
+        # Exporters also write bytes as wider integers: as such they would all be black.
+        sizes = (255, 65535, np.iinfo(colors.dtype).max)
+        return next((size for size in sizes if highest <= size), sizes[-1])
+    if highest <= _OVERSHOOT:
+        return 1.0
+    return next((size for size in (255.0, 65535.0) if highest <= size), float(highest))
+
+
+def _read_ply(path: Path) -> Columns:
+    from plyfile import PlyData
+
+    vertices = PlyData.read(str(path))["vertex"]
+    return {prop.name: vertices[prop.name] for prop in vertices.properties}
+
+
+def _read_npy(path: Path) -> Columns:
+    array = np.load(path, allow_pickle=False)
+    if array.dtype.names:
+        return {name: array[name].ravel() for name in array.dtype.names}
+    return _of_table(array)
+
+
+def _read_text(path: Path) -> Columns:
+    """Columns of numbers; lines that do not begin with a number, and one that counts the points, are
+    skipped."""
+    lines = path.read_text(encoding="utf-8-sig", errors="replace").replace(",", " ").replace(";", " ")
+    rows = [row for line in lines.splitlines() if (row := line.split()) and _is_number(row[0])]
+    return _of_table(np.array(rows[1:] if rows and len(rows[0]) == 1 else rows, np.float64))
+
+
+def _is_number(word: str) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True
+
+
+def _of_table(table: Shaped[np.ndarray, "points columns"]) -> Columns:
+    """Columns without names: x y z, then an intensity if one or four follow, then r g b; normals, which have
+    negative values, are no colours."""
+    if table.ndim != 2 or table.shape[1] < 3 or table.dtype.kind not in "fiu":
+        raise ValueError(f"shape {table.shape} of {table.dtype}")
+    columns = dict(zip("xyz", table.T, strict=False))
+    rest = table[:, 3:]
+    if rest.shape[1] in (1, 4):
+        columns["intensity"], rest = rest[:, 0], rest[:, 1:]
+    triples = (rest[:, i : i + 3] for i in range(0, rest.shape[1] - 2, 3))
+    colors = next((triple for triple in triples if not (triple < 0).any()), None)
+    return columns | ({} if colors is None else dict(zip(_RGB, colors.T, strict=True)))
+
+
+def _read_pcd(path: Path) -> Columns:
+    """PCL's format: lines of a header, and points as lines of text or bytes; rgb packs three bytes."""
+    content = path.read_bytes()
+    start = content.find(b"\nDATA ")
+    end = content.find(b"\n", start + 1)
+    header = content[: end if end >= 0 else len(content)].decode("ascii", "replace")
+    words = dict(line.split(maxsplit=1) for line in header.splitlines() if len(line.split()) > 1)
+    names, types = words["FIELDS"].split(), words["TYPE"].split()
+    sizes = [int(size) for size in words["SIZE"].split()]
+    counts = [int(count) for count in words.get("COUNT", "1 " * len(names)).split()]
+    fields = [
+        (f"{name}_{i}", f"<{kind.lower()}{size}", (count,))
+        for i, (name, kind, size, count) in enumerate(zip(names, types, sizes, counts, strict=True))
+    ]
+    data, layout, points = words["DATA"].strip(), np.dtype(fields), int(words["POINTS"])
+    if data == "binary":
+        rows = np.frombuffer(content, layout, count=points, offset=end + 1)
+    elif data == "ascii":
+        lines = [line.split() for line in content[end + 1 :].decode("ascii").splitlines() if line.strip()]
+        edges = np.cumsum([0, *counts])
+        rows = np.empty(len(lines), layout)
+        for (name, kind, _), first, last in zip(fields, edges, edges[1:], strict=False):
+            rows[name] = np.array([line[first:last] for line in lines], np.float64).astype(kind)
+    else:
+        advice = ", save it as binary" if data == _COMPRESSED else ""
+        raise ValueError(f"DATA {data}{advice}")
+    columns = {name: rows[field][:, 0] for name, (field, _, _) in zip(names, fields, strict=True)}
+    for name in {"rgb", "rgba"} & columns.keys():
+        packed = np.ascontiguousarray(columns[name]).view("<u4")
+        columns |= {
+            color: (packed >> shift & 255).astype(np.uint8)
+            for color, shift in zip(_RGB, (16, 8, 0), strict=True)
+        }
+    return columns
+
+
+_READERS: dict[str, Callable[[Path], Columns]] = {".ply": _read_ply, ".npy": _read_npy, ".pcd": _read_pcd}
+_KINDS = {
+    _read_ply: "a PLY file",
+    _read_npy: "an array",
+    _read_pcd: "a PCD file",
+    _read_text: "lines of text",
+}

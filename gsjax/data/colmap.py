@@ -17,6 +17,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
+from gsjax.data.clouds import find_cloud, read_cloud
 from gsjax.data.colmap_files import AGAIN, CameraEntry, ImageEntry, read_cameras, read_images, read_points
 from gsjax.data.errors import DataError, DataWarning
 from gsjax.data.files import BLACK, background_behind, picture_size, read_image
@@ -76,6 +77,8 @@ def read_colmap(path: str | Path, images: str = "images", model: str | None = No
             advice = "Did the reconstruction fail? Give another model, or reconstruct again."
             raise DataError(file, "at least one entry", "none", advice)
     cloud = None if chosen.points is None else read_points(chosen.points)
+    if cloud is None and (points := find_cloud(chosen.folder)) is not None:
+        cloud = read_cloud(points)
     usable = [image for image in registered if np.isfinite(image.viewmat).all()]
     files = [find_file(root / images, image.name) for image in usable]
     left_out = []

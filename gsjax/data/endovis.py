@@ -83,7 +83,7 @@ def read_endovis(
 
     Raises:
         DataError: a file is missing or unreadable, frames differ in size, or an instrument is unknown.
-        ValueError: there is neither a calibration nor `K`, or an option is invalid.
+        ValueError: there is neither a calibration nor `K`, or both, or an option is invalid.
 
     Warns with DataWarning if there is only one frame, frames lack labels, the pose of the right eye is
     unknown (it is left out), or the lens distorts by more than a pixel, which is not corrected.
@@ -99,6 +99,9 @@ def read_endovis(
     check_one_size([frames[0], *others])
     numbers = frame_numbers(frames)
     eyes = _eyes_from_calibration(root, size, bool(others))
+    if eyes and (K is not None or baseline_m is not None):
+        advice = "leave out K (--read.K) and baseline_m (--read.baseline-m), or remove the file"
+        raise ValueError(f"{root / CALIBRATION}: it states what the options give; {advice}")
     eyes = eyes or _eyes_from_options(root, K, baseline_m, bool(others))
     files = [frames, others][: len(eyes)]
     warn_about_single_frame(frames)

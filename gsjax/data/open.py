@@ -1,16 +1,17 @@
 """Opens recordings and sets of photographs in any layout that has a reader."""
 
 import inspect
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple, TypeVar
 from urllib.parse import parse_qsl
 
 import numpy as np
 
 from gsjax.data import clip, colmap, poses_bounds, transforms
+from gsjax.data.duplicates import without_duplicates
 from gsjax.data.endonerf import is_endonerf, is_unambiguous_endonerf, read_endonerf
 from gsjax.data.endovis import LEFT, is_endovis, read_endovis
 from gsjax.data.errors import DataError
@@ -47,13 +48,25 @@ _LAYOUTS = {
 _RECORDINGS = {mark: layout for mark, (layout, _) in _LAYOUTS.items()} | {LEFT: "EndoVis"}
 _RECORDINGS |= {"poses_bounds.npy and depth or masks": "EndoNeRF", "poses_bounds.npy and cam*.mp4": "DyNeRF"}
 
+# Option -> what it is about, and whether data that were read have that.
+_ABOUT = {
+    "depth_unit_m": ("depth", lambda data: data.load_depth is not None),
+    "depth_percentiles": ("depth", lambda data: data.load_depth is not None),
+    "tool": ("masks", lambda data: data.load_mask is not None),
+    "baseline_m": ("a right eye", lambda data: data.num_cameras > 1),
+}
+
+Data = TypeVar("Data", Sequence, Photographs)
+
 
 @dataclass(frozen=True)
 class ReadOptions:
-    """Options for what some layouts leave open."""
+    """Options for what some layouts leave open. A layout's reader takes those that it has arguments for; the
+    others are refused rather than ignored."""
 
     K: tuple[float, float, float, float] | None = None
-    """fx fy cx cy for data without intrinsics (Open3D, videos), in pixels, with pixel centres at +0.5."""
+    """fx fy cx cy for data without intrinsics (Open3D, videos) or by one's own camera (TUM, 7-Scenes), in
+    pixels, with pixel centres at +0.5."""
     axes: poses_bounds.Axes | None = None
     """Meaning of the rotation columns in poses_bounds.npy: llff (down, right, back; DyNeRF too) or endonerf
     (right, up, back). Default: endonerf if masks and depth lie beside the images; otherwise required."""
@@ -66,8 +79,8 @@ class ReadOptions:
     tool: Tool = "white"
     """Colour of the tool in black-and-white masks (EndoNeRF, videos): white or black."""
     depth_unit_m: float | None = None
-    """Metres per unit of the stored depth values (Open3D, nerfstudio, EndoNeRF); default: the value given in
-    the data, else 0.001."""
+    """Metres per unit of the stored depth values (TUM, 7-Scenes, Panoptic, Open3D, nerfstudio, EndoNeRF);
+    default: the value given in the data, else that of the layout: 0.0002 for TUM, 0.001 for others."""
     depth_percentiles: tuple[float, float] | None = None
     """Lowest and highest percentile of each frame's depth to keep (EndoNeRF), for example 3 99.8 for depth
     from stereo matching; default: keep all."""
@@ -82,6 +95,9 @@ class ReadOptions:
     def __post_init__(self):
         if not 0 <= self.near < np.inf:
             raise ValueError(f"near: expected 0 or more, found {self.near}")
+        for name in ("depth_unit_m", "pose_unit_m", "baseline_m"):
+            if (length := getattr(self, name)) is not None and not 0 < length < np.inf:
+                raise ValueError(f"{name}: expected metres above 0, found {length}")
 
 
 def open_sequence(path: str | Path, options: ReadOptions | None = None) -> Sequence:
@@ -93,7 +109,8 @@ def open_sequence(path: str | Path, options: ReadOptions | None = None) -> Seque
 
     Raises:
         DataError: there is no such folder, its layout is unknown, or it holds photographs without a time.
-        ValueError: there is no built-in scene of that name, it has no such argument, or an option is missing.
+        ValueError: there is no built-in scene of that name, it has no such argument, an option is missing, or
+            one is given that the layout has no use for.
     """
     options = options or ReadOptions()
     return replace(_sequence(path, options), near=options.near)
@@ -101,33 +118,68 @@ def open_sequence(path: str | Path, options: ReadOptions | None = None) -> Seque
 
 def _sequence(path: str | Path, options: ReadOptions) -> Sequence:
     if str(path).startswith(SIMULATED_PREFIX):
-        return _simulate(str(path))
+        return _read("built-in", _simulate, str(path), options)
     root = Path(path)
     if root.is_file() and clip.is_clip(root):
-        return _clip(root, options)
+        return _read("video", clip.read_clip, root, options, unused={"images"})
     root = _folder(path)
-    for mark, (_, read) in _LAYOUTS.items():
+    for mark, (layout, read) in _LAYOUTS.items():
         if next(root.glob(mark), None):
-            return read(root)
+            return _read(layout, read, root, options)
     if is_open3d(root):
-        return _open3d(root, options)
+        return _read("Open3D", read_open3d, root, options)
     if poses_bounds.find(root) and next(root.glob("cam*.mp4"), None):
-        return poses_bounds.read_dynerf(root, options.axes or "llff")
+        return _read("DyNeRF", poses_bounds.read_dynerf, root, options)
     if is_endonerf(root, options.images):
-        return _endonerf(root, options)
+        return _read("EndoNeRF", read_endonerf, root, options, axes=_axes(root, options))
     if is_endovis(root):
-        return read_endovis(root, K=options.K, baseline_m=options.baseline_m)
+        return _read("EndoVis", read_endovis, root, options)
     photographs = _photograph_layout(root)
     if photographs:
         found = f"photographs ({photographs.name} layout), which are not ordered in time"
         raise DataError(root, "a recording over time", found, "Use gsjax fit for photographs.")
     if clip.is_clip(root, options.images, options.masks):
-        return _clip(root, options)
+        return _read("clip", clip.read_clip, root, options)
     raise _unknown(root, _RECORDINGS, options)
+
+
+def _read(
+    layout: str,
+    read: Callable[..., Data],
+    path: Any,
+    options: ReadOptions,
+    *,
+    unused: Collection[str] = (),
+    **settled: Any,
+) -> Data:
+    """What a reader makes of a path and of the options that were given, which it takes by their names.
+
+    Raises:
+        ValueError: an option is given that the reader has no argument for, or that the data has no use for.
+    """
+    given = {f.name for f in fields(options) if getattr(options, f.name) != f.default} - {"near"}
+    taken = (inspect.signature(read).parameters.keys() & {f.name for f in fields(options)}) - set(unused)
+    if refused := sorted(given - taken):
+        expected = f"options for {layout} data ({', '.join(map(_flag, sorted({*taken, 'near'})))})"
+        found = ", ".join(map(_flag, refused))
+        raise ValueError(f"{path}: expected {expected}, found {found}. Leave it out.")
+    data = read(path, **({name: getattr(options, name) for name in given} | settled))
+    for name in sorted(given & _ABOUT.keys()):
+        what, has = _ABOUT[name]
+        if not has(data):
+            raise ValueError(f"{path}: expected data with {what}, as {_flag(name)} is given, found none.")
+    return data
+
+
+def _flag(name: str) -> str:
+    """An option as the command line spells it."""
+    return f"--read.{name.replace('_', '-')}"
 
 
 def open_photographs(path: str | Path, options: ReadOptions | None = None) -> Photographs:
     """Open the photographs in a folder, whose layout is recognised, or all frames of a recording.
+
+    Of photographs that are listed twice, one is left (see `gsjax.data.duplicates`).
 
     Raises:
         DataError: there is no such folder, or its layout is unknown.
@@ -140,12 +192,13 @@ def open_photographs(path: str | Path, options: ReadOptions | None = None) -> Ph
 def _photographs(path: str | Path, options: ReadOptions) -> Photographs:
     text = str(path)
     if text.startswith(SIMULATED_PREFIX):
-        return photographs_of(open_sequence(text))
+        return photographs_of(open_sequence(text, options))
     if text.endswith(".json") and Path(path).is_file():
-        return transforms.read_transforms(path, **_unit(options))
+        return without_duplicates(_read("nerfstudio", transforms.read_transforms, Path(path), options))
     root = _folder(path)
     if (layout := _photograph_layout(root)) is not None:
-        return layout.read(root, options)
+        settled = {"axes": _axes(root, options)} if layout.read is poses_bounds.read_llff else {}
+        return without_duplicates(_read(layout.name, layout.read, root, options, **settled))
     if is_recording(root):
         return photographs_of(open_sequence(root, options))
     raise _unknown(root, {layout.mark: layout.name for layout in _PHOTOGRAPHS} | _RECORDINGS, options)
@@ -176,7 +229,7 @@ class _PhotographLayout(NamedTuple):
     name: str
     mark: str
     is_layout_of: Callable[[Path], bool]
-    read: Callable[[Path, ReadOptions], Photographs]
+    read: Callable[..., Photographs]
 
 
 _PHOTOGRAPHS = (
@@ -184,19 +237,19 @@ _PHOTOGRAPHS = (
         "nerfstudio",
         "transforms.json",
         lambda root: next(root.glob("transforms*.json"), None) is not None,
-        lambda root, options: transforms.read_transforms(root, **_unit(options)),
+        transforms.read_transforms,
     ),
     _PhotographLayout(
         "COLMAP",
         "sparse/0/cameras.bin",
         lambda root: bool(colmap.find_models(root)),
-        lambda root, options: colmap.read_colmap(root, options.images, options.model),
+        colmap.read_colmap,
     ),
     _PhotographLayout(
         "LLFF",
         "poses_bounds.npy",
         lambda root: bool(poses_bounds.find(root)) and not next(root.glob("cam*.mp4"), None),
-        lambda root, options: poses_bounds.read_llff(root, _axes(root, options), options.images),
+        poses_bounds.read_llff,
     ),
 )
 
@@ -204,32 +257,6 @@ _PHOTOGRAPHS = (
 def _photograph_layout(root: Path) -> _PhotographLayout | None:
     """The layout of a folder of photographs, judged by its files; None if it has none."""
     return next((layout for layout in _PHOTOGRAPHS if layout.is_layout_of(root)), None)
-
-
-def _open3d(root: Path, options: ReadOptions) -> Sequence:
-    if options.K is None:
-        raise ValueError(
-            f"{root}: an Open3D folder has no intrinsics; give K (--read.K), fx fy cx cy in pixels, centres "
-            "at +0.5 (if your calibration counts pixel centres at integers, add 0.5 to cx and cy)"
-        )
-    return read_open3d(root, options.K, **_unit(options))
-
-
-def _endonerf(root: Path, options: ReadOptions) -> Sequence:
-    return read_endonerf(
-        root,
-        axes=_axes(root, options),
-        images=options.images,
-        tool=options.tool,
-        depth_unit_m=options.depth_unit_m,
-        pose_unit_m=options.pose_unit_m,
-        depth_percentiles=options.depth_percentiles,
-        baseline_m=options.baseline_m,
-    )
-
-
-def _clip(path: Path, options: ReadOptions) -> Sequence:
-    return clip.read_clip(path, K=options.K, images=options.images, masks=options.masks, tool=options.tool)
 
 
 def _axes(root: Path, options: ReadOptions) -> poses_bounds.Axes:
@@ -241,10 +268,6 @@ def _axes(root: Path, options: ReadOptions) -> poses_bounds.Axes:
             "to llff (down, right, back) or endonerf (right, up, back)"
         )
     return options.axes
-
-
-def _unit(options: ReadOptions) -> dict[str, float]:
-    return {} if options.depth_unit_m is None else {"depth_unit_m": options.depth_unit_m}
 
 
 def _folder(path: str | Path) -> Path:

@@ -47,7 +47,7 @@ def is_open3d(root: Path) -> bool:
 @near_origin
 def read_open3d(
     path: str | Path,
-    K: Float[np.ndarray, "3 3"] | tuple[float, float, float, float],
+    K: Float[np.ndarray, "3 3"] | tuple[float, float, float, float] | None = None,
     *,
     depth_unit_m: float = DEPTH_UNIT_M,
     trajectory: str | None = None,
@@ -63,9 +63,14 @@ def read_open3d(
 
     Raises:
         DataError: the folder has no images or poses, a file is malformed, or no frame has all three.
-        ValueError: `K` is invalid, or a pose is not a rigid motion.
+        ValueError: `K` is missing or invalid, or a pose is not a rigid motion.
     """
     root = Path(path)
+    if K is None:
+        raise ValueError(
+            f"{root}: an Open3D folder has no intrinsics; give K (--read.K), fx fy cx cy in pixels, centres "
+            "at +0.5 (if your calibration counts pixel centres at integers, add 0.5 to cx and cy)"
+        )
     matrix = intrinsics_matrix(K)
     folder, log = _first(root, _IMAGES), root / trajectory if trajectory else _first(root, _TRAJECTORIES)
     if folder is None or log is None:

@@ -38,12 +38,16 @@ _ADVICE_META = "Correct the file, or remove that frame or camera from it."
 
 
 @near_origin
-def read_panoptic(path: str | Path) -> Sequence:
+def read_panoptic(path: str | Path, *, depth_unit_m: float | None = None) -> Sequence:
     """The sequence in a folder of this layout, with the cameras of both metas in the order in which they are
     listed.
 
     Without `time`, frames are 1/30 s apart; without `depth_unit_m`, depth is in millimetres. Frames without
     any image are left out, with a DataWarning that counts them.
+
+    Args:
+        path: the folder.
+        depth_unit_m: metres per depth step; None: as train_meta.json states, else 0.001.
 
     Raises:
         DataError: a meta is missing, inconsistent or in conflict with the other, only some images of a frame
@@ -61,7 +65,7 @@ def read_panoptic(path: str | Path) -> Sequence:
         raise DataError(
             root / META_NAMES[0], f"time to be {frames} numbers", f"shape {times.shape}", _ADVICE_META
         )
-    unit = float(meta.get("depth_unit_m", DEFAULT_DEPTH_UNIT_M))
+    unit = depth_unit_m or float(meta.get("depth_unit_m", DEFAULT_DEPTH_UNIT_M))
 
     first_mask_only = [_has_first_mask_only(root, name) for name in names[0]]
 

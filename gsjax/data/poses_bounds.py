@@ -5,13 +5,14 @@ and farthest depth. R and t are camera to world. The file does not state the mea
 DyNeRF write [down, right, back], EndoNeRF [right, up, back]. So the caller has to choose.
 """
 
+import warnings
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 from jaxtyping import Float, Int
 
-from gsjax.data.errors import DataError
+from gsjax.data.errors import DataError, DataWarning
 from gsjax.data.files import BLACK, background_behind, picture_size, read_arrays, read_image
 from gsjax.data.frame_folders import pictures
 from gsjax.data.lens import scaled_intrinsics
@@ -71,7 +72,9 @@ def read_llff(path: str | Path, axes: Axes, images: str = "images") -> Photograp
 def read_dynerf(path: str | Path, axes: Axes = "llff") -> Sequence:
     """A DyNeRF scene (Li et al. 2022): cam00.mp4, cam01.mp4, ..., one per row of poses.
 
-    The sequence is as long as the shortest video.
+    The sequence is as long as the shortest video, and its times are those of the first.
+
+    Warns with DataWarning if frames of one number are more than half a frame apart in time.
 
     Raises:
         DataError: as for `read_llff`, or the videos differ in size.
@@ -94,7 +97,8 @@ def read_dynerf(path: str | Path, axes: Axes = "llff") -> Sequence:
         )
         raise DataError(paths[odd], expected, found, "Resize all videos to one size.")
     frames = min(video.frames for video in described)
-    videos = [Video(p, *shapes[0], video.frames) for p, video in zip(paths, described, strict=True)]
+    videos = [Video(p, *shapes[0], video.frames, video) for p, video in zip(paths, described, strict=True)]
+    _warn_of_clocks(paths, [video.times[:frames] for video in described])
     Ks = _intrinsics(paths, focals, sizes, np.array(shapes))
     return Sequence(
         name=root.resolve().name,
@@ -103,13 +107,24 @@ def read_dynerf(path: str | Path, axes: Axes = "llff") -> Sequence:
         ),
         width=shapes[0][0],
         height=shapes[0][1],
-        times=np.arange(frames) / described[0].rate_hz,
+        times=described[0].times[:frames],
         frame_ids=tuple(range(frames)),
         Ks=np.broadcast_to(Ks, (frames, *Ks.shape)),
         viewmats=np.broadcast_to(viewmats, (frames, *viewmats.shape)),
         load_image=lambda t, c: videos[c].frame(t),
         locate=lambda kind, t, c: f"{paths[c]}, {kind} {t}",
     )
+
+
+def _warn_of_clocks(paths: list[Path], times: list[Float[np.ndarray, "t"]]) -> None:
+    """Warns if the frames of one number, which count as simultaneous, are apart in time."""
+    apart = np.abs(np.stack(times) - times[0])
+    step = np.median(np.diff(times[0])) if apart.shape[1] > 1 else np.inf
+    if apart.max() > 0.5 * step:
+        c, t = (int(i) for i in np.unravel_index(apart.argmax(), apart.shape))
+        message = f"{paths[c]}: frame {t} is {apart[c, t]:.3g} s apart from that of {paths[0].name}"
+        advice = "frames of one number count as simultaneous; give videos with the same times"
+        warnings.warn(f"{message}; {advice}", DataWarning, stacklevel=3)
 
 
 def find(root: Path) -> Path | None:

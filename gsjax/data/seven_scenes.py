@@ -19,7 +19,8 @@ import numpy as np
 from jaxtyping import Float
 
 from gsjax.data.errors import DataError, DataWarning
-from gsjax.data.files import read_depth, read_image, read_text
+from gsjax.data.files import image_size, read_depth, read_image, read_text
+from gsjax.data.lens import intrinsics_matrix
 from gsjax.data.names import find_file
 from gsjax.data.origin import near_origin
 from gsjax.data.pictures import SUFFIXES
@@ -34,13 +35,19 @@ DEPTH_FOCAL, COLOR_FOCAL = 585.0, 525.0
 BASELINE_M = 0.025
 """Distance of the colour camera to the right of the depth camera."""
 
-_DEPTH_UNIT_M = 0.001
+DEPTH_UNIT_M = 0.001
 _MICROSOFT_NAN = re.compile(r"-?\d\.#(?:IND|QNAN|SNAN|INF)\w*(?:[+-]\d+)?")
 _FRAME = re.compile(r"frame-(\d+)\.pose\.txt")
 
 
 @near_origin
-def read_seven_scenes(path: str | Path, *, register: bool = True) -> Sequence:
+def read_seven_scenes(
+    path: str | Path,
+    *,
+    register: bool = True,
+    K: Float[np.ndarray, "3 3"] | tuple[float, float, float, float] | None = None,
+    depth_unit_m: float = DEPTH_UNIT_M,
+) -> Sequence:
     """The sequence in a folder of this layout (such as seq-01 of a scene): one camera, 0; times are frame
     numbers at 30 Hz.
 
@@ -52,6 +59,9 @@ def read_seven_scenes(path: str | Path, *, register: bool = True) -> Sequence:
         register: return the colour camera with depth warped into its view: reprojected point by point with a
             z-buffer, and invalid where the depth camera has no data. False returns the depth camera with the
             files unchanged, for use with depth alone or with colour that is already registered.
+        K: intrinsics of one's own camera, or (fx, fy, cx, cy), with pixel centres at +0.5. Then pictures may
+            have any one size, and depth is taken as registered to colour; default: the Kinect of 7-Scenes.
+        depth_unit_m: metres per depth step.
 
     Raises:
         DataError: the folder has no frame or holds several sequences, a pose is malformed, or its intrinsics
@@ -59,28 +69,31 @@ def read_seven_scenes(path: str | Path, *, register: bool = True) -> Sequence:
         ValueError: a pose is not a rigid motion.
     """
     root = Path(path)
-    _check_intrinsics(root / "camera-intrinsics.txt")
+    if K is None:
+        _check_intrinsics(root / "camera-intrinsics.txt")
     numbers, poses, images, depths = _read_frames(root)
-    frames = len(numbers)
+    frames, (width, height) = len(numbers), (WIDTH, HEIGHT) if K is None else image_size(images[0])
+    register = register and K is None
     from_depth = np.eye(4)
     from_depth[0, 3] = -BASELINE_M if register else 0.0
 
     def load_depth(t: int, c: int) -> Float[np.ndarray, "height width"]:
-        depth = read_depth(depths[t], _DEPTH_UNIT_M, WIDTH, HEIGHT)
+        depth = read_depth(depths[t], depth_unit_m, width, height)
         return _warped_to_color(depth) if register else depth
 
     files = {"image": images, "depth": depths}
-    K = intrinsics(COLOR_FOCAL if register else DEPTH_FOCAL, WIDTH, HEIGHT)
+    if K is None:
+        K = intrinsics(COLOR_FOCAL if register else DEPTH_FOCAL, WIDTH, HEIGHT)
     return Sequence(
         name=_name(root.resolve()),
         camera_ids=(0,),
-        width=WIDTH,
-        height=HEIGHT,
+        width=width,
+        height=height,
         times=np.array(numbers) / RATE_HZ,
         frame_ids=tuple(numbers),
-        Ks=np.broadcast_to(K, (frames, 1, 3, 3)),
+        Ks=np.broadcast_to(intrinsics_matrix(K), (frames, 1, 3, 3)),
         viewmats=(from_depth @ np.linalg.inv(poses))[:, None],
-        load_image=lambda t, c: read_image(images[t], WIDTH, HEIGHT),
+        load_image=lambda t, c: read_image(images[t], width, height),
         load_depth=load_depth,
         locate=lambda kind, t, c: str(files[kind][t]),
     )
@@ -172,5 +185,5 @@ def _check_intrinsics(path: Path) -> None:
     known = intrinsics(DEPTH_FOCAL, WIDTH, HEIGHT)
     if not np.allclose(K, known, atol=0.5):
         expected = f"the depth camera of 7-Scenes, {known.tolist()}"
-        advice = "Give a recording of another camera as arrays or as a Panoptic folder (docs/data.md)."
+        advice = "If its depth is registered to colour, give K (--read.K), fx fy cx cy, centres at +0.5."
         raise DataError(path, expected, f"{K.tolist()}", advice)

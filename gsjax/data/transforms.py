@@ -4,10 +4,16 @@ fl_x, fl_y, cx, cy, w, h       pixels, centres at +0.5; for all frames, or per f
 camera_angle_x, camera_angle_y radians, instead of focal lengths
 k1 .. k4, p1, p2               OpenCV's lens distortion; camera_model (or is_fisheye) selects the model
 frames[]                       file_path (Blender omits the extension), transform_matrix [4,4], optionally
-                               mask_path (0 = ignored), depth_file_path (16 bits), time
+                               mask_path (0 = ignored), depth_file_path or instant-ngp's depth_path (16 bits),
+                               time
+integer_depth_scale            instant-ngp's length of a depth step; depth_unit_scale_factor in nerfstudio;
+                               enable_depth_loading false leaves depth out
 train_filenames, ...           nerfstudio's splits: files in none of the lists are left out, as nerfstudio
                                does; Blender has a file per split: transforms_train.json, ...
-ply_file_path                  nerfstudio's sparse points
+ply_file_path                  nerfstudio's sparse points; default: sparse_pc.ply, if it lies there
+
+Poses and points are in one frame, so nerfstudio's applied_transform, which tells how that came to be, and the
+scale, offset and aabb_scale by which instant-ngp places its grid, change nothing here.
 """
 
 import warnings
@@ -18,7 +24,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float
 
-from gsjax.data.clouds import read_cloud
+from gsjax.data.clouds import find_cloud, read_cloud
 from gsjax.data.errors import DataError, DataWarning
 from gsjax.data.files import (
     BLACK,
@@ -36,11 +42,18 @@ from gsjax.data.names import find_file, portable
 from gsjax.data.origin import near_origin
 from gsjax.data.photographs import Photographs
 from gsjax.data.pictures import SUFFIXES, refuse_unread
+from gsjax.data.transforms_keys import (
+    DEPTH_UNIT_M,
+    DEPTHS,
+    MODEL_KEYS,
+    SPLITS,
+    UNITS,
+    warn_of_unknown_unit,
+    warn_of_unread,
+)
 from gsjax.data.validation import check_poses
 from gsjax.geometry.cameras import intrinsics, viewmat_from_opengl
 
-SPLITS = ("train", "val", "test")
-_DEPTH_UNIT_M = 0.001  # nerfstudio's default
 _MODELS = dict.fromkeys(("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV"), False)
 _MODELS["OPENCV_FISHEYE"] = True
 
@@ -54,6 +67,7 @@ class _Frame(NamedTuple):
     image: Path
     mask: Path | None
     depth: Path | None
+    depth_unit: float
     time: float | None
 
 
@@ -62,7 +76,7 @@ def read_transforms(
     path: str | Path,
     *,
     background: Color = WHITE,
-    depth_unit_m: float = _DEPTH_UNIT_M,
+    depth_unit_m: float | None = None,
 ) -> Photographs:
     """The photographs listed in a transforms.json, or in a transforms_train.json and its siblings.
 
@@ -75,7 +89,10 @@ def read_transforms(
     Args:
         path: the folder, or one such file.
         background: RGB, 0 to 1, behind transparent photographs; default: white, as is usual.
-        depth_unit_m: length of one depth step.
+        depth_unit_m: length of one depth step; None: as the file states, else 0.001, as in nerfstudio.
+
+    Warns with DataWarning if the file has keys that look like data and are not read, or instant-ngp's depth
+    without its unit.
 
     Raises:
         DataError: a file is missing or malformed, no frame is left, or a camera model is unknown.
@@ -91,6 +108,9 @@ def read_transforms(
         if not isinstance(meta, dict) or not isinstance(meta.get("frames"), list) or not meta["frames"]:
             raise DataError(file, "frames, a non-empty list", "none", "Is it a transforms.json?")
         named = _named_splits(file, meta)
+        warn_of_unread(root, file, meta)
+        if depth_unit_m is None:
+            warn_of_unknown_unit(file, meta)
         listed += len(meta["frames"])
         for number, entry in enumerate(meta["frames"]):
             frame = _Entry(file, number, meta, entry)
@@ -106,11 +126,13 @@ def read_transforms(
             if pose is None:
                 lost.append(str(entry["file_path"]))
                 continue
-            frames.append(frame.read(root, image, pose, own_split))
-        if cloud is None and meta.get("ply_file_path") is not None:
-            cloud = read_cloud(_beside(root, str(meta["ply_file_path"])))
+            frames.append(frame.read(root, image, pose, own_split, depth_unit_m))
+        points = meta.get("ply_file_path")
+        points = find_cloud(root) if points is None else _beside(root, str(points))
+        if cloud is None and points is not None:
+            cloud = read_cloud(points)
     _report_left_out(root, listed, missing, lost, unnamed, len(frames))
-    return _photographs(root, frames, cloud, background, depth_unit_m)
+    return _photographs(root, frames, cloud, background)
 
 
 def _files(path: Path) -> tuple[Path, dict[Path, str | None]]:
@@ -218,8 +240,14 @@ class _Entry(NamedTuple):
         check_poses("transform_matrix", matrix[None, None], lambda i, _: where, advice)
         return viewmat_from_opengl(matrix)
 
-    def read(self, root: Path, image: Path, pose: np.ndarray, split: str | None) -> _Frame:
+    def read(
+        self, root: Path, image: Path, pose: np.ndarray, split: str | None, depth_unit: float | None
+    ) -> _Frame:
         width, height = picture_size(image)
+        stated = next((unit for name in UNITS if (unit := self.numeral(name)) is not None), DEPTH_UNIT_M)
+        if stated <= 0:
+            raise self.error(f"{' or '.join(UNITS)} above 0", f"{stated:g}", "Correct the file.")
+        has_depth = self.value("enable_depth_loading") is not False
         return _Frame(
             portable(self.entry["file_path"]),
             split,
@@ -228,12 +256,14 @@ class _Entry(NamedTuple):
             (width, height),
             image,
             self.beside(root, "mask_path"),
-            self.beside(root, "depth_file_path"),
+            self.beside(root, *DEPTHS) if has_depth else None,
+            stated if depth_unit is None else depth_unit,
             self.numeral("time"),
         )
 
-    def beside(self, root: Path, key: str) -> Path | None:
+    def beside(self, root: Path, *keys: str) -> Path | None:
         """Path of the mask or depth image of its photograph, if it has one."""
+        key = next((key for key in keys if self.value(key) is not None), keys[0])
         name = self.value(key)
         if name is not None and not isinstance(name, str):
             raise self.error(f"{key}, a name", repr(name), "Correct the file.")
@@ -261,7 +291,8 @@ class _Entry(NamedTuple):
         center = (stated_width / 2 if cx is None else cx, stated_height / 2 if cy is None else cy)
         K = intrinsics(fx, 0, 0, center)
         K[1, 1] = fy
-        model = self.value("camera_model") or ("OPENCV_FISHEYE" if self.value("is_fisheye") else "OPENCV")
+        chosen = (model for key, model in MODEL_KEYS.items() if self.value(key) not in (None, False))
+        model = self.value("camera_model") or next(chosen, "OPENCV")
         if str(model) not in _MODELS:
             raise self.error(
                 f"camera_model to be one of {', '.join(_MODELS)}", model, "Undistort the photographs first."
@@ -298,7 +329,7 @@ def _report_left_out(
         warnings.warn(message, DataWarning, stacklevel=4)
 
 
-def _photographs(root, frames, cloud, background, depth_unit_m) -> Photographs:
+def _photographs(root, frames, cloud, background) -> Photographs:
     ideal = [undistort(frame.lens, *frame.size) for frame in frames]
     shown_before = background_behind([frame.image for frame in frames], background)
     behind = shown_before or BLACK
@@ -315,7 +346,8 @@ def _photographs(root, frames, cloud, background, depth_unit_m) -> Photographs:
     def load_depth(i: int) -> np.ndarray | None:
         if frames[i].depth is None:
             return None
-        return ideal[i][1](read_depth(frames[i].depth, depth_unit_m, *frames[i].size), cv2.INTER_NEAREST)
+        depth = read_depth(frames[i].depth, frames[i].depth_unit, *frames[i].size)
+        return ideal[i][1](depth, cv2.INTER_NEAREST)
 
     has = {
         key: any(getattr(frame, key) is not None for frame in frames) for key in ("mask", "depth", "split")

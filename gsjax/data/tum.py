@@ -21,6 +21,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from gsjax.data.association import associate
 from gsjax.data.errors import DataError, DataWarning
 from gsjax.data.files import image_size, read_depth, read_image, read_text
+from gsjax.data.lens import intrinsics_matrix
 from gsjax.data.names import find_file
 from gsjax.data.origin import near_origin
 from gsjax.data.sequence import Sequence
@@ -48,13 +49,14 @@ _CALIBRATIONS = {
 }
 _SIZE = (640, 480)
 _COMPLETE = "Check the folder; was it copied completely?"
+_GIVE_K = "ive its intrinsics: K (--read.K), fx fy cx cy in pixels, centres at +0.5."
 _UNIT_TOLERANCE = 0.01  # on a quaternion's length: files have four digits
 
 
 @near_origin
 def read_tum(
     path: str | Path,
-    K: Float[np.ndarray, "3 3"] | None = None,
+    K: Float[np.ndarray, "3 3"] | tuple[float, float, float, float] | None = None,
     distortion: Numbers[float] = (),
     *,
     max_skew: float = MAX_SKEW_S,
@@ -74,8 +76,8 @@ def read_tum(
 
     Args:
         path: the folder.
-        K: intrinsics with pixel centres at +0.5; default: those published for freiburg1, 2 or 3, chosen by
-            the folder's name.
+        K: intrinsics of one's own camera, or (fx, fy, cx, cy), with pixel centres at +0.5; default: those
+            published for freiburg1, 2 or 3, chosen by the folder's name.
         distortion: OpenCV distortion coefficients that belong to a given K: none, 4, 5 or 8.
         max_skew: largest time between colour, depth and pose, seconds.
         depth_unit_m: metres per depth step.
@@ -95,6 +97,7 @@ def read_tum(
     width, height = image_size(images[0])
     if K is None:
         K, distortion = _published(root, images[0], (width, height))
+    K = intrinsics_matrix(K)
     lens = _Lens(K, distortion, width, height)
     frames = len(times)
     files = {"image": images, "depth": depth_images}
@@ -212,12 +215,12 @@ def _published(
     camera = re.search(r"(?:freiburg|fr)([123])(?!\d)", name.lower())
     if camera is None:
         expected = "a folder name with freiburg1, freiburg2 or freiburg3, which identifies the camera"
-        advice = "Rename the folder, or give its intrinsics: read_tum(path, K=...)."
+        advice = f"Rename the folder, or g{_GIVE_K}"
         raise DataError(root, expected, repr(name), advice)
     if size != _SIZE:
         expected = f"{_SIZE[0]}x{_SIZE[1]} pixels, for which freiburg{camera[1]} is calibrated"
         found = f"{size[0]}x{size[1]}"
-        raise DataError(image, expected, found, "Give its intrinsics: read_tum(path, K=...).")
+        raise DataError(image, expected, found, f"G{_GIVE_K}")
     (fx, fy, cx, cy), distortion = _CALIBRATIONS[int(camera[1])]
     return np.array([[fx, 0, cx + 0.5], [0, fy, cy + 0.5], [0, 0, 1]]), distortion
 

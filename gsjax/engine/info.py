@@ -11,6 +11,7 @@ from jaxtyping import Float
 from rich.console import Console
 
 from gsjax.data import Photographs, Sequence, open_photographs, open_sequence, photographs_of
+from gsjax.data.consistency import check_photographs, check_recording
 from gsjax.data.errors import MissingFile
 from gsjax.data.open import is_photographs, is_recording
 from gsjax.engine.folder import expect_dataset
@@ -58,11 +59,13 @@ def run(options: Options) -> int:
         if is_photographs(options.dataset) and not is_recording(options.dataset):
             photographs = open_photographs(options.dataset, options.read)
             photographs.image(0)  # an error if it cannot be read
+            check_photographs(photographs)
             facts, groups = describe_photographs(photographs), by_split
         else:
             sequence = open_sequence(options.dataset, options.read)
             for c in range(sequence.num_cameras):
                 sequence.image(0, c)  # an error if it cannot be read
+            check_recording(sequence)
             masks = first_masks(sequence)
             facts, table = describe_sequence(sequence, masks), mask_table(masks, sequence)
             photographs, groups = photographs_of(sequence), lambda _: by_camera(sequence)

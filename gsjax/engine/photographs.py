@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Int
 from rich.console import Console
 
+from gsjax.data.consistency import check_photographs, check_recording
 from gsjax.data.errors import DataError
 from gsjax.data.open import ReadOptions, is_photographs, is_recording, open_photographs
 from gsjax.data.photographs import Photographs, photographs_of
@@ -61,8 +62,11 @@ def choose_photographs(
                 f"--frames: {frames} selects no photograph of {photographs.name}, which has 0 to "
                 f"{photographs.num - 1}."
             )
-        return smaller(photographs.select(chosen), scale)
+        photographs = photographs.select(chosen)
+        check_photographs(photographs)
+        return smaller(photographs, scale)
     recording = open_recording(dataset, cameras, eval_cameras, frames, read)
+    check_recording(recording.judged)
     photographs = photographs_of(recording.judged)
     if eval_cameras:
         places = np.arange(photographs.num) % recording.judged.num_cameras

@@ -17,6 +17,7 @@ from rich.console import Console
 from rich.progress import track
 
 from gsjax.data import ReadOptions, Sequence, open_sequence
+from gsjax.data.consistency import check_recording
 from gsjax.data.errors import DataError, DataWarning
 from gsjax.data.open import SIMULATED_PREFIX
 from gsjax.engine.messages import Notes
@@ -57,9 +58,11 @@ def located(dataset: str) -> str:
 
 
 def chosen_recording(options: OfRecording) -> Recording:
-    """The recording of a command's options. Raises: as `open_recording`."""
+    """The recording of a command's options, checked for mistakes. Raises: as `open_recording`."""
     cameras = (options.cameras, options.eval_cameras)
-    return open_recording(options.dataset, *cameras, options.frames, options.read, options.scale)
+    recording = open_recording(options.dataset, *cameras, options.frames, options.read, options.scale)
+    check_recording(recording.judged)
+    return recording
 
 
 def open_recording(

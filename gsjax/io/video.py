@@ -1,15 +1,16 @@
-"""Videos that browsers can play: H.264, yuv420p, encoded by the ffmpeg bundled with imageio-ffmpeg."""
+"""Videos that browsers can play: H.264, yuv420p, encoded by the ffmpeg bundled with imageio-ffmpeg, which
+also lists the packets of any video."""
 
 import contextlib
 import os
 import subprocess
 import tempfile
 from pathlib import Path
+from typing import NamedTuple
 
 import cv2
-import imageio_ffmpeg
 import numpy as np
-from jaxtyping import Num, UInt8
+from jaxtyping import Float, Num, UInt8
 
 
 class VideoWriter:
@@ -89,7 +90,7 @@ class _Encoder:
         self._messages = tempfile.TemporaryFile()  # noqa: SIM115  (`finish` closes it)
         # imageio-ffmpeg's own writer forks with a `preexec_fn`, which may deadlock with JAX's threads.
         self._process = subprocess.Popen(
-            [imageio_ffmpeg.get_ffmpeg_exe(), "-y", "-loglevel", "error", *source, *target, str(path)],
+            [_ffmpeg(), "-y", "-loglevel", "error", *source, *target, str(path)],
             stdin=subprocess.PIPE,
             stderr=self._messages,
             **_own_process_group(),
@@ -138,6 +139,51 @@ def read_video_frames(path: str | os.PathLike) -> UInt8[np.ndarray, "T H W 3"]:
     return np.stack(frames)
 
 
+class Packets(NamedTuple):
+    """The packets of a video's pictures, of which each mostly holds one.
+
+    Attributes:
+        times: presentation timestamps, seconds, sorted, [n].
+        skipped: number of packets that the file's edit list hides.
+        sound: whether all have a timestamp and content, none is marked as damaged, and none comes before the
+            first key frame.
+        codec: ffmpeg's name of the codec; "" if ffmpeg finds no pictures.
+    """
+
+    times: Float[np.ndarray, "n"]
+    skipped: int
+    sound: bool
+    codec: str
+
+
+_KEY, _CORRUPT, _DISCARD = 1, 2, 4  # flags of a packet
+_NO_STAMP = -(2**63)
+
+
+def list_packets(path: str | os.PathLike) -> Packets:
+    """The packets of the pictures in a video, without decoding them."""
+    what = ["-map", "0:V:0", "-c", "copy", "-copyinkf", "-f", "framecrc", "-"]
+    command = [_ffmpeg(), "-v", "error", "-i", f"file:{path}", *what]
+    listed = subprocess.run(command, capture_output=True, stdin=subprocess.DEVNULL, check=False)
+    unit, codec, rows = 0.0, "", []
+    for line in listed.stdout.decode(errors="replace").splitlines():
+        if line.startswith("#tb"):
+            seconds, _, parts = line.split(":")[1].partition("/")
+            unit = int(seconds) / int(parts)
+        elif line.startswith("#codec_id"):
+            codec = line.split(":")[1].strip()
+        elif not line.startswith("#"):
+            _, _, stamp, _, size, _, *more = (field.strip() for field in line.split(","))
+            flags = next((int(field[2:], 16) for field in more if field.startswith("F=")), _KEY)
+            rows.append((int(stamp), int(size), flags))
+    stamps, sizes, flags = np.array(rows, np.int64).reshape(-1, 3).T
+    shown = (flags & _DISCARD) == 0
+    key = stamps[(flags & _KEY) > 0]
+    sound = listed.returncode == 0 and not listed.stderr and len(key) > 0 and (stamps[shown] >= key[0]).all()
+    sound = sound and bool((stamps != _NO_STAMP).all() and (sizes > 0).all() and not (flags & _CORRUPT).any())
+    return Packets(np.sort(stamps[shown]) * unit, int(np.sum(~shown)), bool(sound), codec)
+
+
 def _to_bytes(frame: np.ndarray) -> np.ndarray:
     if frame.ndim != 3 or frame.shape[2] != 3:
         raise ValueError(f"frame: expected shape [H, W, 3], found {frame.shape}")
@@ -146,6 +192,13 @@ def _to_bytes(frame: np.ndarray) -> np.ndarray:
     if not np.issubdtype(frame.dtype, np.floating):
         raise ValueError(f"frame: expected uint8 or floats 0 to 1, found dtype {frame.dtype}")
     return np.round(255 * np.clip(np.nan_to_num(frame), 0, 1)).astype(np.uint8)
+
+
+def _ffmpeg() -> str:
+    """The path of ffmpeg. Imported late, as most programs read and write no video."""
+    import imageio_ffmpeg
+
+    return imageio_ffmpeg.get_ffmpeg_exe()
 
 
 def _own_process_group() -> dict[str, int]:

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from gsjax.engine.files import read_options
 from gsjax.engine.photographs import choose_photographs, photographs_of_run, split
 
 RECORDING = "simulated:tabletop?width=32&height=24&frames=4"  # cameras 0, 1 and 2
@@ -27,8 +28,8 @@ def test_frames_and_cameras_of_a_recording():
 @pytest.mark.filterwarnings("ignore:.*with no file")
 def test_some_of_photographs(photographs):
     assert choose_photographs(str(photographs)).num == 9
-    assert choose_photographs(str(photographs), frames="1:8:3").names == tuple(
-        choose_photographs(str(photographs)).names[i] for i in (1, 4, 7)
+    assert choose_photographs(str(photographs), frames="1:8:2").names == tuple(
+        choose_photographs(str(photographs)).names[i] for i in (1, 3, 5, 7)
     )
     with pytest.raises(ValueError, match=r"--cameras: .* holds photographs, not a recording"):
         choose_photographs(str(photographs), cameras=(0,))
@@ -42,8 +43,9 @@ def test_those_of_a_run_are_found_by_its_settings():
     assert found.names == ("2/1",)
     assert found.sizes.tolist() == [[16, 12]]
     assert photographs_of_run({"dataset": "gone"}, dataset=RECORDING).num == 12
-    older = {"dataset": RECORDING, "read": {"K": [1.0, 1.0, 1.0, 1.0], "no_longer_there": 3}}
-    assert photographs_of_run(older).num == 12
+    older = {"dataset": RECORDING, "read": {"near": 0.5, "no_longer_there": 3}}
+    assert photographs_of_run(older).near == 0.5
+    assert read_options({"K": [1.0, 1.0, 1.0, 1.0]}).K == (1.0, 1.0, 1.0, 1.0)  # YAML has no tuples
     with pytest.raises(KeyError):
         photographs_of_run({"scale": 1.0})
 

@@ -64,6 +64,13 @@ TRANSFORMS = (
         change("transforms.json", lambda m: m.update(test_filenames=["images/0.png"])),
         ("transforms.json",),
     ),
+    Fault("photograph listed twice", frame("transforms.json", 1, file_path="./images/0.png"), ("images/0",)),
+    Fault("key that is not read", frame("transforms.json", 1, normal_path="n.png"), ("normal_path",)),
+    Fault(
+        "depth_path without its unit",
+        frame("transforms.json", 1, depth_path="depth/1.png"),
+        ("transforms.json", "integer_depth_scale"),
+    ),
     Fault("photograph missing", gone("images/1.png"), ("images/1.png",)),
     Fault("all photographs missing", gone(*(f"images/{i}.png" for i in range(3))), ("images/0.png",)),
     Fault("image cut off", cut("images/1.png"), ("images/1.png",)),
@@ -81,10 +88,10 @@ TRANSFORMS = (
 
 
 def build_blender(root: Path) -> None:
-    for split in ("train", "test"):
+    for s, split in enumerate(("train", "test")):
         frames = []
         for i in range(2):
-            dots.save(root / f"{split}/r_{i}.png", picture(i))
+            dots.save(root / f"{split}/r_{i}.png", picture(2 * s + i))
             frames.append({"file_path": f"./{split}/r_{i}", "transform_matrix": moved(i).tolist()})
         meta = {"camera_angle_x": 0.8, "frames": frames}
         (root / f"transforms_{split}.json").write_text(json.dumps(meta))

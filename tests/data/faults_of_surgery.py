@@ -203,6 +203,7 @@ def build_video(root: Path) -> None:
 VIDEO = (
     Fault("not a video", holds("clip.mp4", "text"), ("clip.mp4",)),
     Fault("no video", gone("clip.mp4"), ("clip.mp4",)),
+    Fault("cut off", cut("clip.mp4"), ("clip.mp4",)),
 )
 
 OPTIONS = ReadOptions(K=K)

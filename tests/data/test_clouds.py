@@ -1,3 +1,5 @@
+import io
+
 import numpy as np
 import pytest
 from plyfile import PlyData, PlyElement
@@ -22,6 +24,145 @@ def test_points_and_colours(tmp_path, text, kind, top):
     cloud = read_cloud(file)
     np.testing.assert_allclose(cloud.points, [[1, 2, 3], [4, 5, 6]])
     np.testing.assert_allclose(cloud.colors, [[1, 0, 0], [0, 0, 1]])
+
+
+BYTES = np.array([[255, 0, 51], [0, 102, 255]])
+
+
+@pytest.mark.parametrize(
+    ("names", "kind", "values"),
+    [
+        (("red", "green", "blue"), "u1", BYTES),
+        (("red", "green", "blue"), "i1", BYTES.astype(np.uint8).view(np.int8)),
+        (("red", "green", "blue"), "u2", 257 * BYTES),
+        (("red", "green", "blue"), "u2", BYTES),
+        (("red", "green", "blue"), "i4", BYTES),
+        (("red", "green", "blue"), "u4", 16843009 * BYTES),
+        (("red", "green", "blue"), "f4", BYTES),
+        (("red", "green", "blue"), "f8", BYTES / 255),
+        (("red", "green", "blue"), "f4", 257.0 * BYTES),
+        (("r", "g", "b"), "u1", BYTES),
+        (("R", "G", "B"), "u1", BYTES),
+        (("Red", "Green", "Blue"), "f4", BYTES / 255),
+        (("diffuse_red", "diffuse_green", "diffuse_blue"), "u1", BYTES),
+        (("f_dc_0", "f_dc_1", "f_dc_2"), "f4", (BYTES / 255 - 0.5) / 0.28209479),
+    ],
+)
+@pytest.mark.parametrize("text", [True, False])
+def test_colours_of_other_tools(tmp_path, text, names, kind, values):
+    layout = [*((axis, "f4") for axis in "xyz"), *((name, kind) for name in names), ("alpha", "u1")]
+    rows = np.array([(*range(3), *color, 7) for color in values], layout)
+    PlyData([PlyElement.describe(rows, "vertex")], text=text).write(tmp_path / "points.ply")
+    np.testing.assert_allclose(read_cloud(tmp_path / "points.ply").colors, BYTES / 255, atol=1e-6)
+
+
+@pytest.mark.parametrize(("name", "kind"), [("intensity", "u2"), ("scalar_Intensity", "f4")])
+def test_intensities_are_grey(tmp_path, name, kind):
+    rows = np.array(
+        [(0, 0, 0, 65535), (0, 0, 1, 13107)], [("x", "f4"), ("y", "f4"), ("z", "f4"), (name, kind)]
+    )
+    PlyData([PlyElement.describe(rows, "vertex")]).write(tmp_path / "points.ply")
+    np.testing.assert_allclose(read_cloud(tmp_path / "points.ply").colors, [[1, 1, 1], [0.2, 0.2, 0.2]])
+
+
+PCD = """# .PCD v0.7
+VERSION 0.7
+FIELDS x y z {name}
+SIZE 4 4 4 4
+TYPE F F F {kind}
+COUNT 1 1 1 1
+WIDTH 2
+HEIGHT 1
+VIEWPOINT 0 0 0 1 0 0 0
+POINTS 2
+DATA {data}
+"""
+POINTS = np.array([[1.0, 2.0, 3.0], [4.0, 5.5, 6.0]])
+
+
+def lines_of(points, separator=" "):
+    return "".join(separator.join(f"{value:g}" for value in row) + "\n" for row in points)
+
+
+def packed(kind):
+    return (BYTES @ [65536, 256, 1]).astype("<u4").view({"F": "<f4", "U": "<u4"}[kind])
+
+
+def pcd_text(kind):
+    rows = zip(POINTS, packed(kind), strict=True)
+    return PCD.format(name="rgb", kind=kind, data="ascii") + "".join(
+        f"{x:g} {y:g} {z:g} {color!r}\n" for (x, y, z), color in ((p, c.item()) for p, c in rows)
+    )
+
+
+def pcd_bytes(kind):
+    layout = [("xyz", "<f4", 3), ("color", packed(kind).dtype)]
+    rows = np.array([*zip(POINTS, packed(kind), strict=True)], layout)
+    return PCD.format(name="rgb", kind=kind, data="binary").encode() + rows.tobytes()
+
+
+def npy(array):
+    stream = io.BytesIO()
+    np.save(stream, array)
+    return stream.getvalue()
+
+
+COLORED = np.concatenate([POINTS, BYTES], axis=1)
+NORMALS = np.array([[0, 0, -1.0], [1, 0, 0]])
+
+
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [
+        ("a.xyz", lines_of(COLORED)),
+        ("a.txt", "\ufeffX Y Z R G B\n" + lines_of(COLORED)),
+        ("a.csv", "//X,Y,Z,R,G,B\n" + lines_of(COLORED, ",")),
+        ("a.asc", lines_of(np.concatenate([POINTS, NORMALS, BYTES], axis=1))),
+        ("a.xyz", lines_of(np.concatenate([POINTS, BYTES, NORMALS], axis=1))),
+        ("a.pts", "2\n" + lines_of(np.insert(COLORED, 3, -1200, axis=1))),
+        ("a.npy", npy(COLORED)),
+        ("a.npy", npy(np.concatenate([POINTS, BYTES / 255], axis=1))),
+        ("a.pcd", pcd_text("F")),
+        ("a.PCD", pcd_text("U")),
+        ("a.pcd", pcd_bytes("F")),
+        ("a.pcd", pcd_bytes("U")),
+    ],
+)
+def test_points_in_other_files(tmp_path, name, content):
+    (tmp_path / name).write_bytes(content if isinstance(content, bytes) else content.encode())
+    cloud = read_cloud(tmp_path / name)
+    np.testing.assert_allclose(cloud.points, POINTS)
+    np.testing.assert_allclose(cloud.colors, BYTES / 255, atol=1e-6)
+
+
+def test_files_without_colours_are_grey(tmp_path):
+    (tmp_path / "a.xyz").write_text(lines_of(np.concatenate([POINTS, NORMALS], axis=1)))
+    np.save(tmp_path / "a.npy", POINTS)
+    for name in ("a.xyz", "a.npy"):
+        assert (read_cloud(tmp_path / name).colors == 0.5).all()
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "says"),
+    [
+        ("a.xyz", "", "lines of text with x, y, z"),
+        ("a.xyz", "1 2\n", "lines of text with x, y, z"),
+        ("a.xyz", "1 2 3\n4 5\n", "lines of text with x, y, z"),
+        ("a.npy", "no array", "an array with x, y, z"),
+        ("a.npy", npy(np.array([{}])), "an array with x, y, z"),
+        ("a.npy", npy(np.zeros(3)), "an array with x, y, z"),
+        ("a.pcd", "", "a PCD file with x, y, z"),
+        ("a.pcd", PCD.format(name="rgb", kind="F", data="ascii"), "a PCD file with x, y, z"),
+        ("a.pcd", pcd_bytes("F")[:-3], "a PCD file with x, y, z"),
+        ("a.pcd", pcd_bytes("F").replace(b"POINTS 2", b"POINTS 99999999999999999999"), "a PCD file"),
+        ("a.pcd", PCD.format(name="rgb", kind="F", data="binary_compressed"), "save it as binary"),
+        ("a.pcd", PCD.format(name="rgb", kind="Q", data="binary"), "a PCD file"),
+    ],
+)
+def test_other_files_that_are_no_points(tmp_path, name, content, says):
+    (tmp_path / name).write_bytes(content if isinstance(content, bytes) else content.encode())
+    with pytest.raises(DataError, match=says):
+        read_cloud(tmp_path / name)
 
 
 def test_points_without_colour_are_grey(tmp_path):

@@ -167,6 +167,14 @@ def test_frames_without_labels_are_counted(folder):
     assert sequence.mask(2, 0) is not None
 
 
+@pytest.mark.parametrize("options", [ReadOptions(K=(100, 102, 47, 36)), ReadOptions(baseline_m=0.004)])
+def test_options_that_the_calibration_states_too_are_refused(folder, options):
+    with pytest.raises(
+        ValueError, match=r"camera_calibration.txt: it states what .*--read.K.*remove the file"
+    ):
+        open_sequence(folder, options)
+
+
 def test_without_a_calibration(folder):
     (folder / "camera_calibration.txt").unlink()
     with pytest.raises(ValueError, match=r"there is no camera_calibration.txt. Give K \(--read.K\)"):

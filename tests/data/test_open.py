@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from gsjax.data import DataError, ReadOptions, open_photographs, open_sequence
+from gsjax.io.video import VideoWriter
 
 ONE_PIXEL = cv2.imencode(".png", np.array([[[30, 20, 10]]], np.uint8))[1].tobytes()
 
@@ -95,7 +96,7 @@ def colmap(root):
 )
 def test_photographs_are_no_recording(tmp_path, write, layout):
     write(tmp_path)
-    scene = open_photographs(tmp_path, ReadOptions(axes="endonerf"))
+    scene = open_photographs(tmp_path, ReadOptions(axes="endonerf" if write is llff else None))
     assert (scene.num, scene.image(0).tolist()) == (1, [[[10, 20, 30]]])
     with pytest.raises(DataError, match=rf"expected a recording .*photographs \({layout} layout\)"):
         open_sequence(tmp_path)
@@ -109,6 +110,56 @@ def test_options_for_what_a_folder_leaves_open_are_required(tmp_path):
         open_photographs(tmp_path)
     (tmp_path / "images").rename(tmp_path / "images_8")
     assert open_photographs(tmp_path, ReadOptions(axes="endonerf", images="images_8")).num == 1
+
+
+def video(root):
+    with VideoWriter(root / "clip.mp4", 10) as writer:
+        for level in (10, 90):
+            writer.write(np.full((16, 16, 3), level, np.uint8))
+
+
+OTHERS = {"K": (9, 9, 8, 8), "axes": "llff", "depth_unit_m": 0.1, "tool": "black", "pose_unit_m": 2.0}
+OTHERS |= {"images": "photos", "masks": "tools", "depth_percentiles": (3, 97), "baseline_m": 0.1}
+
+
+@pytest.mark.parametrize(
+    ("write", "opened", "uses"),
+    [
+        (transforms, open_photographs, ("depth_unit_m",)),
+        (llff, open_photographs, ("axes", "images")),
+        (colmap, open_photographs, ("images",)),
+        (video, lambda path, options: open_sequence(path / "clip.mp4", options), ("K", "masks", "tool")),
+        (None, lambda path, options: open_sequence("simulated:bar?frames=2", options), ()),
+        (None, lambda path, options: open_photographs("simulated:bar?frames=2", options), ()),
+    ],
+)
+def test_options_that_a_layout_has_no_use_for_are_refused_by_name(tmp_path, write, opened, uses):
+    if write is not None:
+        write(tmp_path)
+    needed = {"axes": "llff"} if write is llff else {}
+    for name in OTHERS.keys() - set(uses):
+        flag = "--read." + name.replace("_", "-")
+        with pytest.raises(
+            ValueError, match=rf"expected options for .* data .*--read.near.*, found {flag}\. Leave"
+        ):
+            opened(tmp_path, ReadOptions(**needed | {name: OTHERS[name]}))
+
+
+@pytest.mark.parametrize(("name", "what"), [("depth_unit_m", "depth"), ("tool", "masks")])
+def test_options_about_what_the_data_lack_are_refused_by_name(tmp_path, name, what):
+    (transforms if name == "depth_unit_m" else video)(tmp_path)
+    opened = open_photographs if name == "depth_unit_m" else open_sequence
+    path = tmp_path if name == "depth_unit_m" else tmp_path / "clip.mp4"
+    flag = "--read." + name.replace("_", "-")
+    with pytest.raises(ValueError, match=rf"expected data with {what}, as {flag} is given, found none"):
+        opened(path, ReadOptions(K=None if name == "depth_unit_m" else (9, 9, 8, 8), **{name: OTHERS[name]}))
+
+
+@pytest.mark.parametrize("name", ["depth_unit_m", "pose_unit_m", "baseline_m"])
+@pytest.mark.parametrize("value", [0.0, -1.0, float("nan"), float("inf")])
+def test_lengths_are_above_0(name, value):
+    with pytest.raises(ValueError, match=f"{name}: expected metres above 0, found"):
+        ReadOptions(**{name: value})
 
 
 def test_one_file_of_photographs(tmp_path):

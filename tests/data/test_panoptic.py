@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from gsjax.data import DataError, DataWarning, read_panoptic, write_panoptic
+from gsjax.data import DataError, DataWarning, ReadOptions, open_sequence, read_panoptic, write_panoptic
 from gsjax.data.simulated import tabletop
 
 FRAMES, WIDTH, HEIGHT = 3, 8, 6
@@ -374,3 +374,11 @@ def test_depth_too_far_to_be_saved_is_counted(tmp_path):
         DataWarning, match=rf"depth of {3 * WIDTH * HEIGHT} pixels farther than 6.553 m is lost"
     ):
         write_panoptic(_labelled(1, depth=8.0), tmp_path)
+
+
+def test_a_unit_of_depth_that_the_user_gives(folder):
+    folder.add("depth", 0, np.uint16, 500)
+    folder.meta["depth_unit_m"] = 0.01
+    folder.write()
+    assert (open_sequence(folder.root).depth(0, 0) == 5).all()
+    assert (open_sequence(folder.root, ReadOptions(depth_unit_m=0.002)).depth(0, 0) == 1).all()

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from gsjax.data import DataError, DataWarning, open_sequence, read_seven_scenes
+from gsjax.data import DataError, DataWarning, ReadOptions, open_sequence, read_seven_scenes
 from tests.data.scene_helpers import depths_from_another_frame
 
 WALL_M, BOX_M = 2.0, 1.0
@@ -202,3 +202,20 @@ def test_colour_of_the_kitchen_is_registered(shared_data):
 def test_a_folder_name_changes_nothing(folder, tmp_path):
     shutil.copytree(folder, tmp_path / "mine")
     assert open_sequence(tmp_path / "mine").frame_ids == (0, 1, 2, 5)
+
+
+def test_a_recording_by_ones_own_camera(folder):
+    """Its depth is registered to colour, in its own size and unit."""
+    for file in folder.glob("frame-*.png"):
+        image = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
+        assert cv2.imwrite(str(file), image[:240, :320])
+    (folder / "frame-000002.pose.txt").unlink()  # its colour is a JPEG
+    np.savetxt(folder / "camera-intrinsics.txt", [[300, 0, 160], [0, 310, 120], [0, 0, 1]])
+    with pytest.raises(DataError, match=r"registered to colour, give K \(--read.K\)"):
+        open_sequence(folder)
+    sequence = open_sequence(folder, ReadOptions(K=(300, 310, 160, 120), depth_unit_m=0.002))
+    assert (sequence.width, sequence.height) == (320, 240)
+    np.testing.assert_array_equal(sequence.Ks[1, 0], [[300, 0, 160], [0, 310, 120], [0, 0, 1]])
+    np.testing.assert_allclose(sequence.viewmats[1, 0], pose_at(-0.1), atol=1e-6)
+    stored = cv2.imread(str(folder / "frame-000000.depth.png"), cv2.IMREAD_UNCHANGED)
+    np.testing.assert_allclose(sequence.depth(0, 0), np.where(stored == 65535, 0, 0.002 * stored), rtol=1e-6)

@@ -333,3 +333,62 @@ def test_the_fox(shared_data):
     centers = np.linalg.inv(scene.viewmats)[:, :3, 3]
     axes = scene.viewmats[:, 2, :3]  # cameras around an object face its centre
     assert (((centers.mean(0) + 5 * axes.mean(0) - centers) * axes).sum(-1) > 0).all()
+
+
+def add_depth(folder, key, steps=1500):
+    for i, frame in enumerate(folder.meta["frames"]):
+        dots.save(folder.root / f"depth/{i}.png", np.full((HEIGHT, WIDTH), steps, np.uint16))
+        frame[key] = f"depth/{i}.png"
+
+
+@pytest.mark.parametrize("key", ["depth_path", "depth_file_path"])
+@pytest.mark.parametrize("unit", ["integer_depth_scale", "depth_unit_scale_factor"])
+def test_depth_of_instant_ngp_and_its_unit(folder, key, unit):
+    add_depth(folder, key)
+    folder.meta |= {unit: 0.002, "enable_depth_loading": True}
+    np.testing.assert_allclose(folder.read().depth(1), 3.0)
+    np.testing.assert_allclose(folder.read(depth_unit_m=0.004).depth(1), 6.0)  # the user knows better
+    folder.meta["frames"][1][unit] = 0.001
+    np.testing.assert_allclose(folder.read().depth(1), 1.5)
+    folder.meta["enable_depth_loading"] = False
+    assert folder.read().load_depth is None
+    folder.meta[unit] = 0
+    with pytest.raises(DataError, match=r"frame 0: expected integer_depth_scale or .* above 0, found 0"):
+        folder.read()
+
+
+def test_depth_of_instant_ngp_without_its_unit(folder):
+    add_depth(folder, "depth_path")
+    with pytest.warns(
+        DataWarning, match=r"without integer_depth_scale: assuming 0.001 .*--read.depth-unit-m"
+    ):
+        scene = folder.read()
+    np.testing.assert_allclose(scene.depth(0), 1.5)
+
+
+def test_keys_that_look_like_data_are_named_if_they_are_not_read(folder):
+    folder.meta["frames"][0] |= {"normal_path": "n.png", "colmap_im_id": 3, "sharpness": 40.0}
+    folder.meta["frames"][1] |= {"extra": "images/0.png"}  # names a file
+    folder.meta |= {"depth_scale": 5000, "k5": 0.1, "aabb_scale": 16, "scale": 0.3, "up": [0, 0, 1]}
+    folder.meta |= {"applied_transform": np.eye(4)[:3].tolist(), "fps": 30, "tool": "mine"}
+    with pytest.warns(
+        DataWarning, match=r"transforms.json: these keys are not read: depth_scale, k5, "
+    ) as seen:
+        folder.read()
+    assert "k5, normal_path (of 1 frames), extra (of 1 frames); give" in str(seen[0].message)
+    assert len(seen) == 1
+
+
+@pytest.mark.parametrize(("key", "model"), [("latlong", "LATLONG"), ("ftheta_p0", "FTHETA")])
+def test_models_that_instant_ngp_marks_by_other_keys_are_refused(folder, key, model):
+    folder.meta[key] = True
+    with pytest.raises(DataError, match=rf"expected camera_model to be one of .*, found {model}"):
+        folder.read()
+
+
+def test_points_that_lie_beside_the_file(folder):
+    (folder.root / "sparse_pc.ply").write_text(
+        "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\nproperty float z\n"
+        "end_header\n1 2 3\n"
+    )
+    assert folder.read().cloud.points.tolist() == [[1, 2, 3]]

@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from gsjax.data import DataError, DataWarning, open_sequence, read_tum
+from gsjax.data import DataError, DataWarning, ReadOptions, open_sequence, read_tum
 
 START = 1305031102.0
 RATE, FRAMES = 30.0, 6
@@ -190,13 +190,25 @@ def test_missing_and_empty_lists(folder, name):
 
 def test_a_folder_whose_name_does_not_identify_the_camera(tmp_path):
     folder = Folder(tmp_path / "desk", size=(64, 48))
-    with pytest.raises(DataError, match=r"freiburg1, freiburg2 or .*found 'desk'.*read_tum\(path, K="):
+    with pytest.raises(
+        DataError, match=r"freiburg1, freiburg2 or .*found 'desk'.*give its intrinsics: K \(--read.K\)"
+    ):
         folder.read()
-    K = np.array([[50.0, 0, 32], [0, 50, 24], [0, 0, 1]])
-    sequence = folder.read(K=K, depth_unit_m=0.001)
-    np.testing.assert_array_equal(sequence.Ks[0, 0], K)
-    assert (sequence.width, sequence.height) == (64, 48)
-    assert (sequence.depth(0, 0) == 5).all()
+
+
+@pytest.mark.parametrize("name", ["desk", "my_fr1_room"])
+def test_a_recording_by_ones_own_camera(tmp_path, name):
+    folder = Folder(tmp_path / name, size=(64, 48))
+    folder.write()
+    K = np.array([[50.0, 0, 32], [0, 51, 24], [0, 0, 1]])
+    for sequence in (
+        folder.read(K=K, depth_unit_m=0.001),
+        open_sequence(folder.root, ReadOptions(K=(50, 51, 32, 24), depth_unit_m=0.001)),
+    ):
+        np.testing.assert_array_equal(sequence.Ks[0, 0], K)
+        assert (sequence.width, sequence.height) == (64, 48)
+        assert (sequence.depth(0, 0) == 5).all()
+        assert sequence.image(2, 0)[-1, 0].tolist() == [20, 20, 200]  # no published lens is undone
 
 
 def test_the_published_intrinsics_hold_for_one_size(tmp_path):

@@ -13,6 +13,7 @@ from jaxtyping import Float
 from rich.console import Console
 
 from gsjax.data import Photographs, Sequence
+from gsjax.data.consistency import check_recording
 from gsjax.data.open import is_photographs, is_recording, open_photographs
 from gsjax.data.ordered import open_as_sequence
 from gsjax.engine.budget import Budget, note_if_few
@@ -148,6 +149,7 @@ def _recording(options: Options, notes: Notes) -> tuple[Sequence, DepthSource]:
     """The recording with its depth, the training camera first, and the source of the depth."""
     chosen = (options.frames, options.read, options.scale)
     whole = open_recording(options.dataset, (), (), *chosen, opened=open_as_sequence).judged
+    check_recording(whole)
     if is_photographs(options.dataset) and not is_recording(options.dataset):
         photographs = open_photographs(options.dataset, options.read)
         notes.add(_of_photographs(photographs, whole.viewmats[0, 0]))

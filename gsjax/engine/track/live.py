@@ -15,6 +15,7 @@ from rich.console import Console
 from rich.live import Live
 from scipy.spatial.transform import Rotation
 
+from gsjax.data.consistency import check_recording
 from gsjax.data.opencv_cameras import open_camera, snapshots
 from gsjax.data.stream import Arrival, NewestSnapshots, Snapshot, replay
 from gsjax.engine.drive import Tick
@@ -150,6 +151,7 @@ def _open(options: Options, console: Console) -> Source:
         recording = open_recording(
             options.source, options.cameras, (), options.frames, options.read, options.scale
         )
+        check_recording(recording.judged)
         mask = first_mask(recording.tracked, options.mask_camera, options.masks)
         if mask.labels is None:
             raise ValueError(

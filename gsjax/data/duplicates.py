@@ -1,0 +1,84 @@
+"""Photographs that a dataset lists twice, of which one would be fitted and the other held out."""
+
+import os
+import warnings
+from collections.abc import Iterator
+from hashlib import blake2b
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, Int
+
+from gsjax.data.errors import DataWarning
+from gsjax.data.photographs import Photographs
+
+_SPLITS = ("train", "val", "test")
+_NEAR = 0.01  # of the cameras' spread: poses of one picture by structure from motion differ a little
+_NEAR_ANGLE = np.deg2rad(1.0)
+
+
+def without_duplicates(photographs: Photographs) -> Photographs:
+    """The photographs with one of each: without those whose file is listed again (also by another path to
+    it), and without copies of a file under another name, from the same place and time.
+
+    Of those in several splits, the one of the latest of train, val and test stays, so that no picture is both
+    fitted and held out. Warns with DataWarning if some are left out, and counts them.
+    """
+    same = np.arange(photographs.num)  # the first that each is the same as
+    for i, j in _pairs(photographs):
+        same[same == same[j]] = same[i]
+    groups = [np.flatnonzero(same == first) for first in np.unique(same)]
+    kept = sorted(_chosen(group, photographs) for group in groups)
+    if len(kept) == photographs.num:
+        return photographs
+    left_out = [photographs.names[i] for i in range(photographs.num) if i not in set(kept)]
+    some = ", ".join(left_out[:3]) + (", ..." if len(left_out) > 3 else "")
+    message = (
+        f"{photographs.name}: {len(left_out)} of {photographs.num} photographs are listed twice ({some})"
+    )
+    advice = "one of each is used, the rest are left out"
+    warnings.warn(f"{message}: {advice}", DataWarning, stacklevel=3)
+    return photographs.select(kept)
+
+
+def _chosen(group: np.ndarray, photographs: Photographs) -> int:
+    splits = photographs.splits
+    if splits is None:
+        return int(group[0])
+    return int(max(group, key=lambda i: _SPLITS.index(splits[i]) if splits[i] in _SPLITS else -1))
+
+
+def _pairs(photographs: Photographs) -> Iterator[tuple[int, int]]:
+    """Pairs of photographs (the first one first) that are one."""
+    files: dict[tuple[int, int], int] = {}
+    by_size: dict[int, list[int]] = {}
+    paths = [Path(photographs.where("image", i)) for i in range(photographs.num)]
+    for i, path in enumerate(paths):
+        try:
+            found = os.stat(path)
+        except (OSError, ValueError):  # a frame of a video, say
+            continue
+        if (first := files.setdefault((found.st_dev, found.st_ino), i)) != i:
+            yield first, i
+        else:
+            by_size.setdefault(found.st_size, []).append(i)
+    for group in by_size.values():
+        alike = _from_one_place(photographs, np.array(group)) if len(group) > 1 else np.zeros((1, 1), bool)
+        digests = {
+            k: blake2b(paths[group[k]].read_bytes()).digest()
+            for k in np.flatnonzero((alike | alike.T).any(0))
+        }
+        yield from ((group[i], group[j]) for i, j in np.argwhere(alike) if digests[i] == digests[j])
+
+
+def _from_one_place(photographs: Photographs, group: Int[np.ndarray, "n"]) -> Bool[np.ndarray, "n n"]:
+    """Which photographs of a group were taken at almost the same place, in almost the same direction and at
+    the same time as a later one."""
+    everywhere = np.linalg.inv(photographs.viewmats)[:, :3, 3]
+    spread = np.median(np.linalg.norm(everywhere - np.median(everywhere, axis=0), axis=1))
+    centers, turns = everywhere[group], photographs.viewmats[group, :3, :3]
+    near = np.linalg.norm(centers[:, None] - centers, axis=-1) <= _NEAR * spread
+    near &= np.einsum("aij,bij->ab", turns, turns) >= 1 + 2 * np.cos(_NEAR_ANGLE)  # the trace of a rotation
+    if photographs.times is not None:
+        near &= photographs.times[group][:, None] == photographs.times[group]
+    return np.triu(near, 1)
