@@ -312,7 +312,7 @@ def check_size(path: Path, image: np.ndarray, width: int, height: int) -> None:
 
     Args:
         path: the file, for messages.
-        image: its pixels.
+        image: its pixels, [H,W] or [H,W,C].
         width, height: expected size, pixels.
     """
     if image.shape[:2] != (height, width):

@@ -95,7 +95,7 @@ def refuse_unread(where: Path, expected: str, paths: Iterable[Path], *, others: 
     Raises:
         DataError: there are such files, and no others.
     """
-    found = [path for path in paths if is_unread(path)]
+    found = sorted(path for path in paths if is_unread(path))
     if not found:
         return
     name, advice = _UNREAD[found[0].suffix.lower()]
@@ -103,7 +103,7 @@ def refuse_unread(where: Path, expected: str, paths: Iterable[Path], *, others: 
     counted = f"{len(found)} in a format that is not read ({name}: {some})"
     if not others:
         raise DataError(where, expected, counted, advice)
-    message = f"{where}: besides {others} pictures, {counted} are left out. {advice}"
+    message = f"{where}: of {others + len(found)} pictures, {counted} are left out. {advice}"
     warnings.warn(message, DataWarning, stacklevel=3)
 
 

@@ -149,7 +149,7 @@ def test_folders_that_cannot_be_used(say, tmp_path):
     assert "found 2 in a format that is not read (HEIC: " in said
     assert "Convert to JPEG or PNG first" in said
     dots.save(tmp_path / "phone/a.png", np.zeros((20, 20, 3), np.uint8))
-    assert "besides 1 pictures, 2 in a format that is not read" in say(tmp_path / "phone", "--out", out)[1]
+    assert "of 3 pictures, 2 in a format that is not read" in say(tmp_path / "phone", "--out", out)[1]
     assert not (tmp_path / "new").exists()
     said = say(tmp_path / "empty", "--out", tmp_path / "empty")[1]
     assert "the photographs themselves are there; name another folder" in said

@@ -116,7 +116,7 @@ def test_frames_without_depth_or_pose_are_counted(folder):
         ("", r"blocks of one line of three integers and four lines of four numbers, found 0 numbers"),
         (log({0: pose(0)})[:-5], r"found 18 numbers, not one or more blocks of 19. Is it cut off\?"),
         (log({0: pose(0)}).replace("0.0", "zero", 1), r"found something else \(could not convert .*'zero'"),
-        (b"\xff\xfe\x00", r"found something else \("),
+        (b"\xff\xfe\x00", r"found binary data \("),
     ],
 )
 def test_invalid_trajectories_are_refused(folder, text, says):

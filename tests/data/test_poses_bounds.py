@@ -206,9 +206,7 @@ def test_what_is_transparent_is_white_as_the_background(tmp_path):
 def test_photographs_in_formats_that_are_not_read(tmp_path):
     root = build(tmp_path / "fern", "llff")
     (root / "images/003.HEIC").write_bytes(b"")
-    with pytest.warns(
-        DataWarning, match=r"besides 3 pictures, 1 in a format .*\(HEIC: 003.HEIC\) are left out"
-    ):
+    with pytest.warns(DataWarning, match=r"of 4 pictures, 1 in a format .*\(HEIC: 003.HEIC\) are left out"):
         assert read_llff(root, "llff").num == 3
     for photograph in (root / "images").glob("*.png"):
         photograph.rename(photograph.with_suffix(".DNG"))

@@ -293,7 +293,7 @@ def test_faults_of_a_file(folder, change, says):
         ("[]", r"expected frames, a non-empty list, found none"),
         ('{"frames": [', r"expected a JSON file, found bad JSON"),
         ("", r"expected a JSON file, found bad JSON"),
-        (b"\xff\xfe\x80", r"expected a JSON file, found bad JSON"),
+        (b"\xff\xfe\x80", r"expected a JSON file, found binary data"),
     ],
 )
 def test_invalid_files_are_refused(folder, content, says):
