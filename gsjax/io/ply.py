@@ -2,21 +2,21 @@
 
 One vertex per Gaussian: x y z, nx ny nz (zeros), f_dc_0..2, f_rest_* channel-major (all of red, then green,
 then blue), opacity as a logit, scale_0..2 as logarithms, rot_0..3 as w x y z. gsjax adds feature_* and label
-if a scene has them; other readers ignore both. PlayCanvas's compressed PLY can be read, but not written.
+if a scene has them; other readers ignore both. PlayCanvas's compressed PLY is read too.
 """
 
 import os
-from dataclasses import dataclass
 from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Int, Integer
+from jaxtyping import Integer
 from plyfile import PlyData, PlyElement, PlyParseError
 
 from gsjax.io.atomic import atomic_write
 from gsjax.io.compressed_ply import PACKED, decompress, find_fault, is_compressed
-from gsjax.scene.gaussians import SH_SIZES, Gaussians, take, valid_rows
+from gsjax.io.scene_file import SceneError, SceneReport, drawable
+from gsjax.scene.gaussians import SH_SIZES, Gaussians
 
 _REQUIRED = (
     *("x", "y", "z"),
@@ -29,30 +29,8 @@ _NORMALS = ("nx", "ny", "nz")
 _REST_COUNTS = tuple(3 * (size - 1) for size in SH_SIZES)
 
 
-class PlyError(ValueError):
+class PlyError(SceneError):
     """A file is not a PLY of Gaussians; the message has the path, what was expected and found, and advice."""
-
-    def __init__(self, path: str | os.PathLike, expected: str, found: str, advice: str):
-        super().__init__(f"{path}: expected {expected}, found {found}. {advice}")
-
-
-@dataclass(frozen=True)
-class PlyReport:
-    """Contents of a PLY file besides the returned Gaussians.
-
-    Attributes:
-        stored: number of rows in the file.
-        culled: number of rows left out because of a NaN, an infinity or a zero quaternion.
-        extra: properties that were not read.
-        rows: row in the file of each returned Gaussian, [N].
-        labels: int32 label of each returned Gaussian, [N]; None if the file has no labels.
-    """
-
-    stored: int
-    culled: int
-    extra: tuple[str, ...]
-    rows: Int[np.ndarray, "N"]
-    labels: Int[np.ndarray, "N"] | None = None
 
 
 def write_ply(
@@ -105,7 +83,7 @@ def _columns(gaussians: Gaussians) -> dict[str, np.ndarray]:
     return columns
 
 
-def read_ply(path: str | os.PathLike) -> tuple[Gaussians, PlyReport]:
+def read_ply(path: str | os.PathLike) -> tuple[Gaussians, SceneReport]:
     """The Gaussians of a 3DGS PLY or a PlayCanvas compressed PLY (detected from the header), as float32.
 
     The file may be binary of either byte order, or ASCII. Rows that cannot be rendered (with a NaN, an
@@ -128,16 +106,11 @@ def read_ply(path: str | os.PathLike) -> tuple[Gaussians, PlyReport]:
     else:
         gaussians, known = _uncompressed(path, vertices)
     names = vertices.dtype.names or ()
-    valid = valid_rows(gaussians)
-    rows = np.flatnonzero(valid)
-    report = PlyReport(
-        stored=len(vertices),
-        culled=int(np.sum(~valid)),
+    return drawable(
+        gaussians,
         extra=tuple(name for name in names if name not in {*known, "label"}),
-        rows=rows,
-        labels=np.asarray(vertices["label"])[rows].astype(np.int32) if "label" in names else None,
+        labels=np.asarray(vertices["label"]) if "label" in names else None,
     )
-    return take(gaussians, rows), report
 
 
 def _uncompressed(path: Path, vertices: np.ndarray) -> tuple[Gaussians, set[str]]:
