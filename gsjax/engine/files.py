@@ -15,7 +15,8 @@ from gsjax.data import ReadOptions
 from gsjax.data.errors import DataError
 from gsjax.engine.messages import Notes
 from gsjax.engine.recording import Opener, Recording, open_recording
-from gsjax.io.ply import PlyReport, read_ply
+from gsjax.io.scene_file import SceneReport
+from gsjax.io.scenes import read_gaussians
 from gsjax.scene.gaussians import Gaussians
 
 _SETTINGS = ("dataset", "cameras", "frames")
@@ -82,14 +83,14 @@ def check_arrays(
     return sizes
 
 
-def read_drawable(file: Path, notes: Notes) -> tuple[Gaussians, PlyReport]:
-    """The drawable Gaussians of a PLY file, and what else it held; warns of those that cannot be drawn.
+def read_drawable(file: Path, notes: Notes) -> tuple[Gaussians, SceneReport]:
+    """The drawable Gaussians of a file, and what else it held; warns of those that cannot be drawn.
 
     Raises:
-        FileNotFoundError, PlyError: as for `read_ply`.
+        FileNotFoundError, SceneError: as for `read_gaussians`.
         ValueError: it holds none.
     """
-    gaussians, report = read_ply(file)
+    gaussians, report = read_gaussians(file)
     if report.culled:
         notes.warn(f"{file}: {report.culled} of {report.stored} Gaussians cannot be drawn and are left out")
     if gaussians.num == 0:
@@ -109,7 +110,7 @@ def read_scene(path: Path, count: int, arrays: str, again: str) -> Gaussians:
     Raises:
         ValueError: there are not as many, or not all of them can be drawn.
     """
-    gaussians, report = read_ply(path / "scene.ply")
+    gaussians, report = read_gaussians(path / "scene.ply")
     if gaussians.num != count or report.stored != count:
         found = f"{gaussians.num} drawable Gaussians of {report.stored} in scene.ply"
         raise ValueError(f"{path}: expected {count} Gaussians as in {arrays}, found {found}; {again}")

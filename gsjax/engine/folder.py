@@ -14,6 +14,7 @@ from typing import Any
 import yaml
 
 from gsjax.io.atomic import atomic_write, write_json, write_npz
+from gsjax.io.scenes import is_scene
 
 _WRITTEN = (
     *("config.yml", "metrics.json", "metrics.jsonl", "report.html", "trajectory.npz", "scene.ply"),
@@ -64,14 +65,16 @@ def _wanted(path: Path, made_by: str) -> str:
 
 
 def expect_dataset(path: str) -> None:
-    """Raises ValueError if the path is a run's folder or a PLY file instead of a dataset."""
+    """Raises ValueError if the path is a run's folder or a file of Gaussians instead of a dataset."""
     if is_run(Path(path)):
         raise ValueError(
             f"{path}: expected a dataset, found the folder of a run; open its report.html, or view it with "
             f"gsjax view {path}"
         )
-    if path.lower().endswith(".ply") and Path(path).is_file():
-        raise ValueError(f"{path}: expected a dataset, found a PLY file; view it with gsjax view {path}")
+    if is_scene(path) and Path(path).is_file():
+        raise ValueError(
+            f"{path}: expected a dataset, found a file of Gaussians; view it with gsjax view {path}"
+        )
 
 
 class RunFolder:

@@ -221,7 +221,7 @@ def write_compressed_ply(path: Path, gaussians: Gaussians) -> None:
 def _ranged(
     chunks: np.ndarray, quantities: tuple[str, ...], values: Float[np.ndarray, "N parts"]
 ) -> Float[np.ndarray, "N parts"]:
-    """Write the bounds of each chunk, and return the values as fractions of them; the inverse of `_in_range`."""
+    """Write each chunk's bounds, and return the values as fractions of them; the inverse of `_in_range`."""
     starts = np.arange(0, len(values), CHUNK_SIZE)
     values = values.astype(np.float32)
     low, high = (ufunc.reduceat(values, starts, axis=0) for ufunc in (np.minimum, np.maximum))

@@ -25,7 +25,7 @@ from gsjax.engine.parts.start import FIT, detect_motion
 from gsjax.engine.progress import Progress
 from gsjax.engine.recording import Recording, chosen_recording, located, parse_frames
 from gsjax.engine.records import digest
-from gsjax.io.ply import read_ply
+from gsjax.io.scenes import read_gaussians
 from gsjax.methods.fit import FitConfig
 from gsjax.methods.parts import (
     Anchor,
@@ -54,7 +54,7 @@ class Options(Seeded, SamWeights, OfRecording):
     """Where the pieces in the anchor's pictures come from: a segmenter, or the recording's own masks, whose
     labels must mean the same in all cameras."""
     scene: Path | None = None
-    """The scene at the anchor: a PLY file, or a run of `gsjax fit`; requires --anchor. Default: it is fitted,
+    """The scene at the anchor: a file of Gaussians, or a run of `gsjax fit`; requires --anchor. Default: it is fitted,
     into RUN/canonical."""
     fit: FitConfig = FIT
     """How the canonical scene is fitted."""
@@ -175,7 +175,7 @@ def _masks(
 def _fitted(
     options: Options, folder: RunFolder, anchor: Anchor, recording: Recording, console: Console
 ) -> Path | None:
-    """The PLY file of the scene at the anchor frame; None if the fit was stopped by Ctrl-C."""
+    """The file of the scene at the anchor frame; None if the fit was stopped by Ctrl-C."""
     path = folder.path / "canonical"
     if not RunFolder(path, overwrite=True).finished:
         console.print("[bold]canonical scene[/]  fitted to the anchor frame", soft_wrap=True)
@@ -186,7 +186,7 @@ def _fitted(
 
 
 def _ply_of(path: Path) -> Path:
-    """The PLY file itself, or that of a run of `gsjax fit`."""
+    """The file itself, or that of a run of `gsjax fit`."""
     if path.is_dir():
         expect_run(path, "`gsjax fit`")
         return path / "scene.ply"
@@ -194,7 +194,7 @@ def _ply_of(path: Path) -> Path:
 
 
 def _read_scene(path: Path) -> Gaussians:
-    return jax.tree.map(jnp.asarray, read_ply(path)[0])
+    return jax.tree.map(jnp.asarray, read_gaussians(path)[0])
 
 
 def _fit_options(options: Options, path: Path, anchor: Anchor, recording: Recording) -> FitOptions:
