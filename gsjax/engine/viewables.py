@@ -55,7 +55,9 @@ def open_viewable(path: Path, notes: Notes, now: Whereabouts = AS_IT_WAS) -> tup
         scene = Viewable(path.name, gaussians, report.labels, antialiased=bool(report.antialiased))
         return scene, path.absolute().parent
     if not path.is_dir():
-        raise FileNotFoundError(f"{path}: expected a run or a file of Gaussians, found nothing there; check the path")
+        raise FileNotFoundError(
+            f"{path}: expected a run or a file of Gaussians, found nothing there; check the path"
+        )
     if (path / NAME).is_file():
         return _of_field(path, notes, now), path
     expect_run(path)

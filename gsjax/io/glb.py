@@ -1,8 +1,8 @@
 """glTF with KHR_gaussian_splatting, as one .glb: written, not read. Nothing is rounded.
 
-Attributes of one primitive of points: POSITION, rotations x y z w, logarithms of scales, opacities 0 to 1 and one
-accessor for each coefficient of the harmonics, all float32; and COLOR_0, by which programs without the extension
-show points. The Y axis of glTF points up and that of a 3DGS PLY down, so the node is turned half around X.
+Attributes of one primitive of points: POSITION, rotations x y z w, logarithms of scales, opacities 0 to 1 and
+an accessor for each coefficient of the harmonics, all float32; and COLOR_0, by which programs without the
+extension show points. Y of glTF points up and that of a 3DGS PLY down, so the node is turned half around X.
 Source: extensions/2.0/Khronos/KHR_gaussian_splatting in github.com/KhronosGroup/glTF.
 """
 

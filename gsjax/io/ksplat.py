@@ -1,13 +1,13 @@
 """The .ksplat of mkkellogg's GaussianSplats3D, read alone: sections of records, little-endian.
 
-    header     4096 bytes: version, numbers of sections and of Gaussians, compression level, range of harmonics
+    header     4096 bytes: version, numbers of sections and of Gaussians, level, range of harmonics
     sections   1024 bytes each: numbers of Gaussians, of buckets and of their bytes, degree of harmonics
     data       of each section: lengths of partly filled buckets, centres of buckets, records
 
-A record has centre, scales, rotation w x y z, red green blue opacity as uint8, and harmonics, band by band and
-within it channel by channel. Level 0 holds float32; levels 1 and 2 float16, but for centres: uint16, an offset
-from the centre of the bucket that the Gaussian is in; and harmonics of level 2: uint8 of a range. Axes are those
-of the 3DGS PLY. Source: SplatBuffer.js in github.com/mkkellogg/GaussianSplats3D.
+A record has centre, scales, rotation w x y z, red green blue opacity as uint8, and harmonics, band by band
+and within it channel by channel. Level 0 holds float32; levels 1 and 2 float16, but for centres: uint16, an
+offset from the centre of the bucket that the Gaussian is in; and harmonics of level 2: uint8 of a range. Axes
+are those of the 3DGS PLY. Source: SplatBuffer.js in github.com/mkkellogg/GaussianSplats3D.
 """
 
 import struct

@@ -1,7 +1,7 @@
 """A web page that shows a scene: one .html that opens from disk, without a network or a program beside it.
 
-It holds the scene as a .splat, so without view-dependent colour, and a viewer (page.html) of a few kB: WebGL 2,
-sorted in a worker.
+It holds the scene as a .splat, so without view-dependent colour, and a viewer (page.html) of a few kB: WebGL
+2, sorted in a worker.
 """
 
 import base64

@@ -1,5 +1,5 @@
-"""PlayCanvas's SOG, version 2: pictures of bytes, and a meta.json that says what they mean; in a zip, or beside
-each other in a folder. A pixel of each picture is a Gaussian, row by row.
+"""PlayCanvas's SOG, version 2: pictures of bytes, and a meta.json that says what they mean; in a zip, or in a
+folder. A pixel of each picture is a Gaussian, row by row.
 
     means_l, means_u   low and high byte of x y z: 65535 steps between mins and maxs of sign(x) log(1 + |x|)
     scales             three indices into a codebook of 256 logarithms
@@ -59,8 +59,8 @@ def read_sog(path: Path) -> tuple[Gaussians, SceneReport]:
         path: the file.
 
     Raises:
-        SceneError: it is no SOG of version 2, or cut off; a picture is missing, too small for the Gaussians or
-            far larger than its file allows; or a name leads out of the archive or folder.
+        SceneError: it is no SOG of version 2, or cut off; a picture is missing, too small for the Gaussians
+            or far larger than its file allows; or a name leads out of the archive or folder.
     """
     if path.suffix.lower() == ".json":
         return _read(path, lambda name: _beside(path, name))
@@ -142,9 +142,8 @@ def _read(path: Path, load: Load) -> tuple[Gaussians, SceneReport]:
     meta = _Meta(path, load(_META))
     if meta.get("version") != 2:
         found = f"version {meta.get('version')!r}"
-        raise SceneError(
-            path, "version 2 of SOG", found, "Convert it with a present version of splat-transform"
-        )
+        advice = "Convert it with a present version of splat-transform"
+        raise SceneError(path, "version 2 of SOG", found, advice)
     count = meta.whole("count", most=1 << 28)
 
     def pixels(name: str) -> UInt8[np.ndarray, "N 4"]:
@@ -158,14 +157,11 @@ def _read(path: Path, load: Load) -> tuple[Gaussians, SceneReport]:
     logs = mins + (low + 256 * high) / 65535 * (maxs - mins)
     with np.errstate(over="ignore"):
         means = np.sign(logs) * np.expm1(np.abs(logs))
-    scales = meta.numbers("scales", "codebook", count=256)[
-        pixels(*meta.names("scales", "files", count=1))[:, :3]
-    ]
-    colors = pixels(*meta.names("sh0", "files", count=1))
+    scales, colors, quats = (pixels(*meta.names(key, "files", count=1)) for key in ("scales", "sh0", "quats"))
+    log_scales = meta.numbers("scales", "codebook", count=256)[scales[:, :3]]
     sh0 = meta.numbers("sh0", "codebook", count=256)[colors[:, :3]]
-    quats = _quats(pixels(*meta.names("quats", "files", count=1)))
     rest = np.zeros((count, 0, 3)) if not meta.get("shN") else _rest(meta, load, pixels)
-    columns = Columns(means, quats, scales, colors[:, 3] / 255, sh0 * SH_C0 + 0.5, rest)
+    columns = Columns(means, _quats(quats), log_scales, colors[:, 3] / 255, sh0 * SH_C0 + 0.5, rest)
     antialiased = meta.get("antialias")
     return drawable(gaussians_of(columns), antialiased=antialiased if isinstance(antialiased, bool) else None)
 
@@ -218,8 +214,8 @@ def _rest(meta: _Meta, load: Load, pixels: Callable[[str], np.ndarray]) -> np.nd
 def write_sog(path: Path, gaussians: Gaussians, *, antialiased: bool = False) -> None:
     """Write a .sog of version 2, atomically. Gaussians come in spatial order, which compresses better.
 
-    Scales and colours are rounded to codebooks of 256 values. More than 65,536 Gaussians share as many sets of
-    view-dependent colour.
+    Scales and colours are rounded to codebooks of 256 values. More than 65,536 Gaussians share as many sets
+    of view-dependent colour.
 
     Args:
         path: the file.

@@ -10,8 +10,8 @@ A header, then one array after the other, little-endian:
                  in 2 bits, then the other three in order, a sign and 9 bits of |q| sqrt(2) each
     harmonics    uint8 each, 128 (c + 1), coefficient by coefficient, red green blue
 
-In versions 2 and 3 all of this is one gzip stream; in version 4 a header of 32 bytes is followed by a table of
-sizes and one zstandard frame per array. Axes are right, up, back: y and z of a 3DGS PLY point the other way.
+In versions 2 and 3 all of this is one gzip stream; in version 4 a header of 32 bytes is followed by a table
+of sizes and one zstandard frame per array. Axes are right, up, back: y and z of a 3DGS PLY point the other way.
 Source: README.md and load-spz.cc in github.com/nianticlabs/spz.
 """
 
@@ -77,23 +77,20 @@ def read_spz(path: Path) -> tuple[Gaussians, SceneReport]:
         path: the file.
 
     Raises:
-        SceneError: it is no SPZ, of another version or degree, cut off, or says that it is far larger than its
-            size allows.
+        SceneError: it is no SPZ, of another version or degree, cut off, or says that it is far larger than
+            its size allows.
     """
     data = path.read_bytes()
+    packed, size = data[:2] == GZIP, _HEADER.size
     try:
-        head = (
-            zlib.decompressobj(31).decompress(data, _HEADER.size)
-            if data[:2] == GZIP
-            else data[: _HEADER.size]
-        )
+        head = zlib.decompressobj(31).decompress(data, size) if packed else data[:size]
     except zlib.error as error:
         raise SceneError(path, "a gzip stream", f"another ({error})", AGAIN) from error
     header = _parse(path, head)
     if header.version == 4:
         arrays = _streams(path, data, header)
     else:
-        body = _inflated(path, data, header) if data[:2] == GZIP else data[_HEADER.size :]
+        body = _inflated(path, data, header) if packed else data[size:]
         if len(body) < sum(header.sizes()):
             found = f"{len(body)} of {sum(header.sizes())} bytes"
             raise SceneError(path, f"{header.count} Gaussians", found, AGAIN)

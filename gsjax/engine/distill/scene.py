@@ -1,4 +1,5 @@
-"""The scene that a field is distilled for, and photographs of it: those of a run, or of a file of another program."""
+"""The scene that a field is distilled for, and photographs of it: those of a run, or of a file of another
+program."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -75,7 +76,9 @@ def open_scene(options: SceneOptions, gaussians: Gaussians | None = None) -> Fie
     path = options.scene
     if path.is_file():
         if options.images is None:
-            raise ValueError(f"{path}: a file of Gaussians has no photographs; give a folder of them with --images")
+            raise ValueError(
+                f"{path}: a file of Gaussians has no photographs; give a folder of them with --images"
+            )
         chosen = {name: getattr(options, name) for name in ("frames", "cameras", "eval_cameras")}
         scene = scene_of_file(path, options.images, options.read, options.test_every, gaussians, **chosen)
     else:
