@@ -1,4 +1,4 @@
-"""What readers and writers of Gaussians share: error, report, bounded sizes, and values as files have them."""
+"""What readers and writers of Gaussians share: error, report, bounded sizes, values as files have them."""
 
 import os
 from dataclasses import dataclass

@@ -11,7 +11,8 @@ A header, then one array after the other, little-endian:
     harmonics    uint8 each, 128 (c + 1), coefficient by coefficient, red green blue
 
 In versions 2 and 3 all of this is one gzip stream; in version 4 a header of 32 bytes is followed by a table
-of sizes and one zstandard frame per array. Axes are right, up, back: y and z of a 3DGS PLY point the other way.
+of sizes and one zstandard frame per array. Axes are right, up, back: y and z of a 3DGS PLY point the other
+way.
 Source: README.md and load-spz.cc in github.com/nianticlabs/spz.
 """
 

@@ -80,11 +80,11 @@ def test_debug_shows_where_it_failed(tmp_path):
         main(["info", str(tmp_path / "nowhere"), "--debug"])
 
 
-def test_info_of_a_ply_file_points_to_view(say, tmp_path):
+def test_info_of_a_scene_points_to_view(say, tmp_path):
     (tmp_path / "scene.ply").write_bytes(b"ply")
     code, _, err = say("info", str(tmp_path / "scene.ply"))
     assert code == 2
-    assert f"expected a dataset, found a PLY file; view it with gsjax view {tmp_path}" in err
+    assert f"expected a dataset, found a file of Gaussians; view it with gsjax view {tmp_path}" in err
 
 
 def test_info_says_what_is_there(say):

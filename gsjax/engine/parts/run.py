@@ -54,8 +54,8 @@ class Options(Seeded, SamWeights, OfRecording):
     """Where the pieces in the anchor's pictures come from: a segmenter, or the recording's own masks, whose
     labels must mean the same in all cameras."""
     scene: Path | None = None
-    """The scene at the anchor: a file of Gaussians, or a run of `gsjax fit`; requires --anchor. Default: it is
-    fitted, into RUN/canonical."""
+    """The scene at the anchor: a file of Gaussians, or a run of `gsjax fit`; requires --anchor. Default: it
+    is fitted, into RUN/canonical."""
     fit: FitConfig = FIT
     """How the canonical scene is fitted."""
     parts: PartsConfig = field(default_factory=PartsConfig)
