@@ -4,7 +4,7 @@ verbs       fit, track, parts, distill, deform: data in, a tick a step, `now.res
 settings    FitConfig, TrackConfig, PartsConfig, DistillConfig, DeformConfig
 data        open_photographs, open_sequence, Photographs, Sequence
 tracking    start_scene, scene_from_shapes
-files       save, load, read_ply, write_ply
+files       save, load, read_gaussians, write_gaussians, read_ply, write_ply
 scene       Gaussians, Tags, Camera, Frame, render, plan_render
 rasterize   rasterization, plan, Plan, sharded_rasterization, composite_tile
 speed       host_options, keep_freed_memory, keep_programs
@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from gsjax.engine.verbs import deform, distill, fit, parts, track
     from gsjax.geometry.cameras import Camera
     from gsjax.io.ply import read_ply, write_ply
+    from gsjax.io.scenes import read_gaussians, write_gaussians
     from gsjax.methods.deform import DeformConfig
     from gsjax.methods.distill import DistillConfig
     from gsjax.methods.fit import FitConfig
@@ -42,6 +43,7 @@ _HOMES = {
     "gsjax.engine.verbs": ("deform", "distill", "fit", "parts", "track"),
     "gsjax.geometry.cameras": ("Camera",),
     "gsjax.io.ply": ("read_ply", "write_ply"),
+    "gsjax.io.scenes": ("read_gaussians", "write_gaussians"),
     "gsjax.methods.deform": ("DeformConfig",),
     "gsjax.methods.distill": ("DistillConfig",),
     "gsjax.methods.fit": ("FitConfig",),
@@ -85,6 +87,7 @@ __all__ = [
     "plan",
     "plan_render",
     "rasterization",
+    "read_gaussians",
     "read_ply",
     "render",
     "save",
@@ -92,6 +95,7 @@ __all__ = [
     "sharded_rasterization",
     "start_scene",
     "track",
+    "write_gaussians",
     "write_ply",
 ]
 

@@ -27,13 +27,14 @@ GROUPS = {
         "deform": ("gsjax.cli.deform", "reconstruct a deforming scene, such as from an endoscope"),
     },
     "Distil and query": {
-        "distill": ("gsjax.cli.distill", "distil a semantic field for a run or a PLY file"),
+        "distill": ("gsjax.cli.distill", "distil a semantic field for a run or a file"),
         "query": ("gsjax.cli.query", "find what a text means: objects of a run, or Gaussians"),
         "ask": ("gsjax.cli.ask", "answer a question about a deforming scene"),
         "grasp": ("gsjax.cli.grasp", "find the best grasp of what a text means, in every frame"),
     },
     "View and edit": {
-        "view": ("gsjax.cli.view", "view a run or a PLY file in a browser"),
+        "view": ("gsjax.cli.view", "view a run or a file of Gaussians in a browser"),
+        "export": ("gsjax.cli.export", "write a scene in another format, or as a page"),
         "edit": ("gsjax.cli.edit", "change when, where and how parts move, and film it"),
     },
     "Evaluate and measure": {

@@ -58,7 +58,7 @@ class FieldOptions:
 
     image: Path | None = None
     """A picture of the thing to find; with an alpha channel, only its opaque part."""
-    scene: Annotated[Path | None, tyro.conf.arg(metavar="PLY")] = None
+    scene: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """Present path of the scene's file, if it was moved (default: its first path, or next to the field)."""
     images: Annotated[str | None, tyro.conf.arg(metavar="FOLDER")] = None
     """Present folder of the photographs, if they were moved."""

@@ -1,11 +1,11 @@
-"""`gsjax view`: a run or a PLY file in a web browser."""
+"""`gsjax view`: a run or a file of Gaussians in a web browser."""
 
 import re
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import count
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import numpy as np
 import tyro
@@ -15,7 +15,7 @@ from gsjax.engine.distill.saved import Whereabouts
 from gsjax.engine.messages import Notes, stage
 from gsjax.engine.options import Common
 from gsjax.engine.streams import say_error
-from gsjax.engine.viewables import open_viewable
+from gsjax.engine.viewables import UP, Up, open_viewable
 from gsjax.io.atomic import write_new
 from gsjax.io.pictures import write_png
 from gsjax.optim.compiler import host_options
@@ -23,7 +23,6 @@ from gsjax.viz.viewer import Viewable, Viewer, open_viewer
 from gsjax.viz.viewer.markup import contents
 from gsjax.viz.viewer.server import PORT, is_loopback, load_viser
 
-_UP = {sign + axis: s * np.eye(3)[i] for sign, s in (("", 1), ("-", -1)) for i, axis in enumerate("xyz")}
 _NUMBERED = re.compile(r"(\d+)_")
 
 
@@ -31,20 +30,20 @@ _NUMBERED = re.compile(r"(\d+)_")
 class Options(Common):
     """Options of `gsjax view`."""
 
-    path: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN|FIELD|FILE.ply")]
+    path: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN|FIELD|FILE")]
     """Folder of a run of `gsjax fit`, `gsjax track`, `gsjax parts` or `gsjax deform`; of a field (`gsjax
-    distill`); or a PLY file of Gaussians. A field, a fit with one and a deforming scene with names can be
-    queried."""
+    distill`); or a file of Gaussians: .ply, .compressed.ply, .splat, .spz, .sog or .ksplat. A field, a fit
+    with one and a deforming scene with names can be queried."""
     host: str = "127.0.0.1"
     """Address to listen on. With the default, only this machine can connect."""
     port: int | None = None
     """Port to listen on; default: 8080, or the next free one."""
     max_gaussians: int = 500_000
     """Largest number of Gaussians that the browser receives (the most opaque); gsjax's own render has all."""
-    up: Literal["auto", "x", "y", "z", "-x", "-y", "-z"] = "auto"
+    up: Up = "auto"
     """The up direction; auto: that of the photographs, else z."""
     scene: Path | None = None
-    """Current path of a field's scene, a PLY file."""
+    """Current path of the file of a field's scene."""
     images: str | None = None
     """Current path of the photographs of a field or a fit."""
     weights: Path | None = None
@@ -65,7 +64,7 @@ def run(options: Options) -> int:
             now = Whereabouts(options.scene, options.images, options.weights)
             scene, folder = open_viewable(options.path, notes, now)
         if options.up != "auto":
-            scene = replace(scene, up=_UP[options.up])
+            scene = replace(scene, up=UP[options.up])
         with open_viewer(
             scene,
             host=options.host,

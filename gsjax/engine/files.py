@@ -17,7 +17,9 @@ from gsjax.data import ReadOptions
 from gsjax.data.errors import DataError
 from gsjax.data.origin import relative_to_origin
 from gsjax.engine.recording import Opener, Recording, open_recording
-from gsjax.io.ply import PlyReport, read_ply, write_ply
+from gsjax.io.ply import write_ply
+from gsjax.io.scene_file import SceneReport
+from gsjax.io.scenes import read_gaussians
 from gsjax.scene.gaussians import Gaussians
 
 _SETTINGS = ("dataset", "cameras", "frames")
@@ -105,14 +107,14 @@ def write_scene(
     write_ply(path, gaussians, labels=labels, origin=origin, antialiased=antialiased)
 
 
-def read_drawable(file: Path) -> tuple[Gaussians, PlyReport]:
-    """The drawable Gaussians of a PLY file, and what else it held.
+def read_drawable(file: Path) -> tuple[Gaussians, SceneReport]:
+    """The drawable Gaussians of a file, and what else it held.
 
     Raises:
-        FileNotFoundError, PlyError: as for `read_ply`.
+        FileNotFoundError, SceneError: as for `read_gaussians`.
         ValueError: it holds none.
     """
-    gaussians, report = read_ply(file)
+    gaussians, report = read_gaussians(file)
     if gaussians.num == 0:
         raise ValueError(f"{file}: expected Gaussians, found none that can be drawn")
     return gaussians, report
@@ -132,7 +134,7 @@ def read_scene(
     Raises:
         ValueError: there are not as many, or not all of them can be drawn.
     """
-    gaussians, report = read_ply(path / "scene.ply")
+    gaussians, report = read_gaussians(path / "scene.ply")
     if gaussians.num != count or report.stored != count:
         found = f"{gaussians.num} drawable Gaussians of {report.stored} in scene.ply"
         raise ValueError(f"{path}: expected {count} Gaussians as in {arrays}, found {found}; {again}")

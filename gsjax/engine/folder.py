@@ -16,6 +16,7 @@ import yaml
 from gsjax.engine.locks import LOCK, lock, locked
 from gsjax.io.atomic import atomic_write, write_json, write_npz
 from gsjax.io.labels import ENDING
+from gsjax.io.scenes import is_scene
 
 _WRITTEN = (
     *("config.yml", "metrics.json", "metrics.jsonl", "report.html", "trajectory.npz", "scene.ply"),
@@ -66,14 +67,16 @@ def _wanted(path: Path, made_by: str) -> str:
 
 
 def expect_dataset(path: str) -> None:
-    """Raises ValueError if the path is a run's folder or a PLY file instead of a dataset."""
+    """Raises ValueError if the path is a run's folder or a file of Gaussians instead of a dataset."""
     if is_run(Path(path)):
         raise ValueError(
             f"{path}: expected a dataset, found the folder of a run; open its report.html, or view it with "
             f"gsjax view {path}"
         )
-    if path.lower().endswith(".ply") and Path(path).is_file():
-        raise ValueError(f"{path}: expected a dataset, found a PLY file; view it with gsjax view {path}")
+    if is_scene(path) and Path(path).is_file():
+        raise ValueError(
+            f"{path}: expected a dataset, found a file of Gaussians; view it with gsjax view {path}"
+        )
 
 
 class RunFolder:

@@ -1,7 +1,8 @@
-"""The scenes that `gsjax view` opens: a run of any kind, or a PLY file."""
+"""The scenes that `gsjax view` opens: a run of any kind, or a file of Gaussians."""
 
 from dataclasses import fields
 from pathlib import Path
+from typing import Literal
 
 import jax.numpy as jnp
 import numpy as np
@@ -30,6 +31,9 @@ from gsjax.methods.deform.query import most_likely
 from gsjax.viz.colors import to_uint8
 from gsjax.viz.viewer import Motion, Shots, Viewable, moved
 
+Up = Literal["auto", "x", "y", "z", "-x", "-y", "-z"]
+UP = {sign + axis: s * np.eye(3)[i] for sign, s in (("", 1), ("-", -1)) for i, axis in enumerate("xyz")}
+"""Directions by their names."""
 _AGAIN = "reconstruct it again with this version of gsjax"
 
 
@@ -37,7 +41,7 @@ def open_viewable(path: Path, notes: Notes, now: Whereabouts = AS_IT_WAS) -> tup
     """The scene at a path, and the folder for screenshots.
 
     Args:
-        path: a run, a field, or a PLY file.
+        path: a run, a field, or a file of Gaussians in any format that `read_gaussians` reads.
         notes: collects warnings.
         now: the present paths of what a field or a fit refers to.
 
@@ -47,14 +51,14 @@ def open_viewable(path: Path, notes: Notes, now: Whereabouts = AS_IT_WAS) -> tup
             apply.
     """
     if path.is_file():
-        if path.suffix.lower() != ".ply":
-            raise ValueError(f"{path}: expected a PLY file or the folder of a run, found another file")
-        _expect_only((), now, f"{path} is a PLY file")
+        _expect_only((), now, f"{path} is a file")
         gaussians, report = read_drawable(path)
-        viewable = Viewable(path.name, gaussians, report.labels, antialiased=report.antialiased)
-        return viewable, path.absolute().parent
+        scene = Viewable(path.name, gaussians, report.labels, antialiased=bool(report.antialiased))
+        return scene, path.absolute().parent
     if not path.is_dir():
-        raise FileNotFoundError(f"{path}: expected a run or a PLY file, found nothing there; check the path")
+        raise FileNotFoundError(
+            f"{path}: expected a run or a file of Gaussians, found nothing there; check the path"
+        )
     if (path / NAME).is_file():
         return _of_field(path, notes, now), path
     expect_run(path)

@@ -20,11 +20,14 @@ github.com/playcanvas/splat-transform.
 """
 
 from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float, UInt32
 from plyfile import PlyData, PlyElement
 
+from gsjax.io.atomic import atomic_write
+from gsjax.io.scene_file import Columns, columns_of, spatial_order
 from gsjax.scene.gaussians import SH_SIZES, Gaussians, gaussians_from_activated
 
 PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
@@ -33,6 +36,9 @@ CHUNK_SIZE = 256
 _POSITION = ("x", "y", "z")
 _SCALE = ("scale_x", "scale_y", "scale_z")
 _COLOR = ("r", "g", "b")
+_ENDS = ("min", "max")
+_BOUNDS = [f"{end}_{name}" for group in (_POSITION, _SCALE) for end in _ENDS for name in group]
+_COLOR_BOUNDS = [f"{end}_{name}" for end in _ENDS for name in _COLOR]
 _REST_COUNTS = tuple(3 * (size - 1) for size in SH_SIZES[1:])
 _REST_VALUES = 8 * ((np.arange(256, dtype=np.float32) + 0.5) / 256 - 0.5)
 _REST_VALUES[[0, 255]] = -4, 4  # these also encode clipped values
@@ -70,10 +76,12 @@ def decompress(ply: PlyData, means: Float[np.ndarray, "N 3"]) -> Gaussians:
     colors, opacities = np.split(_fractions(vertices["packed_color"], (8, 8, 8, 8)), [3], axis=1)
     if "min_r" in chunks.dtype.names:
         colors = _in_range(chunks, _COLOR, colors)
+    with np.errstate(over="ignore"):  # to infinities, which are left out
+        scales = np.exp(_in_range(chunks, _SCALE, log_scales))
     return gaussians_from_activated(
         means,
         _quats(vertices["packed_rotation"]),
-        np.exp(_in_range(chunks, _SCALE, log_scales)),
+        scales,
         opacities[:, 0],
         colors,
         shN=_harmonics(ply["sh"].data) if "sh" in ply else None,
@@ -93,8 +101,7 @@ def _in_range(
     """`fractions` interpolated between min_* and max_* of each Gaussian's chunk."""
     # float64, so that the difference of two float32 cannot overflow
     low, high = (
-        np.stack([chunks[f"{end}_{name}"] for name in quantities], axis=1).astype(np.float64)
-        for end in ("min", "max")
+        np.stack([chunks[f"{end}_{name}"] for name in quantities], axis=1).astype(np.float64) for end in _ENDS
     )
     chunk = np.arange(len(fractions)) // CHUNK_SIZE
     return low[chunk] * (1 - fractions) + high[chunk] * fractions
@@ -125,11 +132,8 @@ def _rest_names(rows: np.ndarray) -> list[str]:
 
 def _bounds(chunks: np.ndarray) -> list[str]:
     """The properties required of an element `chunk`; those of colours only if it has any of them."""
-    position, scale, color = (
-        [f"{end}_{name}" for end in ("min", "max") for name in group] for group in (_POSITION, _SCALE, _COLOR)
-    )
-    has_color = not set(color).isdisjoint(chunks.dtype.names or ())
-    return [*position, *scale, *(color if has_color else ())]
+    has_color = not set(_COLOR_BOUNDS).isdisjoint(chunks.dtype.names or ())
+    return [*_BOUNDS, *(_COLOR_BOUNDS if has_color else ())]
 
 
 def find_fault(ply: PlyData) -> Fault | None:
@@ -190,3 +194,58 @@ def _range_fault(chunks: np.ndarray) -> Fault | None:
             found = f"{name} = {chunks[name][bad[0]]} in chunk {bad[0]} (counted from 0)"
             return "finite bounds in every chunk", found, _NAN_ADVICE
     return None
+
+
+def write_compressed_ply(path: Path, gaussians: Gaussians) -> None:
+    """Write a compressed PLY, atomically. Gaussians come in spatial order, so that chunks are small.
+
+    Coefficients of view-dependent colour are clipped to -4 to 4.
+
+    Args:
+        path: the file.
+        gaussians: Gaussians that can all be drawn.
+    """
+    columns = columns_of(gaussians)
+    order = spatial_order(columns.means)
+    columns = Columns(*(value[order] for value in columns))
+    chunks = np.empty(-(-gaussians.num // CHUNK_SIZE), [(name, "<f4") for name in [*_BOUNDS, *_COLOR_BOUNDS]])
+    packed = np.empty(gaussians.num, [(name, "<u4") for name in PACKED])
+    packed["packed_position"] = _words(_ranged(chunks, _POSITION, columns.means), (11, 10, 11))
+    packed["packed_scale"] = _words(_ranged(chunks, _SCALE, columns.log_scales), (11, 10, 11))
+    colors = _ranged(chunks, _COLOR, columns.colors)
+    packed["packed_color"] = _words(np.column_stack([colors, columns.opacities]), (8, 8, 8, 8))
+    largest = np.argmax(np.abs(columns.quats), axis=1)[:, None]
+    quats = columns.quats * np.where(np.take_along_axis(columns.quats, largest, axis=1) < 0, -1, 1)
+    others = quats[np.arange(4) != largest].reshape(-1, 3) * np.sqrt(0.5) + 0.5
+    packed["packed_rotation"] = _words(others, (10, 10, 10)) | largest[:, 0].astype(np.uint32) << 30
+    elements = [PlyElement.describe(chunks, "chunk"), PlyElement.describe(packed, "vertex")]
+    if rest := 3 * columns.rest.shape[1]:
+        coefficients = columns.rest.transpose(0, 2, 1).reshape(gaussians.num, rest)
+        rows = np.empty(gaussians.num, [(f"f_rest_{i}", "u1") for i in range(rest)])
+        for i, column in enumerate(np.clip(np.floor((coefficients / 8 + 0.5) * 256), 0, 255).T):
+            rows[f"f_rest_{i}"] = column
+        elements.append(PlyElement.describe(rows, "sh"))
+    with atomic_write(path) as temporary:
+        PlyData(elements, byte_order="<").write(str(temporary))
+
+
+def _ranged(
+    chunks: np.ndarray, quantities: tuple[str, ...], values: Float[np.ndarray, "N parts"]
+) -> Float[np.ndarray, "N parts"]:
+    """Write each chunk's bounds, and return the values as fractions of them; the inverse of `_in_range`."""
+    starts = np.arange(0, len(values), CHUNK_SIZE)
+    values = values.astype(np.float32)
+    low, high = (ufunc.reduceat(values, starts, axis=0) for ufunc in (np.minimum, np.maximum))
+    for end, bounds in (("min", low), ("max", high)):
+        for name, column in zip(quantities, bounds.T, strict=True):
+            chunks[f"{end}_{name}"] = column
+    chunk = np.arange(len(values)) // CHUNK_SIZE
+    low, extent = low[chunk].astype(np.float64), (high.astype(np.float64) - low)[chunk]
+    return (values - low) / np.where(extent > 0, extent, 1)
+
+
+def _words(fractions: Float[np.ndarray, "N parts"], bits: tuple[int, ...]) -> UInt32[np.ndarray, "N"]:
+    """Fractions 0 to 1 in as many bits each, highest first; the inverse of `_fractions`."""
+    shifts = sum(bits) - np.cumsum(bits)
+    codes = np.round(np.clip(fractions, 0, 1) * ((1 << np.array(bits)) - 1)).astype(np.uint32)
+    return np.bitwise_or.reduce(codes << shifts.astype(np.uint32), axis=1)

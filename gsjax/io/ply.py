@@ -3,7 +3,7 @@
 One vertex per Gaussian: x y z, nx ny nz (zeros), f_dc_0..2, f_rest_* channel-major (all of red, then green,
 then blue), opacity as a logit, scale_0..2 as logarithms, rot_0..3 as w x y z. gsjax adds feature_* if a scene
 has them. Labels lie in a file beside it (`gsjax.io.labels`), because other readers trip over integers.
-PlayCanvas's compressed PLY can be read, but not written.
+PlayCanvas's compressed PLY is read too.
 
 That a scene is to be drawn antialiased (Mip-Splatting) is said in a comment of the header: Brush and
 splat-transform write "SplatRenderMode: mip", Postshot "antialiased 1"; the last such line counts.
@@ -13,18 +13,18 @@ import os
 import re
 import warnings
 from collections.abc import Iterable
-from dataclasses import dataclass, field
 from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float, Int, Integer
+from jaxtyping import Bool, Float, Integer
 from plyfile import PlyData, PlyElement, PlyParseError
 
 from gsjax.io.atomic import atomic_write
 from gsjax.io.compressed_ply import PACKED, decompress, find_fault, is_compressed, positions
 from gsjax.io.labels import labels_beside, read_labels, write_labels
-from gsjax.scene.gaussians import FLAT, OPAQUE, SH_SIZES, Gaussians, take, valid_rows
+from gsjax.io.scene_file import SceneError, SceneReport, drawable
+from gsjax.scene.gaussians import FLAT, OPAQUE, SH_SIZES, Gaussians
 from gsjax.scene.origin import far_origin, in_words, in_world
 
 _REQUIRED = (
@@ -42,39 +42,8 @@ _MODES = re.compile(r"\s*(?:splatrendermode\s*:\s*(\w+)|antialiased\s+([01])|tra
 _LOST = 0.01  # of a Gaussian's size: steps of float32 that are larger lose its place
 
 
-class PlyError(ValueError):
+class PlyError(SceneError):
     """A file is not a PLY of Gaussians; the message has the path, what was expected and found, and advice."""
-
-    def __init__(self, path: str | os.PathLike, expected: str, found: str, advice: str):
-        super().__init__(f"{path}: expected {expected}, found {found}. {advice}")
-
-
-@dataclass(frozen=True)
-class PlyReport:
-    """Contents of a PLY file besides the returned Gaussians.
-
-    Attributes:
-        stored: number of rows in the file.
-        culled: number of rows left out because of a NaN, a zero quaternion, or an infinity without meaning.
-        extra: properties that were not read.
-        rows: row in the file of each returned Gaussian, [N].
-        labels: int32 label of each returned Gaussian, [N]; None if the file has no labels.
-        invisible: number of rows left out because their opacity is 0, a logit of -inf.
-        origin: what was taken off the means because they lie far from 0, where float32 cannot hold them; None
-            if they are as in the file.
-        places: of the returned Gaussians as in the file, float64 [N,3].
-        antialiased: whether a comment says that the scene is to be drawn antialiased.
-    """
-
-    stored: int
-    culled: int
-    extra: tuple[str, ...]
-    rows: Int[np.ndarray, "N"]
-    labels: Int[np.ndarray, "N"] | None = None
-    invisible: int = 0
-    origin: Float[np.ndarray, "3"] | None = None
-    places: Float[np.ndarray, "N 3"] = field(default_factory=lambda: np.zeros((0, 3)), repr=False)
-    antialiased: bool = False
 
 
 def write_ply(
@@ -92,7 +61,7 @@ def write_ply(
         gaussians: the Gaussians, on the host or a device.
         labels: integers [N], written to a file beside it: NAME_labels.npz of NAME.ply. Without labels, such a
             file of an earlier scene is removed.
-        origin: what means are relative to (`PlyReport.origin`, `Photographs.origin`); it is put back. Where
+        origin: what means are relative to (`SceneReport.origin`, `Photographs.origin`); it is put back. Where
             float32 would then lose places, x y z are of type double.
         antialiased: say in a comment that the scene is to be drawn antialiased.
 
@@ -148,14 +117,14 @@ def _columns(gaussians: Gaussians, origin: Float[np.ndarray, "3"] | None) -> dic
     return columns
 
 
-def read_ply(path: str | os.PathLike) -> tuple[Gaussians, PlyReport]:
+def read_ply(path: str | os.PathLike) -> tuple[Gaussians, SceneReport]:
     """The Gaussians of a 3DGS PLY or a PlayCanvas compressed PLY (detected from the header), as float32.
 
     The file may be binary of either byte order, or ASCII. Rows that cannot be drawn (with a NaN or a zero
     quaternion) are left out and counted, with a warning. Infinities that mean something are kept as the
     nearest value that can be drawn: an opacity of logit +inf is opaque, a log scale of -inf is flat; a logit
     of -inf is invisible, and left out and counted. Places far from 0 are returned relative to
-    `PlyReport.origin`, with a warning. See `gsjax.io.compressed_ply` for packed values.
+    `SceneReport.origin`, with a warning. See `gsjax.io.compressed_ply` for packed values.
 
     Raises:
         FileNotFoundError: there is no file at `path`.
@@ -180,23 +149,18 @@ def read_ply(path: str | os.PathLike) -> tuple[Gaussians, PlyReport]:
         origin = far_origin(places)
         gaussians, invisible = _uncompressed(vertices, _relative(places, origin))
     names = vertices.dtype.names or ()
-    valid = valid_rows(gaussians)
-    invisible &= valid
-    rows = np.flatnonzero(valid & ~invisible)
-    labels = np.asarray(vertices["label"]) if "label" in names else read_labels(path, len(vertices))
-    report = PlyReport(
-        stored=len(vertices),
-        culled=int(np.sum(~valid)),
+    if origin is not None:
+        _warn_of_origin(path, origin, places, vertices)
+    return drawable(
+        path,
+        gaussians,
+        invisible=invisible,
         extra=tuple(name for name in names if name not in {*known, "label"}),
-        rows=rows,
-        labels=None if labels is None else labels[rows].astype(np.int32),
-        invisible=int(invisible.sum()),
+        labels=np.asarray(vertices["label"]) if "label" in names else read_labels(path, len(vertices)),
         origin=origin,
-        places=places[rows],
+        places=places,
         antialiased=_says_antialiased([*ply.comments, *(c for e in ply.elements for c in e.comments)]),
     )
-    _warn(path, report, places, ply)
-    return take(gaussians, rows), report
 
 
 def _relative(
@@ -205,28 +169,20 @@ def _relative(
     return (places if origin is None else places - origin).astype(np.float32)
 
 
-def _says_antialiased(comments: Iterable[str]) -> bool:
-    """Whether the last comment about how to draw the scene says so."""
+def _says_antialiased(comments: Iterable[str]) -> bool | None:
+    """Whether the last comment about how to draw the scene says so; None if none does."""
     said = [found for comment in comments if (found := _MODES.match(comment))]
     if not said:
-        return False
+        return None
     mode, flag, flags = said[-1].groups()
     return (mode or "").lower() == "mip" or flag == "1" or "antialiasing" in (flags or "").lower()
 
 
-def _warn(path: Path, report: PlyReport, places: Float[np.ndarray, "N 3"], ply: PlyData) -> None:
-    """Warn of Gaussians that are left out, and of places far from 0."""
-    left_out = []
-    if report.culled:
-        left_out.append(f"{report.culled} of {report.stored} Gaussians cannot be drawn (NaN, no rotation)")
-    if report.invisible:
-        left_out.append(f"{report.invisible} of {report.stored} Gaussians are invisible (opacity 0)")
-    if left_out:
-        warnings.warn(f"{path}: {' and '.join(left_out)} and are left out", UserWarning, stacklevel=1)
-    if report.origin is None:
-        return
-    words = in_words(places, report.origin)
-    types = ply["vertex"].data.dtype
+def _warn_of_origin(
+    path: Path, origin: Float[np.ndarray, "3"], places: Float[np.ndarray, "N 3"], vertices: np.ndarray
+) -> None:
+    words = in_words(places, origin)
+    types = vertices.dtype
     if "x" in (types.names or ()) and types["x"].itemsize < 8:
         words += "; the file itself is of float32, which has lost what is smaller than these steps"
     warnings.warn(f"{path}: {words}", UserWarning, stacklevel=1)

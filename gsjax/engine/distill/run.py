@@ -143,9 +143,7 @@ def _out(options: Options, scene: Path) -> Path:
         ValueError: there is none, or the scene lies in it and would be removed when the field is replaced.
     """
     if options.out is None and options.scene.is_file():
-        raise ValueError(
-            f"{options.scene}: a PLY file has no folder of its own; --out names one for the field"
-        )
+        raise ValueError(f"{options.scene}: a file has no folder of its own; --out names one for the field")
     out = options.scene / FOLDER if options.out is None else options.out
     if any(place.is_relative_to(out.resolve()) for place in (scene.resolve(), scene.parent.resolve())):
         raise ValueError(

@@ -18,7 +18,8 @@ from gsjax.engine.files import read_drawable, read_options
 from gsjax.engine.folder import is_run
 from gsjax.engine.messages import Notes, describe
 from gsjax.engine.records import digest
-from gsjax.io.ply import PlyReport
+from gsjax.io.scene_file import SceneReport
+from gsjax.io.scenes import is_scene
 from gsjax.methods.distill import DistillResult
 from gsjax.methods.protocols import LanguageEncoder
 from gsjax.scene.gaussians import Gaussians
@@ -31,7 +32,7 @@ class Whereabouts:
     """Current places of a field's scene, photographs and encoder (default: where they were).
 
     Attributes:
-        scene: the scene's PLY file.
+        scene: the scene's file.
         images: the photographs.
         weights: folder of CLIP's weights.
     """
@@ -51,7 +52,7 @@ class FieldRun:
     Attributes:
         path: folder of the field.
         stored: the field, with the means of the scene's Gaussians.
-        file: the scene's PLY file.
+        file: the scene's file.
         gaussians: the scene.
         rows: row of the file of each Gaussian.
         num_rows: number of rows in the file, including Gaussians that cannot be drawn.
@@ -130,7 +131,7 @@ def open_field_run(
 
 
 def _scene_file(folder: Path, stored: DistillResult, given: Path | None, notes: Notes) -> Path:
-    """The PLY file of a field's scene, recognised by its content wherever it was moved to."""
+    """The file of a field's scene, recognised by its content wherever it was moved to."""
     was, parent = Path(stored.scene.get("file") or folder / "scene.ply"), folder.absolute().parent
     beside = (parent / "scene.ply", parent / "canonical" / "scene.ply", folder / "scene.ply")
     there = [file for file in (was, *beside) if file.is_file()] if given is None else [given]
@@ -153,7 +154,7 @@ def _photographs(
     folder: Path,
     stored: DistillResult,
     file: Path,
-    read: tuple[Gaussians, PlyReport],
+    read: tuple[Gaussians, SceneReport],
     images: str | None,
     notes: Notes,
 ) -> Photographs | None:
@@ -187,7 +188,7 @@ def _options(settings: Any, folder: Path, file: Path, images: str | None) -> Sce
     if images is not None:
         chosen["images"] = images
     run, parent = Path(settings["scene"]), folder.absolute().parent
-    if run.suffix.lower() != ".ply" and not run.exists() and folder.name == FOLDER and is_run(parent):
+    if not is_scene(run) and not run.exists() and folder.name == FOLDER and is_run(parent):
         run = parent  # that was moved whole
     return SceneOptions(run if run.is_dir() else file, read=read_options(settings["read"]), **chosen)
 

@@ -1,4 +1,4 @@
-"""The scene that a field is distilled for, and photographs of it: those of a run, or of a PLY file of another
+"""The scene that a field is distilled for, and photographs of it: those of a run, or of a file of another
 program."""
 
 from dataclasses import dataclass, replace
@@ -18,11 +18,12 @@ from gsjax.engine.folder import expect_run
 from gsjax.engine.options import HeldOutFrames, Selection
 from gsjax.engine.photographs import choose_photographs, photographs_of_run, smaller, split
 from gsjax.engine.records import read_record
-from gsjax.io.ply import PlyReport, read_ply
+from gsjax.io.scene_file import SceneReport
+from gsjax.io.scenes import read_gaussians
 from gsjax.scene.gaussians import Gaussians
 from gsjax.scene.origin import about
 
-Read = tuple[Gaussians, PlyReport]
+Read = tuple[Gaussians, SceneReport]
 _AGAIN = "run it again with this version of gsjax"
 _OF_PHOTOGRAPHS = ("frames", "cameras", "eval_cameras", "test_every", "read")  # a run has chosen these
 
@@ -31,11 +32,11 @@ _OF_PHOTOGRAPHS = ("frames", "cameras", "eval_cameras", "test_every", "read")  #
 class SceneAndImages:
     """A static scene, and where its photographs are."""
 
-    scene: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN|SCENE.ply")]
+    scene: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN|FILE")]
     """Folder of a run of `gsjax fit`, `gsjax track` (its first frame) or `gsjax parts` (its canonical frame);
-    or a PLY file from any program, with --images and --out."""
+    or a file of Gaussians from any program (.ply, .spz, .sog, .splat, .ksplat), with --images and --out."""
     images: str | None = None
-    """Photographs of a PLY file's scene, with poses in its coordinates, among which --frames, --cameras,
+    """Photographs of a file's scene, with poses in its coordinates, among which --frames, --cameras,
     --eval-cameras and --test-every select. For a run: the present folder of its photographs, if they
     were moved."""
 
@@ -50,7 +51,7 @@ class FieldScene:
     """A static scene and its photographs.
 
     Attributes:
-        file: the PLY file.
+        file: the file of Gaussians.
         gaussians: the scene.
         photographs: of the scene, posed as it was fitted.
         taught: indices of the training photographs.
@@ -79,11 +80,13 @@ def open_scene(options: SceneOptions, read_scene: Read | None = None) -> FieldSc
     path = options.scene
     if path.is_file():
         if options.images is None:
-            raise ValueError(f"{path}: a PLY file has no photographs; give a folder of them with --images")
+            raise ValueError(
+                f"{path}: a file of Gaussians has no photographs; give a folder of them with --images"
+            )
         chosen = {name: getattr(options, name) for name in ("frames", "cameras", "eval_cameras")}
         scene = scene_of_file(path, options.images, options.read, options.test_every, read_scene, **chosen)
     else:
-        expect_run(path, "`gsjax fit`, `gsjax track` or `gsjax parts`, or a PLY file")
+        expect_run(path, "`gsjax fit`, `gsjax track` or `gsjax parts`, or a file of Gaussians")
         given = [n for n in _OF_PHOTOGRAPHS if getattr(options, n) != getattr(SceneOptions(path), n)]
         if given:
             flag = f"--{given[0].replace('_', '-')}"
@@ -139,7 +142,7 @@ def scene_of_file(
     read_scene: Read | None = None,
     **chosen,
 ) -> FieldScene:
-    """A PLY file with photographs of the same world.
+    """A file of Gaussians with photographs of the same world.
 
     Args:
         file: the scene.
@@ -150,7 +153,7 @@ def scene_of_file(
         **chosen: as for `choose_photographs`.
 
     Raises:
-        PlyError, DataError, ValueError: one of them cannot be read.
+        SceneError, DataError, ValueError: one of them cannot be read.
     """
     gaussians, report = _read(file) if read_scene is None else read_scene
     photographs = relative_to_origin(choose_photographs(images, read, **chosen), report.origin)
@@ -173,7 +176,7 @@ def _split(photographs: Photographs, every: int) -> tuple[list[int], list[int]]:
 
 
 def _read(file: Path) -> Read:
-    gaussians, report = read_ply(file)
+    gaussians, report = read_gaussians(file)
     return jax.tree.map(jnp.asarray, gaussians), report
 
 

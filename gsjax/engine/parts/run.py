@@ -56,8 +56,8 @@ class Options(Seeded, SamWeights, OfRecording):
     """Where the pieces in the anchor's pictures come from: a segmenter, or the recording's own masks, whose
     labels must mean the same in all cameras."""
     scene: Path | None = None
-    """The scene at the anchor: a PLY file, or a run of `gsjax fit`; requires --anchor. Default: it is fitted,
-    into RUN/canonical."""
+    """The scene at the anchor: a file of Gaussians, or a run of `gsjax fit`; requires --anchor. Default: it
+    is fitted, into RUN/canonical."""
     fit: FitConfig = FIT
     """How the canonical scene is fitted."""
     parts: PartsConfig = field(default_factory=PartsConfig)
@@ -178,7 +178,7 @@ def _masks(
 def _fitted(
     options: Options, folder: RunFolder, anchor: Anchor, recording: Recording, console: Console
 ) -> Path | None:
-    """The PLY file of the scene at the anchor frame; None if the fit was stopped by Ctrl-C."""
+    """The file of the scene at the anchor frame; None if the fit was stopped by Ctrl-C."""
     path = folder.path / "canonical"
     if not RunFolder(path, overwrite=True).finished:
         console.print("[bold]canonical scene[/]  fitted to the anchor frame", soft_wrap=True)
@@ -189,7 +189,7 @@ def _fitted(
 
 
 def _ply_of(path: Path) -> Path:
-    """The PLY file itself, or that of a run of `gsjax fit`."""
+    """The file itself, or that of a run of `gsjax fit`."""
     if path.is_dir():
         expect_run(path, "`gsjax fit`")
         return path / "scene.ply"
@@ -197,7 +197,7 @@ def _ply_of(path: Path) -> Path:
 
 
 def _read_scene(path: Path, sequence: Sequence, notes: Notes) -> Gaussians:
-    """The Gaussians of a PLY file, relative to the origin of the recording."""
+    """The Gaussians of a file, relative to the origin of the recording."""
     gaussians, report = read_drawable(path)
     if report.antialiased:
         notes.warn(f"{path} is to be drawn antialiased, and parts are not: small Gaussians look brighter")

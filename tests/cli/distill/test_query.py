@@ -102,7 +102,7 @@ def test_the_scene_is_read_once_and_drawn_by_one_program(gsjax, field, scene, mo
 
     monkeypatch.setattr(field_query, "Drawer", kept)
     for module in ("gsjax.engine.files", "gsjax.engine.distill.scene"):
-        monkeypatch.setattr(f"{module}.read_ply", lambda file: read.append(file) or read_ply(file))
+        monkeypatch.setattr(f"{module}.read_gaussians", lambda file: read.append(file) or read_ply(file))
     code, said = gsjax("query", field, "carton", "--move", 0, 0, 0.01)
     assert code == 0, said
     assert drawers[0]._program._cache_size() == 1

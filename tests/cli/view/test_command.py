@@ -147,7 +147,7 @@ def replace_first_mean(gaussians, value):
 def test_nothing_there(view, tmp_path):
     code, said = view(tmp_path / "none")
     assert code == 2
-    assert "none: expected a run or a PLY file, found nothing there; check the path" in said
+    assert "none: expected a run or a file of Gaussians, found nothing there; check the path" in said
 
 
 def test_a_folder_that_is_no_run(view, photographs):
@@ -175,7 +175,7 @@ def test_files_without_gaussians(view, tmp_path):
     other.write_text("hello")
     code, said = view(other)
     assert code == 2
-    assert "expected a PLY file or the folder of a run" in said
+    assert "notes.txt: expected a file of Gaussians (.ply, .compressed.ply, .splat" in said
     points = np.zeros(3, [("x", "f4"), ("y", "f4"), ("z", "f4")])
     PlyData([PlyElement.describe(points, "vertex")]).write(str(tmp_path / "points.ply"))
     code, said = view(tmp_path / "points.ply")

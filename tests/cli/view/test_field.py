@@ -44,7 +44,7 @@ def test_a_fit_is_asked_by_its_field(fitted, asked, notes):
 
 def test_a_scene_is_read_once(fitted, asked, notes, monkeypatch):
     read = []
-    monkeypatch.setattr("gsjax.engine.files.read_ply", lambda file: read.append(file) or read_ply(file))
+    monkeypatch.setattr("gsjax.engine.files.read_gaussians", lambda file: read.append(file) or read_ply(file))
     open_viewable(fitted, notes)
     assert read == [fitted / "scene.ply"]
 

@@ -1,0 +1,88 @@
+"""glTF with KHR_gaussian_splatting, as one .glb: written, not read. Nothing is rounded.
+
+Attributes of one primitive of points: POSITION, rotations x y z w, logarithms of scales, opacities 0 to 1 and
+an accessor for each coefficient of the harmonics, all float32; and COLOR_0, by which programs without the
+extension show points. Y of glTF points up and that of a 3DGS PLY down, so the node is turned half around X.
+Source: extensions/2.0/Khronos/KHR_gaussian_splatting in github.com/KhronosGroup/glTF.
+"""
+
+import json
+import struct
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gsjax.io.atomic import atomic_write
+from gsjax.io.scene_file import SH_C0, columns_of, to_bytes
+from gsjax.scene.gaussians import Gaussians
+
+MAGIC = b"glTF"
+_EXTENSION = "KHR_gaussian_splatting"
+_FLOAT, _BYTE, _POINTS, _VERTICES = 5126, 5121, 0, 34962
+_SHAPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
+
+
+def write_glb(path: Path, gaussians: Gaussians) -> None:
+    """Write a .glb, atomically.
+
+    Args:
+        path: the file.
+        gaussians: Gaussians that can all be drawn.
+    """
+    attributes = _attributes(gaussians)
+    views, accessors, start = [], [], 0
+    for array in attributes.values():
+        views.append({"buffer": 0, "byteOffset": start, "byteLength": array.nbytes, "target": _VERTICES})
+        accessors.append(_accessor(len(accessors), array))
+        start += array.nbytes
+    accessors[0] |= {end: getattr(attributes["POSITION"], end)(axis=0).tolist() for end in ("min", "max")}
+    primitive = {
+        "attributes": {name: index for index, name in enumerate(attributes)},
+        "mode": _POINTS,
+        "extensions": {_EXTENSION: {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}},
+    }
+    scene = {
+        "asset": {"version": "2.0", "generator": "gsjax"},
+        "extensionsUsed": [_EXTENSION],
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0, "rotation": [1, 0, 0, 0]}],
+        "meshes": [{"primitives": [primitive]}],
+        "buffers": [{"byteLength": start}],
+        "bufferViews": views,
+        "accessors": accessors,
+    }
+    text = json.dumps(scene).encode()
+    text += b" " * (-len(text) % 4)
+    header = MAGIC + struct.pack("<II", 2, 12 + 8 + len(text) + 8 + start)
+    with atomic_write(path) as temporary, open(temporary, "wb") as stream:
+        stream.write(header + struct.pack("<I4s", len(text), b"JSON") + text)
+        stream.write(struct.pack("<I4s", start, b"BIN\0"))
+        for array in attributes.values():
+            stream.write(array.tobytes())
+
+
+def _attributes(gaussians: Gaussians) -> dict[str, np.ndarray]:
+    """The arrays by their names in glTF; POSITION first."""
+    columns = columns_of(gaussians)
+    found = {
+        "POSITION": columns.means,
+        "COLOR_0": np.column_stack([to_bytes(columns.colors), to_bytes(columns.opacities)]),
+        f"{_EXTENSION}:ROTATION": columns.quats[:, [1, 2, 3, 0]],
+        f"{_EXTENSION}:SCALE": columns.log_scales,
+        f"{_EXTENSION}:OPACITY": columns.opacities[:, None],
+        f"{_EXTENSION}:SH_DEGREE_0_COEF_0": (columns.colors - 0.5) / SH_C0,
+    }
+    for band in range(1, gaussians.sh_degree + 1):
+        for index in range(2 * band + 1):
+            found[f"{_EXTENSION}:SH_DEGREE_{band}_COEF_{index}"] = columns.rest[:, band**2 - 1 + index]
+    return {name: array if array.dtype == np.uint8 else array.astype("<f4") for name, array in found.items()}
+
+
+def _accessor(view: int, array: np.ndarray) -> dict[str, Any]:
+    count, width = array.shape
+    kind = (
+        {"componentType": _BYTE, "normalized": True} if array.dtype == np.uint8 else {"componentType": _FLOAT}
+    )
+    return {"bufferView": view, "count": count, "type": _SHAPES[width], **kind}

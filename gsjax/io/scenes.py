@@ -1,0 +1,173 @@
+"""Files of Gaussians of every format: read by their content, written by their ending.
+
+PLY of 3DGS and compressed, .splat, .spz and .sog both ways; .ksplat in; .glb and .html, a page that shows the
+scene, out.
+"""
+
+import os
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import equinox as eqx
+
+from gsjax.io import glb, ksplat, page, ply, sog, splat, spz
+from gsjax.io.compressed_ply import write_compressed_ply
+from gsjax.io.scene_file import SceneError, SceneReport
+from gsjax.scene.gaussians import Gaussians, cull_invalid
+
+Reader = Callable[[Path], tuple[Gaussians, SceneReport]]
+
+
+@dataclass(frozen=True)
+class Format:
+    """A format that is written.
+
+    Attributes:
+        name: what it is called in messages.
+        write: (path, Gaussians that can all be drawn, ...) -> None.
+        degree: largest degree of spherical harmonics that it keeps.
+        options: what else `write` takes.
+    """
+
+    name: str
+    write: Callable[..., None]
+    degree: int = 3
+    options: tuple[str, ...] = ()
+
+
+FORMATS = {
+    ".compressed.ply": Format("PlayCanvas's compressed PLY", write_compressed_ply),
+    ".ply": Format("PLY of 3DGS", ply.write_ply),
+    ".splat": Format(".splat", splat.write_splat, degree=0),
+    ".spz": Format("SPZ", spz.write_spz, options=("antialiased",)),
+    ".sog": Format("SOG", sog.write_sog, options=("antialiased",)),
+    ".glb": Format("glTF", glb.write_glb),
+    ".html": Format("a page", page.write_page, degree=0, options=("antialiased", "up", "background")),
+}
+"""The formats that are written, by the ending of a file; of two that fit, the first."""
+
+READ = (".ply", ".compressed.ply", ".splat", ".spz", ".sog", ".ksplat")
+"""Endings of what is read. Only .splat is known by its ending, for it has no header."""
+_BY_START: dict[bytes, Reader] = {
+    b"ply": ply.read_ply,
+    spz.MAGIC: spz.read_spz,
+    spz.GZIP: spz.read_spz,
+    sog.MAGIC: sog.read_sog,
+    ksplat.MAGIC: ksplat.read_ksplat,
+}
+_KNOWN = {
+    glb.MAGIC: "glTF, which is only written",
+    b"<": "a page or another text of tags",
+    b"version https://git-lfs": "a pointer of Git LFS, which stands for the file (git lfs pull fetches it)",
+}
+
+
+def is_scene(path: str | os.PathLike) -> bool:
+    """Whether a file has the ending of one that `read_gaussians` reads.
+
+    Args:
+        path: the file.
+    """
+    return os.fspath(path).lower().endswith(READ)
+
+
+def read_gaussians(path: str | os.PathLike) -> tuple[Gaussians, SceneReport]:
+    """The Gaussians of a file, float32, and what else it held. The format is told by the content.
+
+    Gaussians that cannot be rendered (with a NaN, an infinity or a zero quaternion) are culled and counted.
+
+    Args:
+        path: a PLY of 3DGS or PlayCanvas's compressed one, .splat, .spz, .sog (or its meta.json), .ksplat.
+
+    Raises:
+        FileNotFoundError: there is no file at `path`.
+        SceneError: it is none of these, cut off, damaged, or says that it is far larger than it can be.
+    """
+    path = Path(path)
+    if not path.is_file():
+        found = "a folder" if path.is_dir() else "no file"
+        raise FileNotFoundError(f"{path}: expected a file of Gaussians, found {found}. Check the path")
+    with path.open("rb") as stream:
+        start = stream.read(24)
+    for magic, read in _BY_START.items():
+        if start.startswith(magic):
+            return read(path)
+    if path.name == "meta.json":
+        return sog.read_sog(path)
+    if path.suffix.lower() == ".splat" and start:
+        return splat.read_splat(path)
+    found = next((what for magic, what in _KNOWN.items() if start.startswith(magic)), None)
+    found = found or (f"one that starts with {start[:8]!r}" if start else "an empty one")
+    raise SceneError(path, f"a file of Gaussians ({', '.join(READ)})", found, "Export the scene as .ply")
+
+
+def write_gaussians(
+    path: str | os.PathLike,
+    gaussians: Gaussians,
+    *,
+    antialiased: bool = False,
+    up: Sequence[float] | None = None,
+    background: Sequence[float] | None = None,
+) -> tuple[str, ...]:
+    """Write Gaussians in the format that the ending of `path` names, atomically.
+
+    Features are not written, nor Gaussians that cannot be drawn.
+
+    Args:
+        path: a .ply, .compressed.ply, .splat, .spz, .sog, .glb, or .html, a page that shows the scene.
+        gaussians: the scene, on the host or a device.
+        antialiased: whether it was fitted with antialiasing, which .spz, .sog and a page say.
+        up: of a page alone: the direction that points up; default: -y, as in most PLY files.
+        background: of a page alone: RGB, 0 to 1; default: black.
+
+    Returns:
+        What was left out, each in a few words.
+
+    Raises:
+        ValueError: no format has that ending, none of the Gaussians can be drawn, the format has no room for
+            them, or an option is given that it does not take.
+    """
+    written = format_of(path)
+    drawn, culled = cull_invalid(gaussians)
+    if drawn.num == 0:
+        raise ValueError(f"{path}: expected Gaussians that can be drawn, found none of {gaussians.num}")
+    left_out = [f"what cannot be drawn, {culled} of {gaussians.num} Gaussians"] if culled else []
+    if drawn.sh_degree > written.degree:
+        left_out.append("view-dependent colour")
+        drawn = _without(drawn, "shN")
+    if drawn.features is not None:
+        left_out.append("features")
+        drawn = _without(drawn, "features")
+    asked = {"antialiased": antialiased or None, "up": up, "background": background}
+    options = {name: value for name, value in asked.items() if value is not None}
+    for name in options.keys() - set(written.options):
+        if name != "antialiased":
+            raise ValueError(
+                f"{name}: expected a page (.html), which alone has it, found {path}; leave it out"
+            )
+        left_out.append("that the scene is antialiased")
+        del options[name]
+    written.write(Path(path), drawn, **options)
+    return tuple(left_out)
+
+
+def format_of(path: str | os.PathLike) -> Format:
+    """The format that `write_gaussians` writes.
+
+    Args:
+        path: the file.
+
+    Raises:
+        ValueError: no format has that ending.
+    """
+    name = os.fspath(path).lower()
+    for ending, written in FORMATS.items():
+        if name.endswith(ending):
+            return written
+    found = ".ksplat, which is only read" if name.endswith(".ksplat") else repr(Path(path).suffix)
+    raise ValueError(f"{path}: expected one of the endings {', '.join(FORMATS)}, found {found}")
+
+
+def _without(gaussians: Gaussians, field: str) -> Gaussians:
+    return eqx.tree_at(lambda g: getattr(g, field), gaussians, None)

@@ -1,0 +1,103 @@
+"""`gsjax export`: runs and files in every format, what it says, and what it refuses."""
+
+import numpy as np
+import pytest
+
+from gsjax.cli import main
+from gsjax.io.scenes import FORMATS, read_gaussians
+from tests.cli.view.conftest import some
+from tests.io.scenes_to_write import ROUNDING, assert_alike
+
+
+@pytest.fixture
+def export(capfd):
+    """Runs the command; returns the exit code and what was said, spaces as one."""
+
+    def call(*arguments) -> tuple[int, str]:
+        capfd.readouterr()
+        code = main(["export", *map(str, arguments)])
+        said = "".join(capfd.readouterr())
+        assert "Traceback" not in said
+        return code, " ".join(said.split())
+
+    return call
+
+
+@pytest.mark.parametrize("ending", FORMATS)
+def test_a_file_in_every_format(export, ply, ending):
+    out = ply.parent / "made" / f"scene{ending}"
+    code, said = export(ply, out)
+    assert code == 0
+    assert f"scene {out}: 30 Gaussians, {FORMATS[ending].name}, " in said
+    if ending in ROUNDING:
+        assert_alike(some(), read_gaussians(out)[0], ROUNDING[ending])
+    assert [file.name for file in out.parent.iterdir()] == [out.name]
+
+
+def test_a_fit_keeps_its_antialiasing(export, fitted, tmp_path):
+    code, said = export(fitted, tmp_path / "scene.spz")
+    assert code == 0
+    assert "leaves out" not in said
+    assert read_gaussians(tmp_path / "scene.spz")[1].antialiased
+    code, said = export(fitted, tmp_path / "scene.splat")
+    assert "the scene is antialiased" in said
+
+
+def test_a_tracked_scene_is_its_first_frame(export, tracked, tmp_path):
+    code, said = export(tracked, tmp_path / "scene.sog")
+    assert code == 0
+    assert "moves; only its first of 4 frames is written" in said
+    assert_alike(some(), read_gaussians(tmp_path / "scene.sog")[0], ROUNDING[".sog"])
+
+
+def test_a_page_of_a_run_has_the_up_of_its_photographs(export, fitted, ply, tmp_path):
+    for source, option, up in (
+        (ply, (), "[0.0, -1.0, 0.0]"),
+        (ply, ("--up=z",), "[0.0, 0.0, 1.0]"),
+    ):
+        code, _ = export(source, tmp_path / "scene.html", *option, "--overwrite")
+        assert code == 0
+        assert f'"up": {up}' in (tmp_path / "scene.html").read_text()
+    assert export(fitted, tmp_path / "fit.html")[0] == 0
+    assert '"antialiased": true' in (tmp_path / "fit.html").read_text()
+
+
+def test_what_is_read_in_one_format_is_written_in_another(export, ply, tmp_path):
+    for ending in (".splat", ".compressed.ply", ".spz", ".sog", ".ply"):
+        before, ply = ply, tmp_path / f"next{ending}"
+        assert export(before, ply)[0] == 0
+    np.testing.assert_allclose(
+        np.sort(read_gaussians(ply)[0].means, axis=0), np.sort(some().means, axis=0), atol=0.02
+    )
+
+
+def test_what_is_refused(export, ply, tmp_path):
+    out = tmp_path / "scene.spz"
+    for arguments, says in (
+        ((ply, tmp_path / "a.obj"), "a.obj: expected one of the endings .compressed.ply, .ply, .splat, .spz"),
+        ((ply, tmp_path / "a.ksplat"), "found .ksplat, which is only read"),
+        ((ply, ply), "things.ply: expected another file than the one that is read"),
+        (
+            (tmp_path / "none.ply", out),
+            "none.ply: expected a run or a file of Gaussians, found nothing there",
+        ),
+        ((ply, out, "--up=z"), "--up: expected OUT to be a page (.html), found"),
+    ):
+        code, said = export(*arguments)
+        assert (code, says in said) == (2, True), said
+    assert not out.exists()
+    (tmp_path / "folder.spz").mkdir()
+    code, said = export(ply, tmp_path / "folder.spz")
+    assert code == 2
+    assert "expected a file, found a folder" in said
+
+
+def test_nothing_is_replaced_unasked(export, ply, tmp_path):
+    out = tmp_path / "scene.spz"
+    out.write_bytes(b"mine")
+    code, said = export(ply, out)
+    assert code == 2
+    assert "is there already; name another OUT, or replace it with --overwrite" in said
+    assert out.read_bytes() == b"mine"
+    assert export(ply, out, "--overwrite")[0] == 0
+    assert read_gaussians(out)[0].num == 30
