@@ -21,6 +21,7 @@ from gsjax.engine.messages import Notes
 from gsjax.engine.options import Common, OneDataset, Reading
 from gsjax.engine.summary import Column, Table
 from gsjax.engine.terminal import print_facts, print_table
+from gsjax.io.scenes import is_scene
 from gsjax.methods.fit import extent_of
 from gsjax.scene.origin import in_world
 
@@ -46,7 +47,7 @@ def run(options: Options) -> int:
         raise ValueError(
             f"--picture: expected a name that ends in {', '.join(PICTURES)}, found {options.picture.name!r}"
         )
-    if (file := Path(options.dataset)).suffix.lower() == ".ply" and file.is_file():
+    if (file := Path(options.dataset)).is_file() and is_scene(file):
         if options.picture is not None:
             raise ValueError(f"--picture: draws cameras, and {file} has none; leave it out")
         with Notes(Console(stderr=True, highlight=False)):

@@ -1,20 +1,20 @@
-"""What a PLY file of Gaussians holds, as `gsjax info` prints it."""
+"""What a file of Gaussians holds, as `gsjax info` prints it."""
 
 from pathlib import Path
 
 import numpy as np
 
-from gsjax.io.ply import read_ply
+from gsjax.io.scenes import read_gaussians
 from gsjax.scene.origin import in_world
 
 
 def describe_scene(file: Path) -> dict[str, str]:
-    """Facts about the Gaussians of a PLY file; what cannot be drawn is warned of.
+    """Facts about the Gaussians of a file; what cannot be drawn is warned of.
 
     Raises:
-        PlyError: it holds no Gaussians.
+        SceneError: it holds no Gaussians.
     """
-    gaussians, report = read_ply(file)
+    gaussians, report = read_gaussians(file)
     facts = {"Gaussians": f"{gaussians.num:,}"}
     if report.stored != gaussians.num:
         facts["Gaussians"] += f" of {report.stored:,}"
@@ -27,7 +27,8 @@ def describe_scene(file: Path) -> dict[str, str]:
         facts["opacities"] = "{:.2f} to {:.2f}".format(*np.percentile(gaussians.opacities, [1, 99]))
     if report.origin is not None:
         facts["origin"] = f"({', '.join(f'{value:.12g}' for value in report.origin)})"
-    facts["drawn"] = "antialiased" if report.antialiased else "classic"
+    if report.antialiased is not None:
+        facts["drawn"] = "antialiased" if report.antialiased else "classic"
     if report.labels is not None:
         facts["labels"] = ", ".join(map(str, np.unique(report.labels)[:8])) or "none"
     if report.extra:

@@ -38,7 +38,7 @@ class Format:
 
 FORMATS = {
     ".compressed.ply": Format("PlayCanvas's compressed PLY", write_compressed_ply),
-    ".ply": Format("PLY of 3DGS", ply.write_ply),
+    ".ply": Format("PLY of 3DGS", ply.write_ply, options=("antialiased",)),
     ".splat": Format(".splat", splat.write_splat, degree=0),
     ".spz": Format("SPZ", spz.write_spz, options=("antialiased",)),
     ".sog": Format("SOG", sog.write_sog, options=("antialiased",)),
@@ -75,7 +75,7 @@ def is_scene(path: str | os.PathLike) -> bool:
 def read_gaussians(path: str | os.PathLike) -> tuple[Gaussians, SceneReport]:
     """The Gaussians of a file, float32, and what else it held. The format is told by the content.
 
-    Gaussians that cannot be rendered (with a NaN, an infinity or a zero quaternion) are culled and counted.
+    Gaussians that cannot be drawn (with a NaN or a zero quaternion) are left out and counted, with a warning.
 
     Args:
         path: a PLY of 3DGS or PlayCanvas's compressed one, .splat, .spz, .sog (or its meta.json), .ksplat.
@@ -117,7 +117,7 @@ def write_gaussians(
     Args:
         path: a .ply, .compressed.ply, .splat, .spz, .sog, .glb, or .html, a page that shows the scene.
         gaussians: the scene, on the host or a device.
-        antialiased: whether it was fitted with antialiasing, which .spz, .sog and a page say.
+        antialiased: whether it is to be drawn antialiased, which .ply, .spz, .sog and a page say.
         up: of a page alone: the direction that points up; default: -y, as in most PLY files.
         background: of a page alone: RGB, 0 to 1; default: black.
 
