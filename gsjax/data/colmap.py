@@ -184,8 +184,8 @@ def _largest(root: Path, models: list[Model]) -> Model:
         if i != best
     )
     read = f"{_name(root, models[best])} with {counts[best]} photographs is read"
-    message = f"{root}: of {len(models)} reconstructions, {read} and {others} left out"
-    warnings.warn(f"{message}; set model (--read.model) to read another", DataWarning, stacklevel=3)
+    message = f"{root}: of {len(models)} reconstructions, {read}; left out: {others}"
+    warnings.warn(f"{message}. Set model (--read.model) to read another", DataWarning, stacklevel=3)
     return models[best]
 
 

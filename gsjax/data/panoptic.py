@@ -180,7 +180,7 @@ def _read_metas(root: Path) -> dict[str, Any]:
 def _read_meta(path: Path) -> dict[str, Any]:
     try:
         return _checked(path, read_json(path))
-    except (TypeError, KeyError, OverflowError) as error:  # a number where a list belongs, and the like
+    except (AttributeError, TypeError, KeyError, OverflowError) as error:  # a number for a list, and the like
         found = f"something else ({error})"
         raise DataError(path, "the lists and numbers of this layout", found, _ADVICE_META) from None
 

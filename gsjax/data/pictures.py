@@ -7,7 +7,7 @@ from pathlib import Path
 
 from gsjax.data.errors import DataError, DataWarning
 
-SUFFIXES = (".png", ".jpg", ".jpeg", ".jpe", ".jfif", ".tif", ".tiff", ".bmp", ".webp", ".avif")
+SUFFIXES = (".png", ".jpg", ".jpeg", ".jpe", ".jfif", ".mpo", ".tif", ".tiff", ".bmp", ".webp", ".avif")
 """File extensions of the pictures that all readers and commands take, in lower case."""
 
 _CONVERT = (

@@ -1,6 +1,7 @@
 """Photographs in every layout, and their faults."""
 
 import json
+import shutil
 import struct
 from pathlib import Path
 
@@ -31,6 +32,8 @@ from tests.data.faulty import (
     picture,
     swap,
 )
+
+HEIC = b"\0\0\0\x18ftypheic" + bytes(99)
 
 # nerfstudio, instant-ngp and Blender.
 
@@ -74,6 +77,7 @@ TRANSFORMS = (
     Fault("photograph missing", gone("images/1.png"), ("images/1.png",)),
     Fault("all photographs missing", gone(*(f"images/{i}.png" for i in range(3))), ("images/0.png",)),
     Fault("image cut off", cut("images/1.png"), ("images/1.png",)),
+    Fault("HEIC", holds("images/1.png", HEIC), ("images/1.png",)),
     Fault("not an image", holds("images/1.png", "text"), ("images/1.png",)),
     Fault("wrong shape of a photograph", drawn("images/1.png", picture(1, 24, 32)), ("frame 1",)),
     Fault("depth image missing", gone("depth/1.png"), ("depth/1.png",)),
@@ -155,6 +159,12 @@ COLMAP_TEXT = (
         swap(TEXT["cameras"], "PINHOLE 32 24", "FOV 32 24 30.0"),
         ("cameras.txt",),
     ),
+    Fault("points cut off", swap(TEXT["images"], "1 2 -1", "1 2"), ("images.txt, line 2",)),
+    Fault(
+        "two reconstructions",
+        lambda root: shutil.copytree(root / "sparse/0", root / "sparse/1"),
+        ("sparse/0", "sparse/1"),
+    ),
     Fault("NaN as focal length", swap(TEXT["cameras"], "30.0", "nan"), ("cameras.txt",)),
     Fault("NaN in a pose", swap(TEXT["images"], "1 1 0 0 0", "1 nan 0 0 0"), ("images.txt", "b.png")),
     Fault(
@@ -210,6 +220,11 @@ def mirror(rows: np.ndarray) -> np.ndarray:
     return rows
 
 
+def all_in_heic(root: Path) -> None:
+    for path in (root / "images").iterdir():
+        path.rename(path.with_suffix(".HEIC"))
+
+
 ROWS = (
     Fault("cut off", cut("poses_bounds.npy"), ("poses_bounds.npy",)),
     Fault("not an array", holds("poses_bounds.npy", "1 2 3\n"), ("poses_bounds.npy",)),
@@ -226,6 +241,8 @@ LLFF = (
     *ROWS,
     Fault("photograph missing", gone("images/b.png"), ("poses_bounds.npy", "DATA/images")),
     Fault("image cut off", cut("images/b.png"), ("images/b.png",)),
+    Fault("another one in HEIC", holds("images/d.HEIC", HEIC), ("images", "d.HEIC")),
+    Fault("all in HEIC", all_in_heic, ("images", "a.HEIC")),
 )
 DYNERF = (
     Fault("cut off", cut("poses_bounds.npy"), ("poses_bounds.npy",)),

@@ -68,10 +68,9 @@ def test_of_several_reconstructions_the_one_with_the_most_photographs_is_read(tm
         build(tmp_path, form, place=f"{place}/{number}")
     with_photographs(tmp_path / place / "0", 1)
     with_photographs(tmp_path / place / "2", 2)
-    said = (
-        rf"of 3 reconstructions, {place}/10 with 3 photographs is read and {place}/0 \(1\), {place}/2 \(2\)"
-    )
-    with pytest.warns(DataWarning, match=rf"{said} left out; set model \(--read.model\) to read another"):
+    read = rf"of 3 reconstructions, {place}/10 with 3 photographs is read"
+    said = rf"{read}; left out: {place}/0 \(1\), {place}/2 \(2\)"
+    with pytest.warns(DataWarning, match=rf"{said}. Set model \(--read.model\) to read another"):
         assert open_photographs(tmp_path).num == 3
     for model in (f"{place}/2", *(["2"] if place == "sparse" else [])):
         assert open_photographs(tmp_path, ReadOptions(model=model)).num == 2
@@ -87,7 +86,7 @@ def test_equal_and_unreadable_reconstructions(tmp_path):
         build(tmp_path, place=place)
     (tmp_path / "sparse/0/images.bin").write_bytes(b"\1")
     with pytest.warns(
-        DataWarning, match=r"sparse/1 with 3 .* and sparse/0 \(unreadable\), sparse \(3\) left out"
+        DataWarning, match=r"sparse/1 with 3 .*; left out: sparse/0 \(unreadable\), sparse \(3\)\. Set"
     ):
         assert read_colmap(tmp_path).num == 3
 

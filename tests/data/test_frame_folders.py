@@ -23,9 +23,11 @@ def save(folder, *names, size=(8, 6)):
 
 def test_pictures_come_in_order_of_name_and_nothing_else_does(tmp_path):
     save(tmp_path, "b.png", "a.jpg", "c.jpeg", ".thumb.png")
+    for name in ("d.MPO", "e.JFIF"):
+        (tmp_path / name).write_bytes((tmp_path / "a.jpg").read_bytes() * 2)
     (tmp_path / "notes.txt").write_text("")
     (tmp_path / "more.png").mkdir()
-    assert [path.name for path in pictures(tmp_path)] == ["a.jpg", "b.png", "c.jpeg"]
+    assert [path.name for path in pictures(tmp_path)] == ["a.jpg", "b.png", "c.jpeg", "d.MPO", "e.JFIF"]
     assert pictures(tmp_path / "nowhere") == []
 
 
