@@ -290,7 +290,7 @@ def replaced_folder(path: Path, written: Sequence[str]) -> Iterator[Path]:
         BlockingIOError: another process does.
     """
     path = expect_ours(path, written)
-    with locked(path.parent, shared=True), locked(path.parent, f".{path.name}.lock"):
+    with locked(path.parent, shared=True), locked(path.parent, path.name):
         yield from _replaced(path)
 
 

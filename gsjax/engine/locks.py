@@ -1,8 +1,8 @@
 """One writer at a time in a folder.
 
-A writer locks a file in the folder, RUN/.lock, with `flock`. The system releases the lock when the process
-ends, however it ends: a run that was killed is free for the next writer, and nobody is misled by a process
-number that is used again. Network file systems with locks (NFS 4, SMB, Lustre mounted with `flock`) share
+A writer locks a file in the folder, RUN/.gsjax.lock, with `flock`. The system releases the lock when the
+process ends, however it ends: a run that was killed is free for the next writer, and nobody is misled by a
+process number that is used again. Network file systems with locks (NFS 4, SMB, Lustre mounted with `flock`) share
 them between machines. Where a file system has none, the writers that the file lists decide: those of this
 machine as long as their processes live, and those of other machines until the file is removed.
 
@@ -27,7 +27,7 @@ try:
 except ImportError:  # Windows: the list of writers decides
     fcntl = None
 
-LOCK = ".lock"
+LOCK = ".gsjax.lock"
 """The file of a folder's lock: there while somebody writes into the folder, and after a writer was killed."""
 _NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP, errno.EINVAL)
 _ATTEMPTS, _BETWEEN_S = 5, 0.1
@@ -104,12 +104,12 @@ def lock(folder: Path, *, shared: bool = False) -> None:
 
 
 @contextmanager
-def locked(folder: Path, name: str = LOCK, *, shared: bool = False) -> Iterator[None]:
+def locked(folder: Path, part: str = "", *, shared: bool = False) -> Iterator[None]:
     """Lock a folder, or a part of it, while the block runs. A process may lock the same twice.
 
     Args:
         folder: the folder. It is made if it is not there, and removed again if it is still empty at the end.
-        name: name of the lock's file: that of the whole folder, or ".PART.lock".
+        part: the part of the folder (default: all of it). The lock of a part is one of its own.
         shared: whether other processes may share the lock. Then a folder without write access is no error,
             and is not locked.
 
@@ -120,7 +120,7 @@ def locked(folder: Path, name: str = LOCK, *, shared: bool = False) -> Iterator[
     """
     if folder.exists() and not folder.is_dir():
         raise NotADirectoryError(f"{folder}: expected a folder, found a file; name another folder")
-    path = folder.resolve() / name
+    path = folder.resolve() / (f".{part}{LOCK}" if part else LOCK)
     held = _held.get(path)
     if held is None:
         held = _taken(folder, path, shared)

@@ -37,7 +37,7 @@ def run_here(
     """
     for cell in cells:
         say(str(cell))
-        with locked(experiment.cells_folder, f".{cell.id}.lock"):  # others may run other cells
+        with locked(experiment.cells_folder, cell.id):  # others may run other cells
             record = run_cell(experiment, cell, script_run, experiment.cells_folder, debug)
         yield cell, record
 

@@ -20,8 +20,8 @@ def written():
     """Starts a process that locks a folder, or a part of it, until it is killed or its stdin is closed."""
     started = []
 
-    def start(folder, name: str = ".lock", *, shared: bool = False) -> subprocess.Popen:
-        command = [sys.executable, "-c", WRITES, str(folder), name, str(shared)]
+    def start(folder, part: str = "", *, shared: bool = False) -> subprocess.Popen:
+        command = [sys.executable, "-c", WRITES, str(folder), part, str(shared)]
         started.append(subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True))
         assert started[-1].stdout.readline() == "locked\n"
         return started[-1]

@@ -69,9 +69,9 @@ def test_some_share_what_another_must_not_replace(tmp_path, written):
 
 def test_parts_of_a_folder_are_locked_apart(tmp_path, written):
     written(tmp_path)
-    with locked(tmp_path, ".query.lock"):
-        assert (tmp_path / ".query.lock").exists()
-    assert not (tmp_path / ".query.lock").exists()
+    with locked(tmp_path, "query"):
+        assert (tmp_path / f".query{LOCK}").exists()
+    assert not (tmp_path / f".query{LOCK}").exists()
 
 
 def test_a_process_may_lock_what_it_has_locked(tmp_path):

@@ -30,7 +30,7 @@ def test_a_second_run_is_refused(command, how, gsjax, photographs, pristine, tmp
     code, said = gsjax(command, photographs if command == "fit" else pristine, "--out", folder, *how)
     assert code == 2
     assert f"run: expected a folder into which no other process writes, found process {number}, which" in said
-    assert sorted(path.name for path in folder.iterdir()) == [".lock", "config.yml", "scene.ply"]
+    assert sorted(path.name for path in folder.iterdir()) == [".gsjax.lock", "config.yml", "scene.ply"]
     assert (folder / "config.yml").read_text() == "# gsjax run\nseed: 3\n"
 
 
@@ -49,8 +49,8 @@ def test_so_is_whatever_else_writes_a_folder(command, gsjax, tmp_path, written):
 
 def test_what_is_made_from_a_run_keeps_out_its_like_and_who_would_replace_the_run(tmp_path, written):
     folder = tmp_path / "run" / "answer"
-    for name in (".lock", ".answer.lock"):
-        other = written(tmp_path / "run", name)
+    for part in ("", "answer"):
+        other = written(tmp_path / "run", part)
         with pytest.raises(BlockingIOError, match=f"process {other.pid}"), replaced_folder(folder, ("a",)):
             pass
         other.communicate("")
