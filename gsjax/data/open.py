@@ -167,7 +167,8 @@ def _read(
     for name in sorted(given & _ABOUT.keys()):
         what, has = _ABOUT[name]
         if not has(data):
-            raise ValueError(f"{path}: expected data with {what}, as {_flag(name)} is given, found none.")
+            expected = f"data with {what}, as {_flag(name)} is given"
+            raise ValueError(f"{path}: expected {expected}, found none. Leave it out.")
     return data
 
 
