@@ -13,7 +13,8 @@ from gsjax.scene.gaussians import Gaussians
 
 FAR = 1e3
 """A scene is far if its distance from the origin is this many times its size: float32 then rounds places to
-some 1e-4 of the scene, about a tenth of a pixel."""
+some 1e-4 of the scene, about a tenth of a pixel. (A fit of 200 steps that stayed there lost 0.01 dB at this
+distance, 0.05 dB at ten times it, and 6.7 dB in UTM.)"""
 _MOST = 0.9  # quantile of distances that is the size, so that a few stray points do not count
 
 

@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -9,8 +10,10 @@ import time
 from pathlib import Path
 
 import cv2
+import numpy as np
 import pytest
 import yaml
+from rich.console import Console
 
 import gsjax.engine.fit.ending
 import gsjax.engine.fit.judge
@@ -19,7 +22,9 @@ from gsjax.cli import main
 from gsjax.data.video import describe_video
 from gsjax.engine.fit.ablation import ablate_time
 from gsjax.engine.fit.schedule import Evaluation
+from gsjax.engine.messages import Notes
 from gsjax.engine.progress import Progress
+from gsjax.engine.viewables import open_viewable
 from gsjax.io.ply import read_ply
 from gsjax.methods.fit import PRESETS
 
@@ -319,3 +324,33 @@ def test_photographs_that_do_not_fit_into_memory_are_refused_before_anything_is_
     code, said = gsjax_fit(*QUICK, "--overwrite", "--fit.start.source", "depth")
     assert (code, "the data has no depth" in said) == (2, True)
     assert (old / "scene.ply").read_text() == "of before"
+
+
+def test_photographs_far_from_0_are_fitted_scored_and_shown_like_others(photographs, tmp_path, capfd):
+    shift, far = np.array([500_000.0, 5_000_000.0, 300.0]), tmp_path / "far"
+    shutil.copytree(photographs, far)
+    listed = json.loads((far / "transforms.json").read_text())
+    for frame in listed["frames"][:-1]:
+        pose = np.array(frame["transform_matrix"])
+        pose[:3, 3] += shift
+        frame["transform_matrix"] = pose.tolist()
+    (far / "transforms.json").write_text(json.dumps(listed))
+    run, options = tmp_path / "run", [*QUICK, "--fit.antialiased", "--fit.refine-poses"]
+    assert main(["fit", str(far), "--out", str(run), *options]) == 0
+    assert "coordinates reach 5e+06" in capfd.readouterr().err
+    with pytest.warns(UserWarning, match="relative to the origin"):
+        _, report = read_ply(run / "scene.ply")
+    assert report.antialiased
+    assert np.abs(np.median(report.places, axis=0) - shift).max() < 3
+    cameras = np.load(run / "cameras.npz")
+    centers = np.linalg.inv(cameras["viewmats"])[:, :3, 3]
+    assert np.abs(centers - shift).max() < 5
+    found = json.loads((run / "metrics.json").read_text())["test"]["psnr"]
+    assert main(["eval", str(run)]) == 0
+    again = json.loads((run / "eval" / "metrics.json").read_text())
+    assert again["mean"]["held out"]["psnr"] == pytest.approx(found, abs=0.01)
+    with Notes(Console(stderr=True)) as notes:
+        scene, _ = open_viewable(run, notes)
+    assert scene.shots is not None
+    assert np.abs(scene.shots.viewmats[..., :3, 3]).max() < 10
+    assert np.abs(np.median(scene.gaussians.means, axis=0)).max() < 5

@@ -10,6 +10,7 @@ import urllib.request
 from dataclasses import replace
 
 import cv2
+import equinox as eqx
 import numpy as np
 import pytest
 from plyfile import PlyData, PlyElement
@@ -270,3 +271,14 @@ def test_a_page_is_served_until_ctrl_c(ply):
     assert process.returncode == 130
     assert "Traceback" not in out + err
     assert "stopped: the page is no longer served" in err
+
+
+def test_a_file_with_a_mark_is_drawn_antialiased_and_its_bad_gaussians_are_counted(view, tmp_path, notes):
+    bad = eqx.tree_at(lambda g: g.means, some(), some().means.at[3, 1].set(np.nan))
+    write_ply(tmp_path / "marked.ply", bad, antialiased=True)
+    scene, _ = open_viewable(tmp_path / "marked.ply", notes)
+    assert scene.antialiased
+    assert scene.gaussians.num == 29
+    code, said = view(tmp_path / "marked.ply", "--port", 0)
+    assert code == 130
+    assert "1 of 30 Gaussians cannot be drawn (NaN, no rotation) and are left out" in said
