@@ -32,7 +32,9 @@ def far_origin(
         return None
     middle = np.median(finite[0], axis=0)
     sizes = [np.quantile(np.linalg.norm(each - middle, axis=1), _MOST) for each in finite if len(each)]
-    size = max(*sizes, NEAR)
+    size = max(sizes)
+    if size < NEAR:  # a camera that stands still says nothing of the size
+        size = 1.0
     if np.abs(middle).max() <= FAR * size:
         return None
     step = 10.0 ** np.floor(np.log10(size))
