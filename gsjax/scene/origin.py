@@ -8,13 +8,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from gsjax.geometry.cameras import NEAR
 from gsjax.scene.gaussians import Gaussians
 
 FAR = 1e3
 """A scene is far if its distance from the origin is this many times its size: float32 then rounds places to
 some 1e-4 of the scene, about a tenth of a pixel. (A fit of 200 steps that stayed there lost 0.01 dB at this
 distance, 0.05 dB at ten times it, and 6.7 dB in UTM.)"""
+_STILL = 1e-9  # relative; places closer together are one
 _MOST = 0.9  # quantile of distances that is the size, so that a few stray points do not count
 
 
@@ -33,7 +33,7 @@ def far_origin(
     middle = np.median(finite[0], axis=0)
     sizes = [np.quantile(np.linalg.norm(each - middle, axis=1), _MOST) for each in finite if len(each)]
     size = max(sizes)
-    if size < NEAR:  # a camera that stands still says nothing of the size
+    if size <= _STILL * np.abs(middle).max():  # a camera that stands still says nothing of the size
         size = 1.0
     if np.abs(middle).max() <= FAR * size:
         return None
