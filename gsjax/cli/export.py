@@ -58,7 +58,7 @@ def run(options: Options) -> int:
         with stage(console, f"writing {options.out}"):
             left_out = write_gaussians(options.out, scene.gaussians, antialiased=scene.antialiased, **look)
         for what in left_out:
-            notes.warn(f"{written.name} has no room for {what}, which {options.out} therefore lacks")
+            notes.warn(f"{options.out}: {written.name} leaves out {what}")
     size = options.out.stat().st_size
     text = f"{scene.gaussians.num:,} Gaussians, {written.name}, {_megabytes(size)}"
     Console(highlight=False).print(f"[bold]scene[/]  {options.out}: {text}", soft_wrap=True)

@@ -3,7 +3,7 @@
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
-_ROUNDS = 12
+_SIZE, _ROUNDS = 256, 8
 
 
 def codebook(values: Float[np.ndarray, "..."]) -> Float[np.ndarray, "256"]:
@@ -13,12 +13,9 @@ def codebook(values: Float[np.ndarray, "..."]) -> Float[np.ndarray, "256"]:
         values: at least one finite number.
     """
     ordered = np.sort(values, axis=None)
-    unique = np.unique(ordered)
-    if len(unique) <= 256:
-        return np.concatenate([unique, np.full(256 - len(unique), unique[-1])])
-    # Halfway between equal shares of the values and equal steps: tails are rare, but seen.
-    share = np.linspace(0, 1, 256)
-    book = (np.quantile(ordered, share) + (ordered[0] + share * (ordered[-1] - ordered[0]))) / 2
+    book = np.sort(palette(ordered[:, None], _SIZE)[0][:, 0])
+    if len(book) < _SIZE or len(ordered) == _SIZE:
+        return np.concatenate([book, np.full(_SIZE - len(book), book[-1])])
     sums = np.concatenate([[0.0], np.cumsum(ordered - ordered[0])])
     for _ in range(_ROUNDS):
         ends = np.searchsorted(ordered, (book[1:] + book[:-1]) / 2)
@@ -57,7 +54,9 @@ def palette(
     while count < most:
         means, squares, _ = _moments(rows, labels, count)
         errors = squares.sum(axis=1)
-        chosen = np.argsort(-errors, kind="stable")[: most - count]
+        # At least half of them, so that there are few rounds.
+        split = max(int(np.sum(errors > 0.5 * errors.mean())), (count + 1) // 2)
+        chosen = np.argsort(-errors, kind="stable")[: min(split, most - count)]
         chosen = chosen[errors[chosen] > 0]
         if not chosen.size:
             break

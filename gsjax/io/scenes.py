@@ -132,7 +132,7 @@ def write_gaussians(
     drawn, culled = cull_invalid(gaussians)
     if drawn.num == 0:
         raise ValueError(f"{path}: expected Gaussians that can be drawn, found none of {gaussians.num}")
-    left_out = [f"{culled} Gaussians that cannot be drawn"] if culled else []
+    left_out = [f"what cannot be drawn, {culled} of {gaussians.num} Gaussians"] if culled else []
     if drawn.sh_degree > written.degree:
         left_out.append("view-dependent colour")
         drawn = _without(drawn, "shN")
@@ -144,7 +144,7 @@ def write_gaussians(
     for name in options.keys() - set(written.options):
         if name != "antialiased":
             raise ValueError(
-                f"{name}: expected a page (.html), which alone takes it, found {path}; leave it out"
+                f"{name}: expected a page (.html), which alone has it, found {path}; leave it out"
             )
         left_out.append("that the scene is antialiased")
         del options[name]

@@ -15,6 +15,7 @@ developer.playcanvas.com, read-sog.ts and write-sog.ts in github.com/playcanvas/
 
 import io
 import json
+import warnings
 import zipfile
 import zlib
 from collections.abc import Callable
@@ -171,9 +172,11 @@ def _picture(path: Path, name: str, data: bytes) -> UInt8[np.ndarray, "H W 4"]:
     from PIL import Image, UnidentifiedImageError
 
     try:
-        with Image.open(io.BytesIO(data), formats=("WEBP", "PNG")) as picture:
-            expect_room(path, 4 * picture.width * picture.height, len(data), name)
-            return np.asarray(picture.convert("RGBA"))
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # the size is checked here
+            picture = Image.open(io.BytesIO(data), formats=("WEBP", "PNG"))
+        expect_room(path, 4 * picture.width * picture.height, len(data), name)
+        return np.asarray(picture.convert("RGBA"))
     except (UnidentifiedImageError, OSError, ValueError, Image.DecompressionBombError) as error:
         if isinstance(error, SceneError):
             raise

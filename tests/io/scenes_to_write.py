@@ -30,8 +30,8 @@ def make_scene(count: int = 300, degree: int = 0, seed: int = 0) -> Gaussians:
 
 @dataclass(frozen=True)
 class Rounding:
-    """The largest differences that a format may make: centres in units, rotations as 1 - |q1 . q2|, the others
-    as they are; colours and opacities of 0 to 1."""
+    """The largest differences that a format may make: centres in units, rotations as 1 - |q1 . q2|, the
+    others as they are; colours and opacities of 0 to 1."""
 
     means: float = 1e-6
     turn: float = 1e-6
@@ -49,7 +49,7 @@ ROUNDING = {
     ".compressed.ply": Rounding(8 / 1023, 4e-6, 9 / 1023, BYTE, BYTE, 0.016),
     ".splat": Rounding(turn=2e-4, log_scales=1e-6, opacities=BYTE, colors=BYTE, degree=0),
     ".spz": Rounding(2**-16, 5e-6, 0.0313, BYTE, 0.283 / 0.15 * BYTE, 8.6 / 128),
-    ".sog": Rounding(1.2e-4, 6e-5, 0.04, BYTE, 0.01, 0.02),
+    ".sog": Rounding(1.6e-4, 6e-5, 0.04, BYTE, 0.01, 0.02),
 }
 """By ending."""
 

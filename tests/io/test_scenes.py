@@ -7,6 +7,9 @@ import json
 import struct
 import tracemalloc
 import zipfile
+from itertools import pairwise
+from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -29,7 +32,7 @@ READ_BACK = sorted(ROUNDING)
 
 def flat(scene):
     """The scene without view-dependent colour."""
-    return eqx.tree_at(lambda g: g.shN, scene, None)
+    return eqx.tree_at(lambda g: g.shN, scene, None, is_leaf=lambda leaf: leaf is None)
 
 
 @pytest.mark.parametrize("degree", range(4))
@@ -71,7 +74,7 @@ def test_what_cannot_be_drawn_and_features_are_left_out_and_named(tmp_path, endi
     scene = eqx.tree_at(lambda g: g.means, scene, scene.means.at[2, 1].set(np.nan))
     scene = eqx.tree_at(lambda g: g.features, scene, jnp.ones((5, 2)), is_leaf=lambda leaf: leaf is None)
     left_out = write_gaussians(tmp_path / f"scene{ending}", scene)
-    assert left_out == ("1 Gaussians that cannot be drawn", "features")
+    assert left_out == ("what cannot be drawn, 1 of 5 Gaussians", "features")
     back, report = read_gaussians(tmp_path / f"scene{ending}")
     assert (back.num, report.stored, back.features) == (4, 4, None)
 
@@ -110,7 +113,8 @@ def test_extremes_are_clipped_not_wrapped(tmp_path):
         np.testing.assert_allclose(found.log_scales[rows][:2, 0], (low, high), atol=0.1, err_msg=ending)
         np.testing.assert_allclose(found.opacities[rows][:2], (0, 1), atol=1e-5)
         colors = found.colors[rows]
-        assert (colors[0] < 0.01).all() and (colors[1] > 0.99).all(), ending
+        assert colors[0].max() < 0.01, ending
+        assert colors[1].min() > 0.99, ending
         if rest:
             assert np.abs(np.abs(found.rest[rows][:2]) - rest).max() < 0.02 * rest, ending
 
@@ -149,7 +153,7 @@ def spz4(scene, path, change=None):
     degree, bits = body[12], body[13]
     sizes = [scene.num * width for width in (9, 1, 3, 3, 4, 3 * (degree * (degree + 2)))]
     starts = 16 + np.concatenate([[0], np.cumsum(sizes)])
-    arrays = [body[a:b] for a, b in zip(starts[:-1], starts[1:], strict=True) if b > a]
+    arrays = [body[a:b] for a, b in pairwise(starts) if b > a]
     frames = [zstandard.ZstdCompressor().compress(array) for array in arrays]
     pairs = [[len(frame), len(array)] for frame, array in zip(frames, arrays, strict=True)]
     if change:
@@ -291,7 +295,7 @@ def test_endings_that_are_not_written(tmp_path, name):
 def test_endings(tmp_path):
     assert format_of("A.COMPRESSED.PLY") is FORMATS[".compressed.ply"]
     assert format_of("a.ply") is FORMATS[".ply"]
-    assert is_scene("x/Y.SPZ") and is_scene("a.ply") and not is_scene("a.html")
+    assert [is_scene(name) for name in ("x/Y.SPZ", "a.ply", "a.html")] == [True, True, False]
 
 
 def test_nothing_to_write(tmp_path):
@@ -340,7 +344,7 @@ def test_files_that_are_cut_off(tmp_path, ending, share):
         ("a.ksplat", b"\xff\xd8\xff\xe0", r"one that starts with b'\xff\xd8\xff\xe0'"),
         ("a.splat", b"", "an empty one"),
         ("a.bin", bytes(64), r"one that starts with b'\x00\x00"),
-        ("a.splat", b"once upon a time there was a scene that somebody had called a .spl" * 32, "with other values"),
+        ("a.splat", b"once upon a time there was a scene" * 32, "with other values"),
         ("a.splat", np.random.default_rng(0).bytes(3200), "with other values"),
         ("a.splat", bytes(33), "found 33 bytes"),
         ("a.spz", spz(1, 1, arrays=bytes(50)), "found version 1"),
@@ -353,8 +357,8 @@ def test_files_that_are_cut_off(tmp_path, ending, share):
         ("a.ply", b"ply\nformat binary_little_endian 1.0\nelement vertex 1099511627776\n"
          b"property float x\nend_header\n", "one that cannot be parsed"),
         ("a.ksplat", b"\0\1\0\0" + struct.pack("<I", 1 << 31) + bytes(4096), "2147483648 sections"),
-        ("a.ksplat", b"\0\1\0\0" + struct.pack("<IIII", 1, 1, 1, 1) + bytes(4076) + struct.pack("<II", 1, 1 << 31)
-         + bytes(1016), "section 0 with all its data"),
+        ("a.ksplat", b"\0\1\0\0" + struct.pack("<IIII", 1, 1, 1, 1) + bytes(4076)
+         + struct.pack("<II", 1, 1 << 31) + bytes(1016), "section 0 with all its data"),
     ],
 )  # fmt: skip
 def test_files_of_another_kind(tmp_path, name, data, says):
@@ -373,9 +377,6 @@ def test_an_spz_with_a_flipped_bit_is_found_by_its_checksum(tmp_path):
 def sog(change_meta=None, pictures=(), extra=()):
     """The bytes of a SOG of 100 Gaussians, changed."""
     stream = io.BytesIO()
-    from pathlib import Path
-    from tempfile import TemporaryDirectory
-
     with TemporaryDirectory() as folder:
         write_gaussians(Path(folder) / "a.sog", make_scene(100, 1))
         with zipfile.ZipFile(Path(folder) / "a.sog") as source:
@@ -408,7 +409,7 @@ def picture(width, height, kind="PNG"):
         (lambda m: m["means"].update(files=["../../etc/passwd", "b"]), "names of files without a folder"),
         (lambda m: m["means"].update(files=["/etc/passwd", "b"]), "names of files without a folder"),
         (lambda m: m["means"].update(files=["..\\a", "b"]), "names of files without a folder"),
-        (lambda m: m["means"].update(files=["none.webp", "b"]), "expected none.webp in it, found means_l.webp"),
+        (lambda m: m["means"].update(files=["no.webp", "b"]), "expected no.webp in it, found means_l.webp"),
         (lambda m: m["means"].update(files=["meta.json", "means_u.webp"]), "picture as meta.json"),
         (lambda m: m["means"].update(mins=[0, None, 0]), "3 finite numbers as means.mins"),
         (lambda m: m["scales"].update(codebook=[1, 2]), "256 finite numbers as scales.codebook"),
