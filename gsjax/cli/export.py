@@ -53,7 +53,7 @@ def run(options: Options) -> int:
         look: dict[str, Any] = {}
         if "up" in written.options:
             known = scene_up(scene) if options.path.is_dir() else UP["-y"]
-            look["up"] = known if options.up == "auto" else UP[options.up]
+            look["up"] = (known if options.up == "auto" else UP[options.up]).tolist()
             look["background"] = scene.background
         with stage(console, f"writing {options.out}"):
             left_out = write_gaussians(options.out, scene.gaussians, antialiased=scene.antialiased, **look)

@@ -6,7 +6,7 @@ from jaxtyping import Float, Int, UInt8
 _SIZE, _ROUNDS = 256, 8
 
 
-def codebook(values: Float[np.ndarray, "..."]) -> Float[np.ndarray, "256"]:
+def codebook(values: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "256"]:
     """256 ascending numbers near to which all values are (Lloyd's algorithm).
 
     Args:

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, UInt8
 
 from gsjax.scene.gaussians import SH_SIZES, Gaussians, take, valid_rows
 
@@ -162,6 +162,6 @@ def spatial_order(means: Float[np.ndarray, "N 3"]) -> Int[np.ndarray, "N"]:
     return np.argsort(codes, kind="stable")
 
 
-def to_bytes(fractions: Float[np.ndarray, "..."]) -> np.ndarray:
+def to_bytes(fractions: Float[np.ndarray, "*n"]) -> UInt8[np.ndarray, "*n"]:
     """Fractions, 0 to 1, to the nearest of 256 steps, uint8; others are clipped."""
     return np.round(np.clip(fractions, 0, 1) * 255).astype(np.uint8)

@@ -12,8 +12,7 @@ import pytest
 
 from gsjax.io.ply import read_ply
 from gsjax.io.scenes import read_gaussians, write_gaussians
-from tests.io.scenes_to_write import ROUNDING, assert_alike, make_scene
-from tests.io.test_scenes import flat, ksplat
+from tests.io.scenes_to_write import ROUNDING, assert_alike, flat, ksplat, make_scene
 
 PROGRAM = os.environ.get("GSJAX_SPLAT_TRANSFORM") or shutil.which("splat-transform")
 pytestmark = pytest.mark.skipif(
