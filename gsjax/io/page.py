@@ -43,7 +43,7 @@ def write_page(
     radius = np.quantile(np.linalg.norm(means - center, axis=1), 0.9)
     about = {
         "title": path.stem,
-        "up": [float(value) for value in up],
+        "up": [float(value) + 0.0 for value in up],
         "background": [float(value) for value in background],
         "antialiased": bool(antialiased),
         "center": center.tolist(),
