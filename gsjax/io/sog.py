@@ -306,5 +306,5 @@ def _webp(pixels: UInt8[np.ndarray, "H W 4"]) -> bytes:
     from PIL import Image
 
     stream = io.BytesIO()
-    Image.fromarray(pixels).save(stream, "WEBP", lossless=True, quality=100, method=4, exact=True)
+    Image.fromarray(pixels).save(stream, "WEBP", lossless=True, quality=75, method=2, exact=True)
     return stream.getvalue()
