@@ -56,7 +56,7 @@ def main(scene: str, up: str = "-y") -> None:
     cameras = cameras_around(gaussians, np.array(UPS[up]))
     wanted = np.asarray(render(gaussians, cameras).colors)
     print(
-        "| format | MB | bytes a Gaussian | PSNR, dB | written, s | read, s |\n| --- | --- | --- | --- | --- | --- |"
+        "| format | MB | bytes a Gaussian | PSNR, dB | written, s | read, s |", "| --- " * 6 + "|", sep="\n"
     )
     with tempfile.TemporaryDirectory() as folder:
         for ending in FORMATS:

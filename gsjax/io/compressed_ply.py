@@ -67,10 +67,12 @@ def decompress(ply: PlyData) -> Gaussians:
     colors, opacities = np.split(_fractions(vertices["packed_color"], (8, 8, 8, 8)), [3], axis=1)
     if "min_r" in chunks.dtype.names:
         colors = _in_range(chunks, _COLOR, colors)
+    with np.errstate(over="ignore"):  # to infinities, which are left out
+        scales = np.exp(_in_range(chunks, _SCALE, log_scales))
     return gaussians_from_activated(
         _in_range(chunks, _POSITION, positions),
         _quats(vertices["packed_rotation"]),
-        np.exp(_in_range(chunks, _SCALE, log_scales)),
+        scales,
         opacities[:, 0],
         colors,
         shN=_harmonics(ply["sh"].data) if "sh" in ply else None,

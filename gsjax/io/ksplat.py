@@ -90,7 +90,8 @@ def read_ksplat(path: Path) -> tuple[Gaussians, SceneReport]:
             found = f"{section.count} Gaussians in room for {section.room}, {len(data)} bytes of {end}"
             raise SceneError(path, f"section {number} with all its data", found, AGAIN)
         if section.count:
-            parts.append(_decode(path, data, section, record, (low or -1.5, high or 1.5)))
+            with np.errstate(invalid="ignore"):  # of NaN, whose Gaussians are left out
+                parts.append(_decode(path, data, section, record, (low or -1.5, high or 1.5)))
         start = end
     rest = max((part.rest.shape[1] for part in parts), default=0)
     padded = [

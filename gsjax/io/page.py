@@ -39,15 +39,15 @@ def write_page(
         background: RGB, 0 to 1.
     """
     means = np.asarray(gaussians.means, np.float64)
-    center = np.median(means, axis=0)
-    radius = np.quantile(np.linalg.norm(means - center, axis=1), 0.9)
+    center = np.quantile(means, (0.01, 0.99), axis=0).mean(axis=0)  # but for a few that are far away
+    radius = np.quantile(np.linalg.norm(means - center, axis=1), 0.98)
     about = {
         "title": path.stem,
         "up": [float(value) + 0.0 for value in up],
         "background": [float(value) for value in background],
         "antialiased": bool(antialiased),
         "center": center.tolist(),
-        "distance": float(max(radius, 1e-6) * 2.5),
+        "distance": float(max(radius, 1e-6) * 2.7),
         "focal": _FOCAL,
     }
     shades = ", ".join(str(round(255 * value)) for value in background)

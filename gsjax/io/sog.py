@@ -20,7 +20,7 @@ import zipfile
 import zlib
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 from jaxtyping import UInt8
@@ -48,7 +48,10 @@ _META = "meta.json"
 _MOST_TEXT = 1 << 24
 _PALETTE_ROW = 64
 _MOST_PALETTE = 1 << 16
-_LARGEST = 252  # alpha of a quaternion whose largest component is w
+_LARGEST = 252
+"""Alpha of a rotation whose largest component is w."""
+_DAMAGED = (zipfile.BadZipFile, zlib.error, NotImplementedError, RuntimeError, EOFError, OSError, ValueError)
+"""What zipfile raises for a file that is none, or encrypted, or packed in a way that it does not know."""
 
 Load = Callable[[str], bytes]
 
@@ -65,10 +68,17 @@ def read_sog(path: Path) -> tuple[Gaussians, SceneReport]:
     """
     if path.suffix.lower() == ".json":
         return _read(path, lambda name: _beside(path, name))
+    with path.open("rb") as stream:
+        return _of_zip(path, stream)
+
+
+def _of_zip(path: Path, stream: BinaryIO) -> tuple[Gaussians, SceneReport]:
     try:
-        with zipfile.ZipFile(path) as archive:
+        with zipfile.ZipFile(stream) as archive:
             return _read(path, lambda name: _member(path, archive, name))
-    except (zipfile.BadZipFile, zlib.error, NotImplementedError, RuntimeError, EOFError) as error:
+    except SceneError:
+        raise
+    except _DAMAGED as error:
         raise SceneError(path, "a zip of pictures and meta.json", f"another ({error})", AGAIN) from error
 
 
@@ -177,9 +187,9 @@ def _picture(path: Path, name: str, data: bytes) -> UInt8[np.ndarray, "H W 4"]:
             picture = Image.open(io.BytesIO(data), formats=("WEBP", "PNG"))
         expect_room(path, 4 * picture.width * picture.height, len(data), name)
         return np.asarray(picture.convert("RGBA"))
+    except SceneError:
+        raise
     except (UnidentifiedImageError, OSError, ValueError, Image.DecompressionBombError) as error:
-        if isinstance(error, SceneError):
-            raise
         raise SceneError(path, f"a WebP or PNG picture as {name}", f"another ({error})", AGAIN) from error
 
 

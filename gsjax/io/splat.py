@@ -35,9 +35,9 @@ def read_splat(path: Path) -> tuple[Gaussians, SceneReport]:
         found = f"{len(data)} bytes"
         raise SceneError(path, f"a multiple of {RECORD.itemsize} bytes, those of a Gaussian", found, _ADVICE)
     records = np.frombuffer(data, RECORD)
-    scales = records["scales"].astype(np.float64)
-    with np.errstate(invalid="ignore"):
-        sane = (np.abs(records["means"]) < _SANE).all(1) & (scales >= 0).all(1) & (scales < _SANE).all(1)
+    with np.errstate(invalid="ignore"):  # of signalling NaN
+        scales, means = (records[name].astype(np.float64) for name in ("scales", "means"))
+        sane = (np.abs(means) < _SANE).all(1) & (scales >= 0).all(1) & (scales < _SANE).all(1)
     if 2 * sane.sum() < len(records):
         found = f"{len(records) - sane.sum()} of {len(records)} with other values"
         raise SceneError(path, "finite positions and scales", found, _ADVICE)
@@ -48,7 +48,6 @@ def read_splat(path: Path) -> tuple[Gaussians, SceneReport]:
     length = np.linalg.norm(quats, axis=1, keepdims=True)
     quats /= np.where(length > 0, length, 1)
     none = np.zeros((len(records), 0, 3))
-    means = records["means"].astype(np.float64)
     return drawable(gaussians_of(Columns(means, quats, log_scales, colors[:, 3], colors[:, :3], none)))
 
 
