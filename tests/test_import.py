@@ -43,7 +43,7 @@ def test_help_does_not_wait_for_jax():
     assert not found & (OPTIONAL | {"jax", "numpy", "scipy", "cv2", "matplotlib", "tyro"})
 
 
-@pytest.mark.parametrize("command", ["track", "info", "view", "poses", "distill", "experiment"])
+@pytest.mark.parametrize("command", ["track", "info", "view", "export", "poses", "distill", "experiment"])
 def test_help_of_a_command_needs_no_extra(command):
     asked = f"from gsjax.cli import main\ntry: main([{command!r}, '--help'])\nexcept SystemExit: pass"
     assert not loaded(asked) & OPTIONAL

@@ -92,7 +92,8 @@ def gaussians_of(columns: Columns) -> Gaussians:
     sh0 = (columns.colors - 0.5) / SH_C0
 
     def as_array(value: np.ndarray):
-        return jnp.asarray(value.astype(np.float32))
+        with np.errstate(invalid="ignore", over="ignore"):  # to what `drawable` leaves out
+            return jnp.asarray(value.astype(np.float32))
 
     return Gaussians(
         as_array(columns.means),

@@ -225,7 +225,8 @@ def valid_rows(gaussians: Gaussians) -> Bool[np.ndarray, "N"]:
     for leaf in jax.tree.leaves(gaussians):
         valid &= np.isfinite(np.asarray(leaf)).all(axis=tuple(range(1, leaf.ndim)))
     # In float64, so that squares of 1e38 do not overflow and those of denormals do not vanish.
-    quats = np.where(valid[:, None], np.asarray(gaussians.quats, np.float64), 0.0)
+    with np.errstate(invalid="ignore"):  # of signalling NaN
+        quats = np.where(valid[:, None], np.asarray(gaussians.quats, np.float64), 0.0)
     return valid & (np.sum(quats**2, axis=1) >= MIN_SQUARED_NORM)
 
 
