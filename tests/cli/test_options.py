@@ -35,6 +35,7 @@ OWN = {
     ("deform", "masks"),  # of every frame
     ("query", "weights"),  # also where they are now, of what CLIP taught
     ("view", "weights"),  # only that
+    ("export", "overwrite"),  # of a file
 }
 
 
