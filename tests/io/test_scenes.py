@@ -181,17 +181,6 @@ def test_glb_is_what_the_extension_says(tmp_path):
     np.testing.assert_allclose(attribute(f"{prefix}SH_DEGREE_2_COEF_4", 3), columns.rest[:, 7], atol=1e-6)
 
 
-def test_a_page_stands_alone(tmp_path):
-    up = (0.0, 0.0, 1.0)
-    said = write_gaussians(tmp_path / "a <b> & $c.html", make_scene(5, 1), up=up, background=(1, 1, 1))
-    assert said == ("view-dependent colour",)
-    text = (tmp_path / "a <b> & $c.html").read_text()
-    assert "<title>a &lt;b&gt; &amp; $c</title>" in text
-    assert '"title": "a \\u003cb> & $c"' in text
-    assert "default-src 'none'" in text
-    assert not [word for word in ("http:", "https:", "//cdn", "import(", "fetch(") if word in text]
-
-
 def test_only_a_page_has_an_up(tmp_path):
     with pytest.raises(
         ValueError, match=r"up: expected a page \(.html\), which alone has it, found .*scene.spz"

@@ -116,7 +116,7 @@ def scene_of_run(path: Path, images: str | None = None, gaussians: Gaussians | N
         raise FileNotFoundError(
             f"{path}: expected a scene.ply, found none: the run is still going on, or failed"
         )
-    gaussians = _read(file) if gaussians is None else gaussians
+    gaussians = _on_device(read_gaussians(file)[0]) if gaussians is None else gaussians
     if record.kind == "track":
         if images is not None:
             raise ValueError("--images: a run of `gsjax track` knows its recording; leave it out")
@@ -151,9 +151,11 @@ def scene_of_file(
     Raises:
         SceneError, DataError, ValueError: one of them cannot be read.
     """
-    photographs = choose_photographs(images, read, **chosen)
-    gaussians = _read(file) if gaussians is None else gaussians
-    return FieldScene(file, gaussians, photographs, *_split(photographs, test_every))
+    photographs, mode = choose_photographs(images, read, **chosen), "classic"
+    if gaussians is None:
+        gaussians, report = read_gaussians(file)
+        gaussians, mode = _on_device(gaussians), "antialiased" if report.antialiased else "classic"
+    return FieldScene(file, gaussians, photographs, *_split(photographs, test_every), mode)
 
 
 def scaled(scene: FieldScene, scale: float) -> FieldScene:
@@ -170,8 +172,8 @@ def _split(photographs: Photographs, every: int) -> tuple[list[int], list[int]]:
     return chosen.tolist(), held_out.tolist()
 
 
-def _read(file: Path) -> Gaussians:
-    return jax.tree.map(jnp.asarray, read_gaussians(file)[0])
+def _on_device(gaussians: Gaussians) -> Gaussians:
+    return jax.tree.map(jnp.asarray, gaussians)
 
 
 def _as_learned(photographs: Photographs, file: Path) -> Photographs:
