@@ -10,6 +10,8 @@ import pytest
 import yaml
 
 from gsjax.cli import main
+from gsjax.engine.distill.scene import SceneOptions, open_scene
+from gsjax.io.scenes import read_gaussians, write_gaussians
 
 SMALL = (
     "--distill.grid.levels",
@@ -51,6 +53,15 @@ def distilled(pristine, scene, tmp_path_factory):
 def field(distilled, tmp_path):
     """A copy of it to ask and to corrupt."""
     return shutil.copytree(distilled, tmp_path / "field")
+
+
+def test_a_file_that_says_it_is_antialiased_is_drawn_so(pristine, scene, tmp_path):
+    gaussians, _ = read_gaussians(scene)
+    for antialiased in (False, True):
+        write_gaussians(tmp_path / "scene.spz", gaussians, antialiased=antialiased)
+        opened = open_scene(SceneOptions(tmp_path / "scene.spz", str(pristine), frames="0:1"))
+        assert opened.gaussians.num == gaussians.num
+        assert opened.rasterize_mode == ("antialiased" if antialiased else "classic")
 
 
 def test_a_distillation_writes_all_that_it_promises(distilled):
