@@ -1,11 +1,10 @@
 """One writer at a time in a folder.
 
 A writer locks a file in the folder, RUN/.gsjax.lock, with `flock`. The system releases the lock when the
-process ends, however it ends: a run that was killed is free for the next writer, and nobody is misled by
-a process number that is used again. Network file systems with locks (NFS 4, SMB, Lustre mounted with
-`flock`) share them between machines. Where a file system has none, the writers that the file lists
-decide: those of this machine as long as their processes live, and those of other machines until the file
-is removed.
+process ends, however it ends: a run that was killed is free for the next writer, and nobody is misled by a
+process number that is used again. Network file systems with locks (NFS 4, SMB, Lustre mounted with `flock`)
+share them between machines. Where a file system has none, the writers that the file lists decide: those of
+this machine as long as their processes live, and those of other machines until the file is removed.
 
 Commands that only add to a run, such as a query, share its lock: they keep out a run that would replace it,
 but not each other.
