@@ -8,6 +8,7 @@ right/images/ ...     the right eye of a stereo endoscope, held out, with the sa
 meta.json, truth.npz  of simulated data: fps, baseline_m; depth_unit_m, verts [T,V,3], T_w_tool [T,4,4]
 """
 
+import inspect
 import warnings
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -29,7 +30,7 @@ from gsjax.data.frame_folders import (
 )
 from gsjax.data.masks import read_shades
 from gsjax.data.objects import Truth
-from gsjax.data.origin import near_origin, relative_to_origin
+from gsjax.data.origin import near_origin
 from gsjax.data.sequence import Sequence
 from gsjax.data.tool_masks import LABEL_NAMES, TOOL, Tool, check_tool, find_masks, tool_labels
 
@@ -87,7 +88,9 @@ def read_endonerf(
     _expect_options(depth_unit_m, pose_unit_m, baseline_m, depth_percentiles)
     root = Path(path)
     # Relative to no origin until the unit is known.
-    rows = relative_to_origin(poses_bounds.read_llff(root, axes, images), None)
+    rows = inspect.unwrap(poses_bounds.read_llff)(
+        root, axes, images
+    )  # with no origin until the unit is known
     frames = pictures(root / images)
     width, height = check_one_size(frames)
     meta = _read_meta(root)

@@ -13,10 +13,13 @@ from gsjax.data.errors import DataWarning
 from gsjax.data.objects import PointModel, Truth
 from gsjax.data.photographs import Photographs
 from gsjax.data.sequence import Sequence
+from gsjax.geometry.cameras import NEAR
 from gsjax.scene.origin import about, far_origin, in_words
 
 Data = TypeVar("Data", Photographs, Sequence)
 Given = ParamSpec("Given")
+_LEAST = 1.0  # size of what cameras that stand still see
+_STILL = 1e-9  # movement, relative to the distance from 0
 
 
 def near_origin(read: Callable[Given, Data]) -> Callable[Given, Data]:
@@ -31,7 +34,8 @@ def near_origin(read: Callable[Given, Data]) -> Callable[Given, Data]:
         data = read(*args, **options)
         centers = np.linalg.solve(data.viewmats, np.array([0.0, 0.0, 0.0, 1.0])[:, None])[..., :3, 0]
         cloud = data.cloud if isinstance(data, Photographs) else None
-        origin = far_origin(centers.reshape(-1, 3), [] if cloud is None else [cloud.points])
+        least = _LEAST if _stand_still(centers) else NEAR
+        origin = far_origin(centers.reshape(-1, 3), [] if cloud is None else [cloud.points], least)
         if origin is None:
             return data
         words = in_words(centers.reshape(-1, 3), origin)
@@ -39,6 +43,11 @@ def near_origin(read: Callable[Given, Data]) -> Callable[Given, Data]:
         return relative_to_origin(data, origin)
 
     return reader
+
+
+def _stand_still(centers: Float[np.ndarray, "frames *cameras 3"]) -> bool:
+    """Whether no camera moves. Where those of a pair or a rig stand says nothing of the size of a scene."""
+    return bool(np.ptp(centers, axis=0).max() <= _STILL * np.abs(centers).max())
 
 
 def relative_to_origin(data: Data, origin: Float[np.ndarray, "3"] | None) -> Data:

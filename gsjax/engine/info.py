@@ -16,7 +16,7 @@ from gsjax.data.errors import MissingFile
 from gsjax.data.open import is_photographs, is_recording
 from gsjax.engine.folder import expect_dataset
 from gsjax.engine.info_picture import by_camera, by_split, write_picture
-from gsjax.engine.info_scene import describe_scene
+from gsjax.engine.info_scene import describe_scene, origin_fact
 from gsjax.engine.messages import Notes
 from gsjax.engine.options import Common, OneDataset, Reading
 from gsjax.engine.summary import Column, Table
@@ -97,18 +97,13 @@ def describe_photographs(photographs: Photographs) -> dict[str, str]:
         "size": ", ".join([*listed, *(["..."] if len(sizes) > 4 else [])]),
         "view": _fields_of_view(photographs.sizes[:, 0], photographs.Ks),
         "cameras": f"within {extent.radius:.2f} of their middle, looking at ({focus})",
-        **_origin(photographs.origin),
+        **origin_fact(photographs.origin),
         "splits": ", ".join(f"{n} {name}" for name, n in Counter(splits or ()).items()) or "none",
         "points": "none" if cloud is None else f"{len(cloud.points):,}",
         "depth": depth,
         "masks": "none" if photographs.load_mask is None else "yes",
         "times": "none" if times is None else f"{times.min():.3f} to {times.max():.3f} s",
     }
-
-
-def _origin(origin: Float[np.ndarray, "3"] | None) -> dict[str, str]:
-    """The fact about data that lie far from 0; none for others."""
-    return {} if origin is None else {"origin": f"({', '.join(f'{value:.12g}' for value in origin)})"}
 
 
 def first_masks(sequence: Sequence) -> dict[int, np.ndarray]:
@@ -133,7 +128,7 @@ def describe_sequence(sequence: Sequence, masks: dict[int, np.ndarray]) -> dict[
     labels = ", ".join(map(str, _labels(masks))) or "none but the background"
     return {
         "cameras": f"{len(ids)}: {', '.join(map(str, ids))} ({movement})",
-        **_origin(sequence.origin),
+        **origin_fact(sequence.origin),
         "image": f"{width} x {sequence.height}, {_fields_of_view(width, sequence.Ks[0])}",
         "frames": f"{sequence.num_frames}, numbered {sequence.frame_ids[0]} to {sequence.frame_ids[-1]}",
         "times": times,

@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Float
 
 from gsjax.io.scenes import read_gaussians
 from gsjax.scene.origin import in_world
@@ -25,8 +26,7 @@ def describe_scene(file: Path) -> dict[str, str]:
         facts["places"] = " to ".join(f"({', '.join(f'{x:.2f}' for x in end)})" for end in (low, high))
         facts["sizes"] = "{:.2g} to {:.2g}".format(*np.percentile(gaussians.scales, [1, 99]))
         facts["opacities"] = "{:.2f} to {:.2f}".format(*np.percentile(gaussians.opacities, [1, 99]))
-    if report.origin is not None:
-        facts["origin"] = f"({', '.join(f'{value:.12g}' for value in report.origin)})"
+    facts |= origin_fact(report.origin)
     if report.antialiased is not None:
         facts["drawn"] = "antialiased" if report.antialiased else "classic"
     if report.labels is not None:
@@ -34,3 +34,12 @@ def describe_scene(file: Path) -> dict[str, str]:
     if report.extra:
         facts["not read"] = ", ".join(report.extra)
     return facts
+
+
+def origin_fact(origin: Float[np.ndarray, "3"] | None) -> dict[str, str]:
+    """The fact about data that lie far from 0; none for others.
+
+    Args:
+        origin: what was taken off; None for data near 0.
+    """
+    return {} if origin is None else {"origin": f"({', '.join(f'{value:.12g}' for value in origin)})"}

@@ -8,33 +8,32 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from gsjax.geometry.cameras import NEAR
 from gsjax.scene.gaussians import Gaussians
 
 FAR = 1e3
 """A scene is far if its distance from the origin is this many times its size: float32 then rounds places to
 some 1e-4 of the scene, about a tenth of a pixel. (A fit of 200 steps that stayed there lost 0.01 dB at this
 distance, 0.05 dB at ten times it, and 6.7 dB in UTM.)"""
-_STILL = 1e-9  # relative; places closer together are one
 _MOST = 0.9  # quantile of distances that is the size, so that a few stray points do not count
 
 
 def far_origin(
-    places: Float[np.ndarray, "n 3"], others: Sequence[Float[np.ndarray, "m 3"]] = ()
+    places: Float[np.ndarray, "n 3"], others: Sequence[Float[np.ndarray, "m 3"]] = (), least: float = NEAR
 ) -> Float[np.ndarray, "3"] | None:
     """An origin near the middle of `places`, in round numbers; None if they are not far from the present one.
 
     Args:
         places: of cameras or Gaussians, float64.
         others: further places of the same scene, which add to its size.
+        least: the least size.
     """
     finite = [each[np.isfinite(each).all(1)] for each in (places, *others)]
     if not len(finite[0]):
         return None
     middle = np.median(finite[0], axis=0)
     sizes = [np.quantile(np.linalg.norm(each - middle, axis=1), _MOST) for each in finite if len(each)]
-    size = max(sizes)
-    if size <= _STILL * np.abs(middle).max():  # a camera that stands still says nothing of the size
-        size = 1.0
+    size = max(*sizes, least)
     if np.abs(middle).max() <= FAR * size:
         return None
     step = 10.0 ** np.floor(np.log10(size))
