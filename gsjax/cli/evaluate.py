@@ -1,6 +1,6 @@
 """`gsjax eval`: scores a scene that `gsjax fit` left, again or in more ways."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
@@ -11,6 +11,7 @@ from jaxtyping import Int
 from rich.console import Console
 from rich.progress import track
 
+from gsjax.data.errors import shortened
 from gsjax.data.origin import relative_to_origin
 from gsjax.data.photographs import Photographs
 from gsjax.engine.fit.judge import Compared, Judge, write_panel
@@ -177,7 +178,8 @@ def _choose(options: Options, record: Record) -> Chosen:
     if known and len(held_out) and not {row["view"] for row in known} <= set(names):
         raise ValueError(
             f"{dataset}: expected the photographs of the fit, which held out "
-            f"{_listed(row['view'] for row in known)}, found others, which would hold out {_listed(names)}; "
+            f"{shortened((row['view'] for row in known), 4)}, found others, which would hold out "
+            f"{shortened(names, 4)}; "
             "give the folder of the fit's photographs with --images"
         )
     if options.views == "held-out" and not len(held_out):
@@ -186,11 +188,6 @@ def _choose(options: Options, record: Record) -> Chosen:
         )
     parts = {"held-out": (held_out,), "train": (train,), "all": (held_out, train)}[options.views]
     return Chosen(photographs, np.concatenate(parts), np.isin(np.concatenate(parts), held_out).tolist())
-
-
-def _listed(names: Iterable[str]) -> str:
-    names = list(names)
-    return ", ".join(names[:4]) + (", ..." if len(names) > 4 else "")
 
 
 def _compared(

@@ -19,7 +19,7 @@ import numpy as np
 
 from gsjax.data.clouds import find_cloud, read_cloud
 from gsjax.data.colmap_files import AGAIN, CameraEntry, ImageEntry, read_cameras, read_images, read_points
-from gsjax.data.errors import DataError, DataWarning
+from gsjax.data.errors import DataError, DataWarning, shortened
 from gsjax.data.files import BLACK, background_behind, picture_size, read_image
 from gsjax.data.lens import scaled_intrinsics, undistort
 from gsjax.data.masks import read_shades
@@ -83,9 +83,9 @@ def read_colmap(path: str | Path, images: str = "images", model: str | None = No
     files = [find_file(root / images, image.name) for image in usable]
     left_out = []
     if missing := [image.name for image, file in zip(usable, files, strict=True) if file is None]:
-        left_out.append(f"{len(missing)} not in {root / images} ({_first(missing)})")
+        left_out.append(f"{len(missing)} not in {root / images} ({shortened(missing)})")
     if lost := [image.name for image in registered if not np.isfinite(image.viewmat).all()]:
-        left_out.append(f"{len(lost)} without a finite pose in {chosen.images.name} ({_first(lost)})")
+        left_out.append(f"{len(lost)} without a finite pose in {chosen.images.name} ({shortened(lost)})")
     kept = [(image, file) for image, file in zip(usable, files, strict=True) if file is not None]
     if not kept:
         if (root / images).is_dir():
@@ -101,10 +101,6 @@ def read_colmap(path: str | Path, images: str = "images", model: str | None = No
             expected = f"one of the cameras {sorted(cameras)[:8]}"
             raise DataError(chosen.images, expected, f"{image.camera} for {image.name}", AGAIN)
     return _photographs(root, kept, cameras, cloud)
-
-
-def _first(names: list[str]) -> str:
-    return ", ".join(names[:3]) + (", ..." if len(names) > 3 else "")
 
 
 def find_models(root: Path) -> list[Model]:

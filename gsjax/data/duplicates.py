@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Int
 
-from gsjax.data.errors import DataWarning
+from gsjax.data.errors import DataWarning, shortened
 from gsjax.data.photographs import Photographs
 
 _SPLITS = ("train", "val", "test")
@@ -32,12 +32,9 @@ def without_duplicates(photographs: Photographs) -> Photographs:
     if len(kept) == photographs.num:
         return photographs
     left_out = [photographs.names[i] for i in range(photographs.num) if i not in set(kept)]
-    some = ", ".join(left_out[:3]) + (", ..." if len(left_out) > 3 else "")
-    message = (
-        f"{photographs.name}: {len(left_out)} of {photographs.num} photographs are listed twice ({some})"
-    )
+    some = f"{len(left_out)} of {photographs.num} photographs are listed twice ({shortened(left_out)})"
     advice = "one of each is used, the rest are left out"
-    warnings.warn(f"{message}: {advice}", DataWarning, stacklevel=3)
+    warnings.warn(f"{photographs.name}: {some}: {advice}", DataWarning, stacklevel=3)
     return photographs.select(kept)
 
 

@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 
-from gsjax.data.errors import DataError, DataWarning
+from gsjax.data.errors import DataError, DataWarning, shortened
 from gsjax.data.files import read_image, read_json, read_text
 from gsjax.data.frame_folders import (
     check_one_size,
@@ -273,10 +273,8 @@ def _by_frame(folder: Path, frames: list[Path]) -> dict[int, Path]:
     files = {t: named[frame.stem] for t, frame in enumerate(frames) if frame.stem in named}
     missing = [frame.name for t, frame in enumerate(frames) if t not in files]
     if missing:
-        some = ", ".join(missing[:3]) + (", ..." if len(missing) > 3 else "")
-        message = (
-            f"{folder}: {len(missing)} of {len(frames)} frames are left out of the labels: no file for {some}"
-        )
+        what = f"{len(missing)} of {len(frames)} frames are left out of the labels"
+        message = f"{folder}: {what}: no file for {shortened(missing)}"
         warnings.warn(message, DataWarning, stacklevel=5)
     return files
 

@@ -1,4 +1,6 @@
-"""The errors and warnings for data that is unusable or only partly usable."""
+"""The errors and warnings for data that is unusable or only partly usable, and how they list names."""
+
+from collections.abc import Iterable
 
 
 class DataError(ValueError):
@@ -15,3 +17,14 @@ class MissingFile(DataError):
 
 class DataWarning(UserWarning):
     """Data that is used although part of it is missing or unusable."""
+
+
+def shortened(names: Iterable[str], most: int = 3) -> str:
+    """Names joined for a message, shortened to the first few if there are many.
+
+    Args:
+        names: the names.
+        most: how many are listed.
+    """
+    names = list(names)
+    return ", ".join(names[:most]) + (", ..." if len(names) > most else "")

@@ -14,7 +14,7 @@ from gsjax.data import clip, colmap, poses_bounds, transforms
 from gsjax.data.duplicates import without_duplicates
 from gsjax.data.endonerf import is_endonerf, is_unambiguous_endonerf, read_endonerf
 from gsjax.data.endovis import LEFT, is_endovis, read_endovis
-from gsjax.data.errors import DataError
+from gsjax.data.errors import DataError, shortened
 from gsjax.data.open3d_rgbd import is_open3d, read_open3d
 from gsjax.data.panoptic import read_panoptic
 from gsjax.data.photographs import Photographs, photographs_of
@@ -300,7 +300,7 @@ def _unknown(root: Path, marks: dict[str, str], options: ReadOptions) -> DataErr
         refuse_unread(folder, expected, files)
     expected = ", ".join(f"{mark} ({layout} layout)" for mark, layout in marks.items())
     names = sorted(entry.name for entry in root.iterdir())
-    found = ", ".join(names[:8]) + (", ..." if len(names) > 8 else "") if names else "an empty folder"
+    found = shortened(names, 8) if names else "an empty folder"
     return DataError(root, f"one of {expected}", found, "Give the folder that holds one of these.")
 
 

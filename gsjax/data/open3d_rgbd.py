@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from gsjax.data.errors import DataError, DataWarning
+from gsjax.data.errors import DataError, DataWarning, shortened
 from gsjax.data.files import image_size, read_depth, read_image, read_text
 from gsjax.data.frame_folders import DEFAULT_RATE_HZ
 from gsjax.data.lens import intrinsics_matrix
@@ -86,7 +86,7 @@ def read_open3d(
         found = f"{len(images)} images, {len(depths)} depths and {len(poses)} poses with no number in common"
         raise DataError(root, "frames with image, depth and pose", found, "Name files by frame number.")
     if left_out := sorted(images.keys() - set(numbers)):
-        some = ", ".join(images[n].name for n in left_out[:3]) + (", ..." if len(left_out) > 3 else "")
+        some = shortened(images[n].name for n in left_out)
         reason = f"{len(left_out)} of {len(images)} frames without depth or a pose are left out"
         message = f"{root}: {reason} ({some})"
         warnings.warn(message, DataWarning, stacklevel=2)

@@ -24,7 +24,6 @@ from gsjax.data.pictures import SUFFIXES, is_picture, is_web_format, refuse_unre
 
 _SMALLEST_MODEL = 3  # photographs: two fix no scale, and almost any two have some matches
 _ENOUGH_FOR_CENTER = 20  # photographs per camera
-_NAMED_AT_MOST = 5
 _ADVICE = (
     "Take more photographs with more overlap, of a textured scene in which nothing moves; or try --max-size, "
     "--max-features and --matching exhaustive."
@@ -200,11 +199,6 @@ def reconstruct_cameras(
         error_px=float(best.compute_mean_reprojection_error()),
         seconds=seconds,
     )
-
-
-def shortened(names: Sequence[str]) -> str:
-    """Names joined for a message, shortened to the first few if there are many."""
-    return ", ".join(names[:_NAMED_AT_MOST]) + (", ..." if len(names) > _NAMED_AT_MOST else "")
 
 
 def _pycolmap() -> Any:

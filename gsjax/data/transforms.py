@@ -25,7 +25,7 @@ import numpy as np
 from jaxtyping import Float
 
 from gsjax.data.clouds import find_cloud, read_cloud
-from gsjax.data.errors import DataError, DataWarning
+from gsjax.data.errors import DataError, DataWarning, shortened
 from gsjax.data.files import (
     BLACK,
     WHITE,
@@ -315,8 +315,7 @@ def _report_left_out(
     left_out = []
     for names, what in ((missing, "with no file"), (lost, "without a finite pose")):
         if names:
-            some = ", ".join(names[:3]) + (", ..." if len(names) > 3 else "")
-            left_out.append(f"{len(names)} {what} ({some})")
+            left_out.append(f"{len(names)} {what} ({shortened(names)})")
     if unnamed:
         left_out.append(f"{unnamed} in none of the train, val and test lists")
     if not kept:

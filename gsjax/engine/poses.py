@@ -16,13 +16,13 @@ from rich.console import Console
 
 from gsjax.data import Photographs, open_photographs, read_colmap
 from gsjax.data.alignment import align_cameras
+from gsjax.data.errors import shortened
 from gsjax.data.stills import write_stills
 from gsjax.data.structure_from_motion import (
     MotionConfig,
     SfmResult,
     list_photographs,
     reconstruct_cameras,
-    shortened,
 )
 from gsjax.engine.locks import lock, releasing_locks
 from gsjax.engine.messages import Notes, stage
@@ -124,7 +124,7 @@ def _in_both(names: Sequence[str], reference: Photographs) -> list[tuple[int, in
     if len(both) < 3:
         raise ValueError(
             f"--compare: expected poses of three of these photographs or more in {reference.name}, found "
-            f"{len(both)} of the same name; it has {shortened(reference.names)}"
+            f"{len(both)} of the same name; it has {shortened(reference.names, 5)}"
         )
     return both
 
@@ -194,7 +194,7 @@ def _facts(found: dict[str, Any]) -> dict[str, str]:
     left_out, others, cameras = found["left_out"], found["other_models"], found["cameras"]
     facts = {
         "registered": f"{found['registered']} of {found['photographs']} photographs",
-        "left out": f"{len(left_out)}: {shortened(left_out)}" if left_out else "none",
+        "left out": f"{len(left_out)}: {shortened(left_out, 5)}" if left_out else "none",
         "points": f"{found['points']:,}, each in {found['track_length']:.1f} photographs on average",
         "error": f"{found['error_px']:.2f} px mean reprojection error",
         "cameras": f"{cameras['number']} {cameras['model']}, {cameras['size'][0]} x {cameras['size'][1]}, "

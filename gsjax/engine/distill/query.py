@@ -15,6 +15,7 @@ from jaxtyping import Array, Float
 from rich.console import Console
 from rich.progress import track
 
+from gsjax.data.errors import shortened
 from gsjax.data.photographs import Photographs
 from gsjax.engine.distill.saved import FieldRun, short_names
 from gsjax.engine.messages import Notes, describe
@@ -219,8 +220,7 @@ def _index(photographs: Photographs, camera: str) -> int:
     for known in (names, photographs.names):
         if camera in known:
             return known.index(camera)
-    listed = ", ".join(names[:12]) + (", ..." if len(names) > 12 else "")
-    raise ValueError(f"--camera: expected one of {listed}, found {camera}")
+    raise ValueError(f"--camera: expected one of {shortened(names, 12)}, found {camera}")
 
 
 def _one(camera: Camera) -> Camera:
