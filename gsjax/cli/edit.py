@@ -9,7 +9,7 @@ import tyro
 from rich.console import Console
 from rich.progress import track
 
-from gsjax.data.files import read_text
+from gsjax.data.text import decoded
 from gsjax.engine.folder import holds_something
 from gsjax.engine.locks import lock, releasing_locks
 from gsjax.engine.messages import Notes, stage
@@ -103,7 +103,10 @@ def read_script(options: Options) -> Script:
         )
     script = Script()
     if options.script is not None:
-        text = read_text(options.script, "a YAML file of edits")
+        try:
+            text = decoded(options.script.read_bytes())
+        except ValueError as error:
+            raise ValueError(f"{options.script}: expected a YAML file of edits, found no text") from error
         try:
             script = parse_script(text)
         except ValueError as error:

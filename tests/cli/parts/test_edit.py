@@ -325,7 +325,7 @@ def test_what_cannot_be_done(gsjax, run, options, says):
         (b"edits: [", "bad.yaml: expected YAML, found a fault in line"),
         (b"speed: 2", "bad.yaml: speed: expected one of fps, length, edits"),
         (b"edits: [{op: speed, parts: 1}]", "bad.yaml: edits: edit 1 (speed): factor: expected a factor"),
-        (b"\xff\xfe\x00", "bad.yaml: expected a YAML file of edits, found binary data"),
+        (b"\xff\xfe\x00", "bad.yaml: expected a YAML file of edits, found no text"),
     ],
 )
 def test_a_script_that_is_none(gsjax, run, tmp_path, text, says):
