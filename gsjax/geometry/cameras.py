@@ -1,5 +1,6 @@
-"""Pinhole cameras. World to camera, OpenCV axes (+x right, +y down, +z forward), pixel centres at +0.5."""
+"""Cameras. World to camera, OpenCV axes (+x right, +y down, +z forward), pixel centres at +0.5."""
 
+from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
 
@@ -19,7 +20,7 @@ NEAR = 0.01
 
 
 class Camera(eqx.Module):
-    """One or many pinhole cameras of the same image size.
+    """One or many cameras of the same image size, pinholes or fisheyes.
 
     Attributes:
         viewmat: world-to-camera transforms, OpenCV axes, metres.
@@ -28,6 +29,8 @@ class Camera(eqx.Module):
         height: pixels, static.
         near: distance of the near plane, metres, static. Anything nearer is not drawn, such as parts of the
             rig where cameras see each other.
+        fisheye: coefficients k1 to k4 of the model of Kannala and Brandt, in OpenCV's form; None for
+            pinholes. Depths are distances from a fisheye, and z in the frame of a pinhole.
     """
 
     viewmat: Float[Array | np.ndarray, "*batch 4 4"]
@@ -35,6 +38,7 @@ class Camera(eqx.Module):
     width: int = eqx.field(static=True)
     height: int = eqx.field(static=True)
     near: float = eqx.field(static=True, default=NEAR)
+    fisheye: Float[Array | np.ndarray, "*batch 4"] | None = None
 
 
 def viewmat_from_opengl(camera_to_world: Float[np.ndarray, "*batch 4 4"]) -> Float[np.ndarray, "*batch 4 4"]:
@@ -80,8 +84,7 @@ def intrinsics(
 def on_device(camera: Camera) -> Camera:
     """The camera in JAX arrays of the default float type."""
     dtype = jnp.result_type(float)
-    viewmat, K = (np.asarray(a, dtype) for a in (camera.viewmat, camera.K))
-    return Camera(*jax.device_put((viewmat, K)), camera.width, camera.height, camera.near)
+    return jax.device_put(jax.tree.map(lambda a: np.asarray(a, dtype), camera))
 
 
 def resized(camera: Camera, scale: float, width: int, height: int) -> Camera:
@@ -93,7 +96,7 @@ def resized(camera: Camera, scale: float, width: int, height: int) -> Camera:
         width, height: new size of the image, pixels.
     """
     K = camera.K * jnp.array([[scale], [scale], [1.0]])
-    return Camera(camera.viewmat, K, width, height, camera.near)
+    return replace(camera, K=K, width=width, height=height)
 
 
 @partial(jax.jit, inline=True)

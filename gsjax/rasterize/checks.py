@@ -9,6 +9,7 @@ import jax.numpy as jnp
 
 from gsjax.geometry.spherical_harmonics import num_sh_bases
 from gsjax.rasterize.plan import Plan
+from gsjax.rasterize.views import Views
 
 
 def is_concrete(tree: Any) -> bool:
@@ -33,12 +34,13 @@ def check_inputs(
     colors,
     viewmats,
     Ks,
+    fisheye,
     backgrounds,
     features,
     roi,
     means2d_offset,
     reads,
-) -> tuple[tuple, tuple[int, ...]]:
+) -> tuple[Views, tuple[int, ...]]:
     """All arguments with leading axes flattened to [scenes, cameras, ...], and those leading axes.
 
     Arguments as for `gsjax.rasterization`, under a resolved plan. Half precision is computed in float32;
@@ -49,7 +51,8 @@ def check_inputs(
     """
     arrays = {"means": means, "quats": quats, "scales": scales, "opacities": opacities, "colors": colors}
     arrays |= {"viewmats": viewmats, "Ks": Ks}
-    more = {"backgrounds": backgrounds, "features": features, "means2d_offset": means2d_offset}
+    more = {"fisheye": fisheye, "backgrounds": backgrounds, "features": features}
+    more |= {"means2d_offset": means2d_offset}
     arrays |= {name: array for name, array in more.items() if array is not None}
     for name, array in {**arrays, "roi": roi, "reads": reads}.items():
         if array is not None and not hasattr(array, "dtype"):
@@ -86,6 +89,10 @@ def check_inputs(
     def stored(array):
         return array.dtype if array.dtype in (jnp.bfloat16, jnp.float16) else dtype
 
+    if fisheye is not None:
+        wanted = (*lead, num_cameras, 4)
+        _expect("fisheye", fisheye, wanted, "k1 to k4 of each of viewmats; one camera: fisheye[None]")
+        lay_out("fisheye", num_cameras, 4)
     if backgrounds is not None:
         wanted = (*lead, num_cameras, channels)
         _expect("backgrounds", backgrounds, wanted, "one row per camera, as wide as colors")
@@ -123,18 +130,14 @@ def check_inputs(
     return views, (*lead, num_cameras)
 
 
-_ORDER = ("means", "quats", "scales", "opacities", "colors", "features", "viewmats", "Ks")
-_ORDER += ("means2d_offset", "backgrounds", "roi", "reads")
-
-
 @partial(jax.jit, static_argnums=(1, 2, 3), inline=True)
-def _laid_out(arrays: dict[str, Any], shapes: tuple, kinds: tuple, edge: int) -> tuple:
+def _laid_out(arrays: dict[str, Any], shapes: tuple, kinds: tuple, edge: int) -> Views:
     """The arrays in their shapes and types, by one program; the pixels of interest as tiles."""
     kinds = dict(kinds)
     laid_out = {name: arrays[name].astype(kinds[name]).reshape(shape) for name, shape in shapes}
     if "roi" in laid_out:
-        laid_out["roi"] = _tiles_with_a_pixel(laid_out["roi"], edge)
-    return tuple(laid_out.get(name) for name in _ORDER)
+        laid_out["tile_mask"] = _tiles_with_a_pixel(laid_out["roi"], edge)
+    return Views(*(laid_out.get(name) for name in Views._fields))
 
 
 def _check_colors(colors, plan: Plan, lead: tuple[int, ...], num_cameras: int, n: int) -> tuple[int, ...]:

@@ -2,6 +2,7 @@
 
 The projected covariance is M M^T + eps2d I with M = J W R S (2x3). Its determinants are written as sums of
 positive terms, |m1 x m2|^2 for M M^T (Cauchy-Binet), so needles and discs lose no digits to cancellation.
+J is the Jacobian of a lens (see `gsjax.rasterize.lenses`).
 """
 
 from typing import NamedTuple
@@ -12,6 +13,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from gsjax.geometry.rotations import MIN_SQUARED_NORM
 from gsjax.rasterize.lanes import columns_in_lanes, flat, in_lanes
+from gsjax.rasterize.lenses import Linearised, fisheye, pinhole
 from gsjax.rasterize.plan import Plan
 
 MIN_COMPENSATION = 0.005  # floor of the antialiasing factor
@@ -23,7 +25,7 @@ class Projected(NamedTuple):
 
     means2d: Float[Array, "n 2"]  # pixels
     conics: Float[Array, "n 3"]  # inverse covariance (A, B, C): A dx^2 + 2 B dx dy + C dy^2
-    depths: Float[Array, "n"]  # z in the camera's frame, metres
+    depths: Float[Array, "n"]  # z in the camera's frame, metres; of a fisheye the distance from it
     opacities: Float[Array, "n"]  # after antialiasing
     extents: Float[Array, "n 2"]  # half-widths of the box where alpha reaches alpha_min, pixels; else 0
     visible: Bool[Array, "n"]
@@ -78,22 +80,16 @@ def _rotation_columns(quats):
     )
 
 
-def _project_local(local, quats, scales, opacities, viewmat, K, plan: Plan):
+def _project_local(at: Linearised, quats, scales, opacities, viewmat, K, plan: Plan):
     """Columns of (means2d, conics, opacities, variances, determinant), without checks for bad values."""
-    x, y, z = local
     fx, skew, cx, fy, cy = K[0, 0], K[0, 1], K[0, 2], K[1, 1], K[1, 2]
-    # Far outside the image the linearisation J would blow up: its x/z is clamped to near the frame.
-    margin_x, margin_y = 0.15 * plan.width / fx, 0.15 * plan.height / fy
-    tx = jnp.clip(x / z, -cx / fx - margin_x, (plan.width - cx) / fx + margin_x)
-    ty = jnp.clip(y / z, -cy / fy - margin_y, (plan.height - cy) / fy + margin_y)
     # Rows of M = J W R S, one entry for each of the Gaussian's axes. They divide last because XLA:CPU stores
     # quotients, while it would recompute products and sums wherever they are used.
     row_u, row_v = [], []
     for axis, scale in zip(_rotation_columns(quats), scales, strict=True):
-        in_x, in_y, in_z = _rotate(viewmat[:3, :3], axis)
-        slope_y = in_y - ty * in_z
-        row_u.append(_quotient((fx * (in_x - tx * in_z) + skew * slope_y) * scale, z))
-        row_v.append(_quotient(fy * slope_y * scale, z))
+        slope_x, slope_y = at.slopes(_rotate(viewmat[:3, :3], axis))
+        row_u.append(_quotient((fx * slope_x + skew * slope_y) * scale, at.depth))
+        row_v.append(_quotient(fy * slope_y * scale, at.depth))
 
     def dot(a, b):
         return sum(p * q for p, q in zip(a, b, strict=True))
@@ -107,7 +103,7 @@ def _project_local(local, quats, scales, opacities, viewmat, K, plan: Plan):
     conics = [_quotient(c, det_blurred) for c in (yy, -xy, xx)]
     if plan.rasterize_mode == "antialiased":
         opacities = opacities * jnp.sqrt(jnp.maximum(_quotient(det, det_blurred), MIN_COMPENSATION**2))
-    means2d = [_quotient(fx * x + skew * y, z) + cx, _quotient(fy * y, z) + cy]
+    means2d = [_quotient(fx * at.x + skew * at.y, at.depth) + cx, _quotient(fy * at.y, at.depth) + cy]
     return means2d, conics, opacities, [xx, yy], det_blurred
 
 
@@ -121,12 +117,13 @@ def project_gaussians(
     K: Float[Array, "3 3"],
     plan: Plan,
     means2d_offset: Float[Array, "n 2"] | None = None,
+    coeffs: Float[Array, "4"] | None = None,
 ) -> Projected:
     """Project N Gaussians into one camera.
 
-    A row that is not finite, has |q|^2 < 1e-12, no area on the image or z outside (near, far), or does not
-    reach into the frame, is not visible and has gradients of exactly zero: visibility is determined first,
-    from values alone; then the same arithmetic runs on inputs in which such rows are replaced.
+    A row that is not finite, has |q|^2 < 1e-12, no area on the image or depth outside (near, far), or does
+    not reach into the frame, is not visible and has gradients of exactly zero: visibility is determined
+    first, from values alone; then the same arithmetic runs on inputs in which such rows are replaced.
 
     Args:
         means, quats, scales, opacities: the Gaussians, as for `gsjax.rasterization`.
@@ -134,13 +131,21 @@ def project_gaussians(
         viewmat, K: the camera: world to camera, and intrinsics in pixels.
         plan: image size and options.
         means2d_offset: added to the projected means, pixels.
+        coeffs: k1 to k4 of a fisheye; None for a pinhole.
     """
     n = means.shape[0]
     # The gradients of the bounds of x/z contain 1 / focal^2. A focal length of 0 fails too.
     slopes = jnp.stack([c / (f * f) for f in (K[0, 0], K[1, 1]) for c in (1.0, K[0, 2], K[1, 2])])
     camera_finite = jnp.isfinite(viewmat).all() & jnp.isfinite(K).all() & jnp.isfinite(slopes).all()
+    if coeffs is not None:
+        camera_finite &= jnp.isfinite(coeffs).all()
+        coeffs = jnp.where(camera_finite, coeffs, 0.0)
     viewmat = jnp.where(camera_finite, viewmat, jnp.eye(4, dtype=viewmat.dtype))
     K = jnp.where(camera_finite, K, jnp.eye(3, dtype=K.dtype))
+
+    def linearised(local, K, coeffs):
+        return pinhole(local, K, plan) if coeffs is None else fisheye(local, coeffs)
+
     means, quats, scales = (columns_in_lanes(a) for a in (means, quats, scales))
     opacities, usable = in_lanes(opacities), in_lanes(usable)
     offset = [] if means2d_offset is None else columns_in_lanes(means2d_offset)
@@ -151,8 +156,8 @@ def project_gaussians(
     # First on values alone: which rows can be drawn, and how far they reach.
     values = jax.lax.stop_gradient((means, quats, scales, opacities, viewmat, K))
     local = _to_camera(values[0], values[4])
-    z = local[2]
-    (u, v), conics, alphas, variances, det = _project_local(local, *values[1:], plan)
+    at = linearised(local, values[5], coeffs if coeffs is None else jax.lax.stop_gradient(coeffs))
+    (u, v), conics, alphas, variances, det = _project_local(at, *values[1:], plan)
     if offset:
         du, dv = jax.lax.stop_gradient(offset)
         u, v = u + du, v + dv
@@ -161,7 +166,9 @@ def project_gaussians(
     # The gradient of 1 / det contains its square. A det of 0, infinity or NaN fails too.
     large = [OVERFLOW_MARGIN * c for c in (*variances, det)]  # allows for factors in the gradients
     has_area = _all_finite([u, v, *conics, *large, 1 / (det * det)])
-    in_range = (z > plan.near_plane) & (z < plan.far_plane)
+    in_range = (at.depth > plan.near_plane) & (at.depth < plan.far_plane)
+    if at.seen is not None:
+        in_range &= at.seen
     culled = flat(~sound | (in_range & ~has_area), n).sum(dtype=jnp.int32)
 
     # The box in which alpha = o exp(-q/2) reaches alpha_min, that is q <= 2 ln(o / alpha_min).
@@ -176,6 +183,7 @@ def project_gaussians(
     sees = visible.any()
     viewmat = jnp.where(sees, viewmat, jnp.eye(4, dtype=viewmat.dtype))
     K = jnp.where(sees, K, jnp.eye(3, dtype=K.dtype))
+    coeffs = coeffs if coeffs is None else jnp.where(sees, coeffs, 0.0)
 
     def kept(columns, harmless, seen=None):
         if seen is not None and visible.size:
@@ -188,12 +196,13 @@ def project_gaussians(
     opacities = jnp.where(visible, opacities, 0.0)
     means = kept(means, (0.0, 0.0, 0.0), values[0])
     local = kept(_to_camera(means, viewmat), (0.0, 0.0, 1.0), local)
-    means2d, conics, opacities, _, _ = _project_local(local, quats, scales, opacities, viewmat, K, plan)
+    at = linearised(local, K, coeffs)
+    means2d, conics, opacities, _, _ = _project_local(at, quats, scales, opacities, viewmat, K, plan)
     if offset:
         means2d = [c + d for c, d in zip(means2d, kept(offset, (0.0, 0.0)), strict=True)]
 
     # Without the barrier XLA:GPU computes the whole projection once more for every column that is stacked.
-    columns = (means2d, conics, local[2], opacities, kept((half_x, half_y), (0.0, 0.0)))
+    columns = (means2d, conics, at.depth, opacities, kept((half_x, half_y), (0.0, 0.0)))
     means2d, conics, depths, opacities, extents = jax.lax.optimization_barrier(columns)
 
     def stacked(columns):

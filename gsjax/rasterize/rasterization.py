@@ -15,13 +15,15 @@ from jaxtyping import Array, Bool, Float, Int
 from gsjax.geometry.cameras import camera_centers
 from gsjax.geometry.spherical_harmonics import evaluate_sh, num_sh_bases
 from gsjax.rasterize import fused
-from gsjax.rasterize.binning import bin_gaussians, needed_capacity
-from gsjax.rasterize.checks import check_inputs, is_concrete
+from gsjax.rasterize.binning import bin_gaussians
+from gsjax.rasterize.capacity import planned_for
+from gsjax.rasterize.checks import check_inputs
 from gsjax.rasterize.compositing import Lists, Splats, untile
 from gsjax.rasterize.gradients import composite
 from gsjax.rasterize.lanes import LANES, slots
 from gsjax.rasterize.plan import HEADROOM, OPTION_NAMES, UNSET, Plan, resolve
 from gsjax.rasterize.projection import Projected, project_gaussians
+from gsjax.rasterize.views import Views, usable
 
 
 class Meta(NamedTuple):
@@ -29,30 +31,13 @@ class Meta(NamedTuple):
 
     means2d: Float[Array, "*batch n 2"]  # pixels, where visible
     radii: Int[Array, "*batch n 2"]  # half-widths in pixels, (x, y); 0 where not visible
-    depths: Float[Array, "*batch n"]  # z in the camera's frame, where visible
+    depths: Float[Array, "*batch n"]  # z in the camera's frame, or distance (fisheye), where visible
     features: Float[Array, "*batch height width channels"] | None
     reads: Int[Array, "*batch tiles"]  # entries of each tile's list read until all its pixels were opaque
     pairs: Int[Array, "*batch"]  # Gaussian-tile pairs drawn
     culled: Int[Array, "*batch"]  # Gaussians rejected for their values (NaN, no rotation, no area)
     overflow: Bool[Array, "*batch"]  # the plan was too small: nothing was drawn
     needed: Int[Array, "*batch"]  # capacity that the plan needs
-
-
-class _Views(NamedTuple):
-    """All inputs flattened to B scenes of C cameras."""
-
-    means: Float[Array, "b n 3"]
-    quats: Float[Array, "b n 4"]
-    scales: Float[Array, "b n 3"]
-    opacities: Float[Array, "b n"]
-    colors: Float[Array, "b #c n ..."]
-    features: Float[Array, "b n f"] | None
-    viewmats: Float[Array, "b c 4 4"]
-    Ks: Float[Array, "b c 3 3"]
-    means2d_offset: Float[Array, "b c n 2"] | None
-    backgrounds: Float[Array, "b c channels"] | None
-    tile_mask: Bool[Array, "b c tiles"] | None
-    reads: Int[Array, "b c tiles"] | None
 
 
 def rasterization(
@@ -68,6 +53,7 @@ def rasterization(
     height: int,
     *,
     plan: Plan | None = None,
+    fisheye: Float[Array, "*batch c 4"] | None = None,
     near_plane: float = UNSET,
     far_plane: float = UNSET,
     eps2d: float = UNSET,
@@ -91,8 +77,9 @@ def rasterization(
     """Render 3D Gaussians (Kerbl et al. 2023) for one or more cameras.
 
     Differentiable in everything continuous: means, quats, scales, opacities, colors, features, viewmats, Ks,
-    backgrounds, means2d_offset. Gaussians that cannot be drawn (NaN, a zero quaternion, no area, a colour
-    whose square overflows) are culled, counted in `meta.culled`, and receive gradients of exactly zero.
+    fisheye, backgrounds, means2d_offset. Gaussians that cannot be drawn (NaN, a zero quaternion, no area, a
+    colour whose square overflows) are culled, counted in `meta.culled`, and receive gradients of exactly
+    zero.
 
     Args:
         means: centres, metres.
@@ -107,6 +94,9 @@ def rasterization(
         width, height: image size, static.
         plan: capacities and options, from `gsjax.plan`. Without one the call makes its own, which needs
             concrete values: under jit or vmap, plan outside and pass it in.
+        fisheye: coefficients k1 to k4 of fisheye cameras (Kannala and Brandt 2006, as OpenCV has them; zeros
+            for an equidistant one); then depths are distances from the camera, for it may see beyond 90
+            degrees off its axis. Default: pinhole cameras.
         near_plane, far_plane: depths between which Gaussians are drawn (default 0.01, 1e10).
         eps2d: variance added on the image, square pixels (default 0.3).
         sh_degree: degree up to which coefficients are used, 0 to 3 (default None: colors are values).
@@ -142,10 +132,10 @@ def rasterization(
     plan = resolve(plan, width, height, _options(locals()))
     gaussians = (means, quats, scales, opacities, colors)
     others = (backgrounds, features, roi, means2d_offset, reads)
-    views, batch = check_inputs(plan, *gaussians, viewmats, Ks, *others)
+    views, batch = check_inputs(plan, *gaussians, viewmats, Ks, fisheye, *others)
     if plan.capacity == 0:
         plan = planned_for(views, plan, headroom=1.0)
-    return _rasterize(_Views(*views), plan, batch)
+    return _rasterize(views, plan, batch)
 
 
 def plan(
@@ -159,6 +149,7 @@ def plan(
     height: int,
     *,
     headroom: float = HEADROOM,
+    fisheye: Float[Array, "*batch c 4"] | None = None,
     roi: Bool[Array, "*batch c height width"] | None = None,
     near_plane: float = UNSET,
     far_plane: float = UNSET,
@@ -187,7 +178,7 @@ def plan(
     bases = () if bare.sh_degree is None else (num_sh_bases(bare.sh_degree),)
     colors = np.zeros((*np.shape(means)[:-1], *bases, 1), jnp.result_type(float))
     gaussians = (means, quats, scales, opacities, colors)
-    views, _ = check_inputs(bare, *gaussians, viewmats, Ks, None, None, roi, None, None)
+    views, _ = check_inputs(bare, *gaussians, viewmats, Ks, fisheye, None, None, roi, None, None)
     return planned_for(views, bare, headroom)
 
 
@@ -195,87 +186,19 @@ def _options(arguments: dict[str, Any]) -> dict[str, Any]:
     return {name: arguments[name] for name in OPTION_NAMES if name in arguments}
 
 
-def planned_for(views, bare: Plan, headroom: float) -> Plan:
-    """`bare` with a capacity for these checked inputs, times `headroom`.
-
-    Args:
-        views: inputs as returned by `check_inputs`.
-        bare: a plan with the options.
-        headroom: 1 or more.
-
-    Raises:
-        ValueError: values are traced, or `headroom` is below 1.
-    """
-    values = jax.lax.stop_gradient(views)
-    if not is_concrete(values):
-        raise ValueError(
-            "planning looks at values, and these are traced (jit, vmap or scan). Call plan = "
-            "gsjax.plan(means, quats, scales, opacities, viewmats, Ks, width, height, ...) outside, with "
-            "typical values, and pass plan=plan inside; meta.overflow reports if it becomes too small"
-        )
-    if values[0].shape[1] == 0:
-        return bare.grown(0, headroom)
-    return bare.grown(_needed(_Views(*jax.tree.map(np.asarray, tuple(values))), bare), headroom)
-
-
-_LEAST_COUNTED = 2**14  # Gaussians
-
-
-def _needed(views: _Views, plan: Plan) -> int:
-    """The largest capacity that a view needs. Scenes are padded to a power of two and views counted one by
-    one, so that many scenes share one compiled program."""
-    size = max(_LEAST_COUNTED, 1 << (views.means.shape[1] - 1).bit_length())
-    counting = Plan(plan.width, plan.height, 0, **{name: getattr(plan, name) for name in _COUNTING})
-
-    def padded(a, axis):
-        return np.pad(a, [(0, (size - a.shape[axis]) if i == axis else 0) for i in range(a.ndim)])
-
-    with np.errstate(over="ignore", invalid="ignore"):
-        scenes = (*views[:4], _usable(views))
-    scenes, needs = [padded(a, 1) for a in scenes], []
-    for b, c in np.ndindex(views.viewmats.shape[:2]):
-        per_view = (views.viewmats, views.Ks, views.means2d_offset, views.tile_mask)
-        viewmat, K, offset, mask = (None if a is None else a[b, c] for a in per_view)
-        offset = None if offset is None else padded(offset, 0)
-        needs.append(_needed_in(*(a[b] for a in scenes), viewmat, K, offset, mask, plan=counting))
-    return max(map(int, needs), default=0)
-
-
-_COUNTING = ("near_plane", "far_plane", "eps2d", "rasterize_mode", "alpha_min", "tile_size", "sort")
-"""Options that a capacity depends on."""
-
-
-@partial(jax.jit, static_argnames="plan")
-def _needed_in(means, quats, scales, opacities, usable, viewmat, K, offset, mask, plan: Plan):
-    projected = project_gaussians(means, quats, scales, opacities, usable, viewmat, K, plan, offset)
-    return needed_capacity(projected, mask, plan)
-
-
-def _usable(views: _Views) -> Bool[Array | np.ndarray, "b n"]:
-    """Gaussians whose values can be drawn: overflowing squares would corrupt others' gradients."""
-
-    def paintable(a):
-        a = a.astype(views.means.dtype)
-        return (abs(a * a) < math.inf).all(axis=(1, *range(3, a.ndim)))
-
-    usable = paintable(views.colors)
-    return usable if views.features is None else usable & paintable(views.features[:, None])
-
-
-def _project_all(views: _Views, plan: Plan) -> Projected:
+def _project_all(views: Views, plan: Plan) -> Projected:
     """Every scene in each of its cameras: fields [B, C, N, ...]."""
 
-    def one_camera(means, quats, scales, opacities, usable, viewmat, K, offset):
-        return project_gaussians(means, quats, scales, opacities, usable, viewmat, K, plan, offset)
+    def one_camera(gaussians, camera):
+        viewmat, K, offset, fisheye = camera
+        return project_gaussians(*gaussians, viewmat, K, plan, offset, fisheye)
 
-    offset_axis = None if views.means2d_offset is None else 0
-    cameras = jax.vmap(one_camera, in_axes=(None,) * 5 + (0, 0, offset_axis))
-    scenes = jax.vmap(cameras, in_axes=(0,) * 7 + (offset_axis,))
-    gaussians = (*views[:4], _usable(views))
-    return scenes(*gaussians, views.viewmats, views.Ks, views.means2d_offset)
+    scenes = jax.vmap(jax.vmap(one_camera, in_axes=(None, 0)))
+    cameras = (views.viewmats, views.Ks, views.means2d_offset, views.fisheye)
+    return scenes((*views[:4], usable(views)), cameras)
 
 
-def _paint(views: _Views, projected: Projected, plan: Plan) -> Float[Array, "b c n channels"]:
+def _paint(views: Views, projected: Projected, plan: Plan) -> Float[Array, "b c n channels"]:
     """The values that each camera composites: colours, depth and features, as the plan requires."""
     seen = projected.visible[..., None]
     columns = []
@@ -305,7 +228,7 @@ class _Counts(NamedTuple):
 
 
 @partial(jax.jit, static_argnames=("plan", "batch"))
-def _rasterize(views: _Views, plan: Plan, batch: tuple[int, ...]):
+def _rasterize(views: Views, plan: Plan, batch: tuple[int, ...]):
     shape = views.viewmats.shape[:2]
     projected = _project_all(views, plan)
     values = _paint(views, projected, plan)
@@ -366,7 +289,7 @@ def _bin_views(projected: Projected, mask, plan: Plan):
     return fused.by_platform(in_xla, in_kernels, jax.lax.stop_gradient(projected), mask)
 
 
-def _finish(image, alphas, views: _Views, projected: Projected, counts: _Counts, plan: Plan, batch):
+def _finish(image, alphas, views: Views, projected: Projected, counts: _Counts, plan: Plan, batch):
     """Backgrounds, expected depth, and the caller's own batch axes."""
     shape = image.shape[:2]
     depth_channels = int("D" in plan.render_mode)
@@ -374,8 +297,8 @@ def _finish(image, alphas, views: _Views, projected: Projected, counts: _Counts,
     colors = image[..., :num_colors]
     if views.backgrounds is not None and num_colors:
         # As with colours: a background whose square overflows would make the gradients overflow too.
-        usable = jnp.isfinite(jax.lax.stop_gradient(views.backgrounds) ** 2)
-        backgrounds = jnp.where(usable, views.backgrounds, 0.0)
+        squares = jax.lax.stop_gradient(views.backgrounds) ** 2
+        backgrounds = jnp.where(jnp.isfinite(squares), views.backgrounds, 0.0)
         colors = colors + (1 - alphas) * backgrounds[:, :, None, None, :]
     depth = image[..., num_colors : num_colors + depth_channels]
     if "ED" in plan.render_mode:

@@ -46,7 +46,17 @@ def _rotation(q):
     )
 
 
-def _splat(mean, quat, scale, opacity, viewmat, K, width, height, eps2d, antialiased):
+def _through_fisheye(point, K, fisheye):
+    """Pixel position of a point in the camera's frame (Kannala and Brandt 2006)."""
+    x, y, z = point
+    radius = jnp.sqrt(x * x + y * y)
+    theta = jnp.arctan2(radius, z)
+    bent = theta + sum(k * theta ** (2 * i + 3) for i, k in enumerate(fisheye))
+    u, v = bent / radius * point[:2]
+    return jnp.array([K[0, 0] * u + K[0, 1] * v + K[0, 2], K[1, 1] * v + K[1, 2]])
+
+
+def _splat(mean, quat, scale, opacity, viewmat, K, width, height, eps2d, antialiased, fisheye):
     """Image mean, conic, depth and opacity of one Gaussian, by the textbook formulas."""
     rotation = _rotation(quat)
     covariance = rotation @ jnp.diag(scale**2) @ rotation.T
@@ -56,14 +66,18 @@ def _splat(mean, quat, scale, opacity, viewmat, K, width, height, eps2d, antiali
     tx = z * jnp.clip(x / z, -(cx / fx + 0.3 * tan_x), (width - cx) / fx + 0.3 * tan_x)
     ty = z * jnp.clip(y / z, -(cy / fy + 0.3 * tan_y), (height - cy) / fy + 0.3 * tan_y)
     jacobian = jnp.array([[fx / z, skew / z, -(fx * tx + skew * ty) / z**2], [0.0, fy / z, -fy * ty / z**2]])
+    mean2d, depth = jnp.array([(fx * x + skew * y) / z + cx, fy * y / z + cy]), z
+    if fisheye is not None:
+        local = jnp.array([x, y, z])
+        jacobian = jax.jacfwd(_through_fisheye)(local, K, fisheye)
+        mean2d, depth = _through_fisheye(local, K, fisheye), jnp.linalg.norm(local)
     to_image = jacobian @ viewmat[:3, :3]
     exact = to_image @ covariance @ to_image.T
     blurred = exact + eps2d * jnp.eye(2)
     det, det_blurred = jnp.linalg.det(exact), jnp.linalg.det(blurred)
     if antialiased:
         opacity = opacity * jnp.sqrt(jnp.maximum(det / det_blurred, 0.005**2))
-    mean2d = jnp.array([(fx * x + skew * y) / z + cx, fy * y / z + cy])
-    return mean2d, jnp.linalg.inv(blurred), z, opacity
+    return mean2d, jnp.linalg.inv(blurred), depth, opacity
 
 
 def rasterization_reference(
@@ -77,6 +91,7 @@ def rasterization_reference(
     width: int,
     height: int,
     *,
+    fisheye: Float[Array, "4"] | None = None,
     near_plane: float = 0.01,
     far_plane: float = 1e10,
     eps2d: float = 0.3,
@@ -89,10 +104,11 @@ def rasterization_reference(
     alpha_max: float = 0.99,
     min_transmittance: float = 1e-4,
 ) -> Reference:
-    """One scene in one camera, exactly; arguments as for `gsjax.rasterization`. All rows must be drawable."""
+    """One scene in one camera, exactly; arguments as for `gsjax.rasterization`. All rows must be drawable,
+    and none lie exactly on the axis of a fisheye."""
     antialiased = rasterize_mode == "antialiased"
     means2d, conics, depths, opacities = jax.vmap(
-        lambda *g: _splat(*g, viewmat, K, width, height, eps2d, antialiased)
+        lambda *g: _splat(*g, viewmat, K, width, height, eps2d, antialiased, fisheye)
     )(means, quats, scales, opacities)
     if sh_degree is not None:
         center = -viewmat[:3, :3].T @ viewmat[:3, 3]

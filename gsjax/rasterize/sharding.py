@@ -14,15 +14,16 @@ import jax
 from jax.sharding import AxisType, Mesh, NamedSharding
 from jax.sharding import PartitionSpec as P
 
+from gsjax.rasterize.capacity import planned_for
 from gsjax.rasterize.checks import check_inputs
 from gsjax.rasterize.plan import OPTION_NAMES, UNSET, Plan, resolve
-from gsjax.rasterize.rasterization import planned_for, rasterization
+from gsjax.rasterize.rasterization import rasterization
 
 AxisNames = str | tuple[str, ...]
 
 _PER_SCENE = ("means", "quats", "scales", "opacities", "features")
-_PER_CAMERA = ("viewmats", "Ks", "backgrounds", "roi", "means2d_offset", "reads")
-_ARRAYS = ("means", "quats", "scales", "opacities", "colors", "viewmats", "Ks")
+_PER_CAMERA = ("viewmats", "Ks", "fisheye", "backgrounds", "roi", "means2d_offset", "reads")
+_ARRAYS = ("means", "quats", "scales", "opacities", "colors", "viewmats", "Ks", "fisheye")
 _ARRAYS += ("backgrounds", "features", "roi", "means2d_offset", "reads")  # in the order of `check_inputs`
 _SIGNATURE = inspect.signature(rasterization)
 
@@ -32,10 +33,10 @@ def sharded_rasterization(
 ) -> Callable:
     """`gsjax.rasterization` over a mesh: the same arguments, options, results and derivatives.
 
-    Cameras (axis C of viewmats, Ks, backgrounds, roi, means2d_offset, reads, and of colors that have one) are
-    split over the mesh axis `cameras`, scenes (the first leading axis of all arrays) over `scenes`. Gaussians
-    are replicated on every device of their scene, and their gradients are summed over `cameras`. Images and
-    every field of `meta` are split in the same way. Mesh axes named in neither repeat the work.
+    Cameras (axis C of viewmats, Ks, fisheye, backgrounds, roi, means2d_offset, reads, and of colors that have
+    one) are split over the mesh axis `cameras`, scenes (the first leading axis of all arrays) over `scenes`.
+    Gaussians are replicated on every device of their scene, and their gradients are summed over `cameras`.
+    Images and every field of `meta` are split in the same way. Mesh axes named in neither repeat the work.
 
     Args:
         mesh: mesh of devices, from `jax.make_mesh`; with `jax.distributed`, of the devices of all processes.

@@ -18,7 +18,7 @@ class Rendered(NamedTuple):
     """Images of C cameras."""
 
     colors: Float[Array, "c height width 3"]
-    depths: Float[Array, "c height width"]  # expected depth, metres; 0 where nothing is drawn
+    depths: Float[Array, "c height width"]  # expected depth (see `Camera`), metres; 0 where nothing is drawn
     alphas: Float[Array, "c height width"]
     features: Float[Array, "c height width f"] | None
     meta: Meta
@@ -35,6 +35,7 @@ def plan_render(gaussians: Gaussians, cameras: Camera, **options: Any) -> Plan:
         cameras.K,
         cameras.width,
         cameras.height,
+        fisheye=cameras.fisheye,
         **{
             "sh_degree": gaussians.sh_degree,
             "render_mode": "RGB+ED",
@@ -59,7 +60,7 @@ def render(
 
     Args:
         gaussians: the scene.
-        cameras: C cameras, viewmat [C,4,4] and K [C,3,3].
+        cameras: C cameras, viewmat [C,4,4] and K [C,3,3]; of fisheyes fisheye [C,4].
         plan: from `plan_render`; required under jit.
         features: values composited with the colours (default: the scene's own features).
         backgrounds, roi, means2d_offset: as for `gsjax.rasterization`.
@@ -70,14 +71,14 @@ def render(
     """
     features = gaussians.features if features is None else features
     scene = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.sh, features)
-    per_camera = (cameras.viewmat, cameras.K, backgrounds, roi, means2d_offset)
+    per_camera = (cameras.viewmat, cameras.K, cameras.fisheye, backgrounds, roi, means2d_offset)
     if visibility is not None:
         # Opacities that differ between cameras require a separate scene for each camera.
         scene = jax.tree.map(lambda a: jnp.broadcast_to(a, (len(visibility), *a.shape)), scene)
         scene = (*scene[:3], scene[3] * visibility, *scene[4:])
         per_camera = jax.tree.map(lambda a: a[:, None], per_camera)
     *scene, features = scene
-    viewmats, Ks, backgrounds, roi, means2d_offset = per_camera
+    viewmats, Ks, fisheye, backgrounds, roi, means2d_offset = per_camera
     images, alphas, meta = rasterization(
         *scene,
         viewmats,
@@ -85,6 +86,7 @@ def render(
         cameras.width,
         cameras.height,
         plan=plan,
+        fisheye=fisheye,
         sh_degree=gaussians.sh_degree,
         render_mode="RGB+ED",
         features=features,

@@ -34,6 +34,7 @@ def call(**changes):
     [
         ({"means": zeros(5, 2)}, r"means must have shape \(..., N, 3\); got \(5, 2\)"),
         ({"means": zeros(3)}, r"means must have shape \(..., N, 3\); got \(3,\)"),
+        ({"fisheye": zeros(4)}, r"fisheye must have shape \(2, 4\), k1 to k4.*got \(4,\)"),
         ({"quats": zeros(5, 3)}, r"quats must have shape \(5, 4\).*got \(5, 3\)"),
         ({"scales": zeros(4, 3)}, r"scales must have shape \(5, 3\).*N = 5 as in means; got \(4, 3\)"),
         ({"opacities": zeros(5, 1)}, r"opacities must have shape \(5,\).*got \(5, 1\)"),

@@ -1,7 +1,7 @@
 """Scores of the views of a fitted scene: each is rendered and compared with its photograph."""
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -96,7 +96,7 @@ class Judge:
         """The Gaussians rendered from the camera of `frame`, beside its photograph. The frame is on the host
         and has one camera."""
         camera, size = frame.cameras, self._size(frame.cameras)
-        at = Camera(camera.viewmat, camera.K, *size, camera.near)
+        at = replace(camera, width=size[0], height=size[1])
         drawn, self.plans[size] = self.draw(gaussians, at, self.plans.get(size))
         colors, depths, alphas = (
             np.asarray(a)[0, : camera.height, : camera.width]

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from gsjax.geometry.cameras import Camera, on_device
+from gsjax.geometry.cameras import on_device
 from gsjax.losses.extra import ExtraLosses, named_losses
 from gsjax.methods.fit.config import FitConfig
 from gsjax.methods.fit.model import Model, carried_over, model_of, refined, with_degree, with_slots
@@ -247,7 +247,7 @@ def on_device_at(frames: list[Frame], view: int, shrink: int) -> Frame:
         mask = None if mask is None else smaller(mask.astype(np.uint8)) > 0
         depth = None if depth is None else smaller(depth)
     cameras = frame.cameras
-    camera = Camera(cameras.viewmat, factors[:, None] * cameras.K, width, height, cameras.near)
+    camera = replace(cameras, K=factors[:, None] * cameras.K, width=width, height=height)
     return Frame(
         jax.device_put(image[None]),
         None if depth is None else jax.device_put(depth[None].astype(jnp.result_type(float))),

@@ -1,9 +1,10 @@
 """Common sizes for photographs of many sizes: each size costs three compiled programs. On the host."""
 
+from dataclasses import replace
+
 import numpy as np
 from jaxtyping import Float, Int
 
-from gsjax.geometry.cameras import Camera
 from gsjax.scene.frame import Frame
 
 _MOST = 2  # sizes; upright and lying photographs stay apart
@@ -79,7 +80,7 @@ def padded(frame: Frame, size: Int[np.ndarray, "2"]) -> Frame:
     return Frame(
         np.pad(frame.images, (*sides, (0, 0)), mode="edge"),  # so that it can be downscaled
         None if frame.depths is None else np.pad(frame.depths, sides),
-        Camera(camera.viewmat, camera.K, width, height, camera.near),
+        replace(camera, width=width, height=height),
         np.pad(mask, sides),
         frame.time,
     )
