@@ -14,19 +14,19 @@ import warnings
 from pathlib import Path
 from typing import NamedTuple
 
-import cv2
 import numpy as np
 
 from gsjax.data.clouds import find_cloud, read_cloud
 from gsjax.data.colmap_files import AGAIN, CameraEntry, ImageEntry, read_cameras, read_images, read_points
 from gsjax.data.errors import DataError, DataWarning, shortened
 from gsjax.data.files import BLACK, background_behind, picture_size, read_image
-from gsjax.data.lens import scaled_intrinsics, undistort
+from gsjax.data.lens import scaled_intrinsics
 from gsjax.data.masks import read_shades
 from gsjax.data.names import find_file, portable
 from gsjax.data.origin import near_origin
 from gsjax.data.photographs import Cloud, Photographs
 from gsjax.data.pictures import refuse_unread
+from gsjax.data.through_lenses import Fisheye, through_lenses
 
 PLACES = ("sparse", "colmap/sparse", ".")
 """Subfolders in which the three files or numbered folders of them may lie, in the order in which they are
@@ -51,7 +51,9 @@ class Model(NamedTuple):
 
 
 @near_origin
-def read_colmap(path: str | Path, images: str = "images", model: str | None = None) -> Photographs:
+def read_colmap(
+    path: str | Path, images: str = "images", model: str | None = None, fisheye: Fisheye = "undistort"
+) -> Photographs:
     """The registered photographs of a reconstruction, sorted by name, and its points.
 
     Photographs whose file is missing or whose pose is not finite are left out, with a DataWarning that counts
@@ -63,10 +65,11 @@ def read_colmap(path: str | Path, images: str = "images", model: str | None = No
         images: name of the photographs' folder in it; masks/NAME.png beside it mark the pixels that count.
         model: folder of the reconstruction, such as "sparse/1"; None: the one with the most photographs, and
             a DataWarning that names the others.
+        fisheye: whether photographs by fisheyes are undistorted or kept.
 
     Raises:
-        DataError: a file is missing, truncated or malformed, no photograph is left, or a camera has a model
-            that OpenCV does not support.
+        DataError: a file is missing, truncated or malformed, no photograph is left, a camera has a model
+            that OpenCV does not support, or fisheyes are to be kept and not all lenses are fisheyes.
     """
     root = Path(path)
     chosen = _largest(root, find_models(root)) if model is None else _named(root, model)
@@ -100,7 +103,7 @@ def read_colmap(path: str | Path, images: str = "images", model: str | None = No
         if image.camera not in cameras:
             expected = f"one of the cameras {sorted(cameras)[:8]}"
             raise DataError(chosen.images, expected, f"{image.camera} for {image.name}", AGAIN)
-    return _photographs(root, kept, cameras, cloud)
+    return _photographs(root, kept, cameras, cloud, fisheye)
 
 
 def find_models(root: Path) -> list[Model]:
@@ -193,7 +196,11 @@ def _count(model: Model) -> int:
 
 
 def _photographs(
-    root: Path, kept: list[tuple[ImageEntry, Path]], cameras: dict[int, CameraEntry], cloud: Cloud | None
+    root: Path,
+    kept: list[tuple[ImageEntry, Path]],
+    cameras: dict[int, CameraEntry],
+    cloud: Cloud | None,
+    fisheye: Fisheye,
 ) -> Photographs:
     entries, paths = [image for image, _ in kept], [file for _, file in kept]
     sizes = [picture_size(path) for path in paths]
@@ -202,27 +209,26 @@ def _photographs(
         camera.lens._replace(K=scaled_intrinsics(camera.lens.K, (camera.width, camera.height), size, path))
         for camera, size, path in zip(taken_by, sizes, paths, strict=True)
     ]
-    ideal = [undistort(lens, *size) for lens, size in zip(lenses, sizes, strict=True)]
+    seen = through_lenses(lenses, sizes, root, fisheye)
     masks = [_mask_of(root / "masks", image.name) for image in entries]
     background = background_behind(paths)
     behind = background or BLACK
 
     def load_mask(i: int) -> np.ndarray | None:
-        if (mask := masks[i]) is None:
-            return None
-        valid = (read_shades(mask, *sizes[i]) != 0).astype(np.uint8)
-        return ideal[i][1](valid, cv2.INTER_NEAREST) > 0
+        mask = masks[i]
+        return seen.mask(i, None if mask is None else read_shades(mask, *sizes[i]))
 
     return Photographs(
         name=root.resolve().name,
         names=tuple(portable(image.name) for image in entries),
         sizes=np.array(sizes),
-        Ks=np.stack([K for K, _ in ideal]),
+        Ks=seen.Ks,
         viewmats=np.stack([image.viewmat for image in entries]),
-        load_image=lambda i: ideal[i][1](read_image(paths[i], *sizes[i], behind), cv2.INTER_LINEAR),
-        load_mask=load_mask if any(masks) else None,
+        load_image=lambda i: seen.image(i, read_image(paths[i], *sizes[i], behind)),
+        load_mask=load_mask if any(masks) or seen.has_edges else None,
         cloud=cloud,
         background=background,
+        fisheye=seen.fisheye,
         locate=lambda kind, i: str(masks[i] if kind == "mask" else paths[i]),
     )
 

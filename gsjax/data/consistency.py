@@ -20,6 +20,7 @@ from jaxtyping import Float
 from gsjax.data.errors import DataWarning
 from gsjax.data.photographs import Photographs
 from gsjax.data.sequence import Sequence
+from gsjax.geometry.sight import pixels_at
 
 _MOST_VIEWS, _MOST_PAIRS = 4, 3
 _POINTS = 600  # per view
@@ -74,7 +75,7 @@ def check_photographs(photographs: Photographs) -> None:
     points = np.zeros((0, 3)) if cloud is None else cloud.points
     if len(points):
         _check_directions(photographs, points)
-    if load is None:
+    if load is None or photographs.fisheye is not None:
         return
     Ks, viewmats = photographs.Ks, photographs.viewmats
     depths = ((i, _depth(partial(load, i))) for i in _spread(photographs.num))
@@ -241,8 +242,8 @@ def _check_directions(photographs: Photographs, points: Float[np.ndarray, "m 3"]
     some, blind = _spread(photographs.num, 64), 0
     for i in some:
         local = points @ photographs.viewmats[i, :3, :3].T + photographs.viewmats[i, :3, 3]
-        local = local[local[:, 2] > 0]
-        pixels = (local @ photographs.Ks[i].T)[:, :2] / local[:, 2:]
+        lens = None if photographs.fisheye is None else photographs.fisheye[i]
+        pixels, _ = pixels_at(local, photographs.Ks[i], lens)
         blind += not ((pixels >= 0) & (pixels < photographs.sizes[i])).all(1).any()
     if 2 * blind > len(some):
         found = f"{blind} of {len(some)} photographs look away from all points that come with the poses"

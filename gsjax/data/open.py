@@ -23,6 +23,7 @@ from gsjax.data.push_t import read_push_t
 from gsjax.data.sequence import Sequence
 from gsjax.data.seven_scenes import read_seven_scenes
 from gsjax.data.simulated import articulated, bar, hard_parts, tabletop, tissue
+from gsjax.data.through_lenses import Fisheye
 from gsjax.data.tool_masks import Tool
 from gsjax.data.tum import read_tum
 from gsjax.geometry.cameras import NEAR
@@ -78,6 +79,9 @@ class ReadOptions:
     """Folder of the tool masks, beside a video or in a folder of frames without poses."""
     tool: Tool = "white"
     """Colour of the tool in black-and-white masks (EndoNeRF, videos): white or black."""
+    fisheye: Fisheye = "undistort"
+    """Photographs by fisheyes (COLMAP, nerfstudio): undistort to pinhole views, which lose what lies far off
+    the axis, or keep as they are and render through the same lens."""
     depth_unit_m: float | None = None
     """Metres per unit of the stored depth values (TUM, 7-Scenes, Panoptic, Open3D, nerfstudio, EndoNeRF);
     default: the value given in the data, else that of the layout: 0.0002 for TUM, 0.001 for others."""

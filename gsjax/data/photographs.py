@@ -4,7 +4,7 @@ from collections.abc import Callable, Mapping
 from collections.abc import Sequence as Indices
 from dataclasses import dataclass, field, replace
 
-import jax.numpy as jnp
+import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int, Integer, UInt8
 
@@ -12,7 +12,7 @@ from gsjax.data.errors import DataError
 from gsjax.data.resizing import area_resized, check_scale, nearest_resized
 from gsjax.data.sequence import Sequence
 from gsjax.data.validation import check_intrinsics, check_poses, check_shape
-from gsjax.geometry.cameras import NEAR, Camera
+from gsjax.geometry.cameras import NEAR, Camera, on_device
 from gsjax.scene.frame import Frame
 
 # Field shapes are in the docstrings: constructors check them, with better messages than an annotation's.
@@ -42,8 +42,9 @@ class Cloud:
 
 @dataclass(frozen=True, eq=False)
 class Photographs:
-    """N photographs by calibrated pinhole cameras, each of its own size. They are loaded on demand and not
-    cached. Lengths are in the data's own unit, which is metres only if a depth sensor fixes the scale.
+    """N photographs by calibrated cameras, pinholes or fisheyes, each of its own size. They are loaded on
+    demand and not cached. Lengths are in the data's own unit, which is metres only if a depth sensor fixes
+    the scale.
 
     Attributes:
         name: name of the set.
@@ -51,9 +52,10 @@ class Photographs:
         sizes: width and height in pixels, [N,2].
         Ks: intrinsics in pixels, pixel centres at +0.5, [N,3,3] float64.
         viewmats: world to camera, OpenCV axes, [N,4,4] float64.
-        load_image: i -> RGB, [H,W,3] uint8, undistorted.
+        load_image: i -> RGB, [H,W,3] uint8, undistorted, or as the fisheye took it.
         load_mask: i -> which pixels count, [H,W] bool; or None if all do.
-        load_depth: i -> depth along the optical axis, [H,W], 0 = invalid; or None without depth.
+        load_depth: i -> depth along the optical axis, or distance from a fisheye, [H,W], 0 = invalid; or None
+            without depth.
         load_labels: i -> label of each pixel, [H,W] integers; or None without labels.
         label_names: names of labels, for those that have one.
         times: seconds, [N]; None if the data has none.
@@ -64,6 +66,8 @@ class Photographs:
         locate: (kind, i) -> path of a file, for messages; kind is "image", "mask", "labels" or "depth".
         origin: where the data lie far from 0, what poses and points are relative to, in the coordinates of
             the files, [3] float64; None if they are as in the files.
+        fisheye: coefficients k1 to k4 of each camera (see `gsjax.geometry.cameras.Camera`), [N,4] float64;
+            None for pinholes.
 
     Raises:
         ValueError: shapes disagree, a pose is not a rigid motion, or there is no photograph.
@@ -86,6 +90,7 @@ class Photographs:
     near: float = NEAR
     locate: Callable[[str, int], str] | None = field(default=None, repr=False)
     origin: Float[np.ndarray, "..."] | None = None
+    fisheye: Float[np.ndarray, "..."] | None = None
 
     def __post_init__(self):
         count = len(self.names)
@@ -96,6 +101,8 @@ class Photographs:
         check_shape("viewmats", self.viewmats, (count, 4, 4))
         if self.origin is not None:
             check_shape("origin", self.origin, (3,))
+        if self.fisheye is not None:
+            check_shape("fisheye", self.fisheye, (count, 4))
         for name in ("times", "splits"):
             if getattr(self, name) is not None:
                 check_shape(name, np.asarray(getattr(self, name)), (count,))
@@ -109,10 +116,7 @@ class Photographs:
 
     def camera(self, i: int) -> Camera:
         """The camera of photograph `i`, in JAX's default float type."""
-        dtype = jnp.result_type(float)
-        width, height = (int(size) for size in self.sizes[i])
-        viewmat, K = (jnp.asarray(a[i], dtype) for a in (self.viewmats, self.Ks))
-        return Camera(viewmat, K, width, height, self.near)
+        return on_device(jax.tree.map(lambda a: a[0], self._cameras(i)))
 
     def frame(self, i: int) -> Frame:
         """Photograph `i` as a frame of one camera, on the host: RGB in bytes, poses in float64.
@@ -120,15 +124,19 @@ class Photographs:
         Raises:
             DataError: as for `image`.
         """
-        width, height = (int(size) for size in self.sizes[i])
-        camera = Camera(self.viewmats[i][None], self.Ks[i][None], width, height, self.near)
         mask, depth = self.mask(i), self.depth(i)
         return Frame(
             self.image(i)[None],
             None if depth is None else depth[None],
-            camera,
+            self._cameras(i),
             None if mask is None else mask[None],
         )
+
+    def _cameras(self, i: int) -> Camera:
+        """The camera of photograph `i`, as one of one, on the host."""
+        width, height = (int(size) for size in self.sizes[i])
+        fisheye = None if self.fisheye is None else self.fisheye[i][None]
+        return Camera(self.viewmats[i][None], self.Ks[i][None], width, height, self.near, fisheye)
 
     def image(self, i: int) -> UInt8[np.ndarray, "height width 3"]:
         """RGB.
@@ -149,7 +157,7 @@ class Photographs:
         return self._optional(self.load_mask, "mask", i, np.bool_)
 
     def depth(self, i: int) -> Float[np.ndarray, "height width"] | None:
-        """Depth along the optical axis, float32, 0 = invalid; None without depth.
+        """Depth along the optical axis, or distance from a fisheye, float32, 0 = invalid; None without depth.
 
         Raises:
             DataError: as for `image`.
@@ -183,6 +191,7 @@ class Photographs:
             load_labels=self.load_labels and (lambda i: self.labels(chosen[i])),
             times=None if self.times is None else self.times[chosen],
             splits=None if self.splits is None else tuple(self.splits[i] for i in chosen),
+            fisheye=None if self.fisheye is None else self.fisheye[chosen],
             locate=locate and (lambda kind, i: locate(kind, chosen[i])),
         )
 

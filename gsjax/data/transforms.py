@@ -20,7 +20,6 @@ import warnings
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import cv2
 import numpy as np
 from jaxtyping import Float
 
@@ -36,12 +35,13 @@ from gsjax.data.files import (
     read_image,
     read_json,
 )
-from gsjax.data.lens import Lens, scaled_intrinsics, undistort
+from gsjax.data.lens import Lens, scaled_intrinsics
 from gsjax.data.masks import read_shades
 from gsjax.data.names import find_file, portable
 from gsjax.data.origin import near_origin
 from gsjax.data.photographs import Photographs
 from gsjax.data.pictures import SUFFIXES, refuse_unread
+from gsjax.data.through_lenses import Fisheye, through_lenses
 from gsjax.data.transforms_keys import (
     DEPTH_UNIT_M,
     DEPTHS,
@@ -77,6 +77,7 @@ def read_transforms(
     *,
     background: Color = WHITE,
     depth_unit_m: float | None = None,
+    fisheye: Fisheye = "undistort",
 ) -> Photographs:
     """The photographs listed in a transforms.json, or in a transforms_train.json and its siblings.
 
@@ -90,12 +91,14 @@ def read_transforms(
         path: the folder, or one such file.
         background: RGB, 0 to 1, behind transparent photographs; default: white, as is usual.
         depth_unit_m: length of one depth step; None: as the file states, else 0.001, as in nerfstudio.
+        fisheye: whether photographs by fisheyes are undistorted or kept.
 
     Warns with DataWarning if the file has keys that look like data and are not read, or instant-ngp's depth
     without its unit.
 
     Raises:
-        DataError: a file is missing or malformed, no frame is left, or a camera model is unknown.
+        DataError: a file is missing or malformed, no frame is left, a camera model is unknown, or fisheyes
+            are to be kept and not all lenses are fisheyes.
         ValueError: a pose is not a rigid motion.
     """
     root, files = _files(Path(path))
@@ -132,7 +135,7 @@ def read_transforms(
         if cloud is None and points is not None:
             cloud = read_cloud(points)
     _report_left_out(root, listed, missing, lost, unnamed, len(frames))
-    return _photographs(root, frames, cloud, background)
+    return _photographs(root, frames, cloud, background, fisheye)
 
 
 def _files(path: Path) -> tuple[Path, dict[Path, str | None]]:
@@ -328,25 +331,22 @@ def _report_left_out(
         warnings.warn(message, DataWarning, stacklevel=4)
 
 
-def _photographs(root, frames, cloud, background) -> Photographs:
-    ideal = [undistort(frame.lens, *frame.size) for frame in frames]
+def _photographs(root, frames, cloud, background, fisheye: Fisheye) -> Photographs:
+    seen = through_lenses([frame.lens for frame in frames], [frame.size for frame in frames], root, fisheye)
     shown_before = background_behind([frame.image for frame in frames], background)
     behind = shown_before or BLACK
 
     def load_image(i: int) -> np.ndarray:
-        return ideal[i][1](read_image(frames[i].image, *frames[i].size, behind), cv2.INTER_LINEAR)
+        return seen.image(i, read_image(frames[i].image, *frames[i].size, behind))
 
     def load_mask(i: int) -> np.ndarray | None:
-        if frames[i].mask is None:
-            return None
-        mask = (read_shades(frames[i].mask, *frames[i].size) != 0).astype(np.uint8)
-        return ideal[i][1](mask, cv2.INTER_NEAREST) > 0
+        mask = frames[i].mask
+        return seen.mask(i, None if mask is None else read_shades(mask, *frames[i].size))
 
     def load_depth(i: int) -> np.ndarray | None:
         if frames[i].depth is None:
             return None
-        depth = read_depth(frames[i].depth, frames[i].depth_unit, *frames[i].size)
-        return ideal[i][1](depth, cv2.INTER_NEAREST)
+        return seen.depth(i, read_depth(frames[i].depth, frames[i].depth_unit, *frames[i].size))
 
     has = {
         key: any(getattr(frame, key) is not None for frame in frames) for key in ("mask", "depth", "split")
@@ -357,14 +357,15 @@ def _photographs(root, frames, cloud, background) -> Photographs:
         name=root.resolve().name,
         names=tuple(frame.name for frame in frames),
         sizes=np.array([frame.size for frame in frames]),
-        Ks=np.stack([K for K, _ in ideal]),
+        Ks=seen.Ks,
         viewmats=np.stack([frame.viewmat for frame in frames]),
         load_image=load_image,
-        load_mask=load_mask if has["mask"] else None,
+        load_mask=load_mask if has["mask"] or seen.has_edges else None,
         load_depth=load_depth if has["depth"] else None,
         times=times if moving else None,
         splits=tuple(frame.split or "train" for frame in frames) if has["split"] else None,
         cloud=cloud,
         background=shown_before,
+        fisheye=seen.fisheye,
         locate=lambda kind, i: str(getattr(frames[i], kind)),
     )

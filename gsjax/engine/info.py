@@ -21,6 +21,7 @@ from gsjax.engine.messages import Notes
 from gsjax.engine.options import Common, OneDataset, Reading
 from gsjax.engine.summary import Column, Table
 from gsjax.engine.terminal import print_facts, print_table
+from gsjax.geometry.sight import bent
 from gsjax.io.scenes import is_scene
 from gsjax.methods.fit import extent_of
 from gsjax.scene.origin import in_world
@@ -95,7 +96,7 @@ def describe_photographs(photographs: Photographs) -> dict[str, str]:
     return {
         "photographs": f"{photographs.num}: {photographs.names[0]} to {photographs.names[-1]}",
         "size": ", ".join([*listed, *(["..."] if len(sizes) > 4 else [])]),
-        "view": _fields_of_view(photographs.sizes[:, 0], photographs.Ks),
+        "view": _view(photographs),
         "cameras": f"within {extent.radius:.2f} of their middle, looking at ({focus})",
         **origin_fact(photographs.origin),
         "splits": ", ".join(f"{n} {name}" for name, n in Counter(splits or ()).items()) or "none",
@@ -166,8 +167,19 @@ def _cameras(ids: Iterable[int], sequence: Sequence) -> str:
     return f"camera{'s' if len(known) > 1 else ''} {', '.join(known)}"
 
 
+def _view(photographs: Photographs) -> str:
+    if photographs.fisheye is None:
+        return _fields_of_view(photographs.sizes[:, 0], photographs.Ks)
+    views = zip(photographs.sizes[:, 0] / (2 * photographs.Ks[:, 0, 0]), photographs.fisheye, strict=True)
+    half = np.array([np.interp(far, *bent(coeffs)[::-1]) for far, coeffs in views])
+    return f"{_degrees_wide(np.degrees(2 * half))}, by fisheyes"
+
+
 def _fields_of_view(widths: np.ndarray | int, Ks: Float[np.ndarray, "n 3 3"]) -> str:
-    degrees = np.degrees(2 * np.arctan(widths / (2 * Ks[:, 0, 0])))
+    return _degrees_wide(np.degrees(2 * np.arctan(widths / (2 * Ks[:, 0, 0]))))
+
+
+def _degrees_wide(degrees: Float[np.ndarray, "n"]) -> str:
     low, high = degrees.min(), degrees.max()
     return f"{low:.0f}° wide" if high - low < 1 else f"{low:.0f}° to {high:.0f}° wide"
 

@@ -10,6 +10,7 @@ from scipy.spatial import cKDTree
 
 from gsjax.geometry.cameras import unproject
 from gsjax.geometry.neighbors import neighbor_spacing, voxel_thin
+from gsjax.geometry.sight import rays
 from gsjax.scene.gaussians import Gaussians, gaussians_from_activated
 
 # Rooms are metres across: a median depth beyond this is almost certainly in millimetres, not metres.
@@ -22,15 +23,18 @@ def points_from_rgbd(
     viewmat: Float[np.ndarray, "4 4"],
     K: Float[np.ndarray, "3 3"],
     *,
+    fisheye: Float[np.ndarray, "4"] | None = None,
     stride: int = 1,
 ) -> tuple[Float[np.ndarray, "M 3"], Float[np.ndarray, "M 3"]]:
     """World points and their colours from every `stride`-th pixel with depth.
 
     Args:
         image: uint8 0 to 255 or floats 0 to 1.
-        depth: z-depth in metres; 0, negative and non-finite values are invalid and dropped.
+        depth: z-depth, or distance from a fisheye, in metres; 0, negative and non-finite values are invalid
+            and dropped.
         viewmat: world to camera, OpenCV axes.
         K: intrinsics in pixels, with pixel centres at +0.5.
+        fisheye: coefficients of a fisheye; None: a pinhole.
         stride: step between sampled pixels along rows and columns.
 
     Returns:
@@ -58,7 +62,12 @@ def points_from_rgbd(
         )
     pixels = np.stack([columns + 0.5, rows + 0.5], axis=-1).astype(np.float64)
     safe = np.where(valid, sampled, 1.0).astype(np.float64)
-    points = on_host(unproject, pixels, safe, viewmat, K)
+    if fisheye is None:
+        points = on_host(unproject, pixels, safe, viewmat, K)
+    else:
+        directions = rays(pixels, np.asarray(K), np.asarray(fisheye))
+        valid &= np.isfinite(directions[..., 0])
+        points = (directions * safe[..., None] - viewmat[:3, 3]) @ viewmat[:3, :3]
     colors = image[rows, columns][valid]
     colors = colors / 255.0 if np.issubdtype(colors.dtype, np.integer) else colors
     return points[valid].astype(np.float32), np.clip(np.nan_to_num(colors), 0, 1).astype(np.float32)

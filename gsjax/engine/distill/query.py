@@ -225,7 +225,7 @@ def _index(photographs: Photographs, camera: str) -> int:
 
 def _one(camera: Camera) -> Camera:
     """A batch of one."""
-    return Camera(camera.viewmat[None], camera.K[None], camera.width, camera.height, camera.near)
+    return jax.tree.map(lambda a: a[None], camera)
 
 
 def _ends(scores: Float[np.ndarray, "n"]) -> tuple[float, float]:

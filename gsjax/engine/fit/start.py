@@ -35,7 +35,13 @@ def start_from(
     source, cloud = config.start.source, photographs.cloud
     has_points = cloud is not None and len(cloud.points) > 0
     has_depth = any(frame.depths is not None for frame in frames)
-    if source != "matches" and (source != "auto" or has_points or has_depth):
+    if photographs.fisheye is not None and source == "matches":
+        raise ValueError(
+            f"--fit.start.source matches: expected photographs by pinholes, found {photographs.name} by "
+            "fisheyes; leave out --read.fisheye, or use random"
+        )
+    pinholes = photographs.fisheye is None
+    if source != "matches" and (source != "auto" or has_points or has_depth or not pinholes):
         return config, (cloud.points, cloud.colors) if cloud is not None else None
     spread = np.unique(np.linspace(0, len(frames) - 1, _MOST_MATCHED).round().astype(int))
     frames = [frames[i] for i in spread]

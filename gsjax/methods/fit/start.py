@@ -4,9 +4,11 @@ host."""
 import warnings
 from typing import NamedTuple
 
+import jax
 import numpy as np
 from jaxtyping import Float, Int
 
+from gsjax.geometry.sight import pixels_at, rays
 from gsjax.methods.fit.config import StartConfig
 from gsjax.methods.fit.model import in_slots
 from gsjax.scene.frame import Frame
@@ -89,11 +91,11 @@ def _is_seen(points: Float[np.ndarray, "m 3"], frames: list[Frame]) -> bool:
     for frame in frames:
         height, width = frame.images[0].shape[:2]
         local = points @ frame.cameras.viewmat[0][:3, :3].T + frame.cameras.viewmat[0][:3, 3]
-        ahead = local[:, 2] > 0
-        x, y, z = (local[ahead] @ frame.cameras.K[0].T).T
-        shown = (x >= 0) & (x < width * z) & (y >= 0) & (y < height * z)
-        seen[ahead] |= shown
-        disparities[np.flatnonzero(ahead)[shown]] = frame.cameras.K[0][0, 0] * extent.radius / z[shown]
+        camera = jax.tree.map(lambda a: a[0], frame.cameras)
+        pixels, depths = pixels_at(local, camera.K, camera.fisheye)
+        shown = ((pixels >= 0) & (pixels < (width, height))).all(axis=1)
+        seen |= shown
+        disparities[shown] = camera.K[0, 0] * extent.radius / depths[shown]
     if seen.mean() < _FEW:
         warnings.warn(
             f"of the data's {len(points)} points the photographs show {seen.sum()}: are they in the axes and "
@@ -117,7 +119,8 @@ def _from_depth(frames, count, random):
         known = frame.known_depths[0]
         if not known.any():
             continue
-        some = points_from_rgbd(frame.images[0], known, frame.cameras.viewmat[0], frame.cameras.K[0])
+        camera = jax.tree.map(lambda a: a[0], frame.cameras)
+        some = points_from_rgbd(frame.images[0], known, camera.viewmat, camera.K, fisheye=camera.fisheye)
         kept = random.permutation(len(some[0]))[:each]
         points.append(some[0][kept])
         colors.append(some[1][kept])
@@ -138,9 +141,10 @@ def _at_random(frames, count, random):
         middle = max(float((rotation @ extent.focus + shift)[2]), 0.3 * extent.radius)
         # Uniform in disparity, from 0.4 to 4 times the depth of the focus.
         depth = middle / random.uniform(1 / 4, 1 / 0.4, len(rows))
-        pixels = np.stack([column + 0.5, row + 0.5, np.ones(len(rows))], axis=-1)
-        rays = pixels @ np.linalg.inv(frame.cameras.K[0]).T
-        points[rows] = (rays * depth[:, None] - shift) @ rotation
+        camera = jax.tree.map(lambda a: a[0], frame.cameras)
+        looks = rays(np.stack([column + 0.5, row + 0.5], axis=-1), camera.K, camera.fisheye)
+        looks = np.where(np.isfinite(looks), looks, [0.0, 0.0, 1.0])  # the edges of a fisheye's photograph
+        points[rows] = (looks * depth[:, None] - shift) @ rotation
         colors[rows] = frame.images[0][row, column] / 255
     return points, colors
 

@@ -1,0 +1,125 @@
+"""Photographs through lenses: undistorted to pinholes, or, by fisheyes, kept as they were taken."""
+
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Literal
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float
+
+from gsjax.data.errors import DataError, DataWarning
+from gsjax.data.lens import Lens, undistort
+from gsjax.geometry.cameras import pixels_of
+from gsjax.geometry.sight import rays
+
+Fisheye = Literal["undistort", "keep"]
+
+_MUCH = 0.25  # of the pixels of a photograph: losing more is said
+_GRID = 64  # pixels along each side that are looked at
+
+
+@dataclass(frozen=True, eq=False)
+class ThroughLenses:
+    """How N photographs are seen, and what of their files becomes what is seen.
+
+    Attributes:
+        Ks: intrinsics in pixels, pixel centres at +0.5, [N,3,3].
+        fisheye: k1 to k4 of each, [N,4]; None if all are seen by pinholes.
+        views: maps each picture to what is seen: (picture, OpenCV interpolation flag) -> picture.
+        reaches: which pixels of each a fisheye shows; None if all.
+    """
+
+    Ks: Float[np.ndarray, "n 3 3"]
+    fisheye: Float[np.ndarray, "n 4"] | None
+    views: Sequence[Callable[[np.ndarray, int], np.ndarray]] = field(repr=False)
+    reaches: Sequence[Bool[np.ndarray, "height width"] | None] = field(repr=False)
+
+    @property
+    def has_edges(self) -> bool:
+        """Whether some photograph has pixels that its lens does not show."""
+        return any(reached is not None for reached in self.reaches)
+
+    def image(self, i: int, picture: np.ndarray) -> np.ndarray:
+        """Colours of photograph `i`."""
+        return self.views[i](picture, cv2.INTER_LINEAR)
+
+    def mask(self, i: int, shades: np.ndarray | None) -> Bool[np.ndarray, "height width"] | None:
+        """Which pixels count: those whose shade is not 0 and that the lens shows; None if all."""
+        reached = self.reaches[i]
+        if shades is None:
+            return reached
+        counts = self.views[i]((shades != 0).astype(np.uint8), cv2.INTER_NEAREST) > 0
+        return counts if reached is None else counts & reached
+
+    def depth(self, i: int, depth: Float[np.ndarray, "height width"]) -> Float[np.ndarray, "height width"]:
+        """Depth as the camera has it: for a fisheye the distance, from depth along the axis."""
+        seen = self.views[i](depth, cv2.INTER_NEAREST)
+        if self.fisheye is None:
+            return seen
+        cosine = _rays(self.Ks[i], self.fisheye[i], *depth.shape[::-1])[..., 2]
+        return np.where(cosine > 1e-3, seen / np.maximum(cosine, 1e-3), 0).astype(depth.dtype)
+
+
+def through_lenses(
+    lenses: Sequence[Lens], sizes: Sequence[tuple[int, int]], where: object, fisheye: Fisheye
+) -> ThroughLenses:
+    """Pinhole views of photographs, or the photographs as fisheyes took them.
+
+    Warns with DataWarning if undistorting loses a quarter of the pixels of fisheye photographs.
+
+    Args:
+        lenses: of each photograph.
+        sizes: width and height of each, pixels.
+        where: name of the photographs in messages.
+        fisheye: whether to undistort those of fisheyes, or to keep them.
+
+    Raises:
+        DataError: fisheyes are to be kept, and not all lenses are fisheyes.
+    """
+    if fisheye == "keep" and any(lens.fisheye for lens in lenses):
+        if others := sum(not lens.fisheye for lens in lenses):
+            found = f"{others} of {len(lenses)} by other lenses"
+            advice = "Leave out fisheye (--read.fisheye), and all are undistorted."
+            raise DataError(where, "photographs that are all by fisheyes", found, advice)
+        coeffs = np.array([lens.coeffs for lens in lenses])
+        seen = [_reach(lens, *size) for lens, size in zip(lenses, sizes, strict=True)]
+        return ThroughLenses(np.stack([lens.K for lens in lenses]), coeffs, [_as_taken] * len(lenses), seen)
+    ideal = [undistort(lens, *size) for lens, size in zip(lenses, sizes, strict=True)]
+    distinct = {(str(lens), size): (lens, K) for lens, (K, _), size in zip(lenses, ideal, sizes, strict=True)}
+    least = min((_shown(*seen, *size) for (_, size), seen in distinct.items()), default=1.0)
+    if least < 1 - _MUCH:
+        message = f"{where}: undistorting keeps {least:.0%} of a photograph by a fisheye"
+        warnings.warn(
+            f"{message}; to fit all of it, set fisheye to keep (--read.fisheye keep)",
+            DataWarning,
+            stacklevel=4,
+        )
+    views = [view for _, view in ideal]
+    return ThroughLenses(np.stack([K for K, _ in ideal]), None, views, [None] * len(lenses))
+
+
+def _as_taken(picture: np.ndarray, interpolation: int) -> np.ndarray:
+    del interpolation
+    return picture
+
+
+def _rays(K, coeffs, width: int, height: int) -> Float[np.ndarray, "height width 3"]:
+    x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
+    return rays(np.stack([x, y], axis=-1), K, np.asarray(coeffs))
+
+
+def _reach(lens: Lens, width: int, height: int) -> Bool[np.ndarray, "height width"] | None:
+    reached = np.isfinite(_rays(lens.K, lens.coeffs, width, height)[..., 0])
+    return None if reached.all() else reached
+
+
+def _shown(lens: Lens, K: Float[np.ndarray, "3 3"], width: int, height: int) -> float:
+    """Share of what a fisheye shows of a photograph that its pinhole view shows too."""
+    if not lens.fisheye:
+        return 1.0
+    small = np.diag([_GRID / width, _GRID / height, 1.0])
+    looks = _rays(small @ lens.K, lens.coeffs, _GRID, _GRID).reshape(-1, 3)
+    looks = looks[np.isfinite(looks[:, 0])]
+    return float(pixels_of(looks, np.eye(4), K, width, height).inside.mean()) if len(looks) else 1.0
