@@ -56,7 +56,9 @@ def run(options: Options) -> int:
             look["up"] = (known if options.up == "auto" else UP[options.up]).tolist()
             look["background"] = scene.background
         with stage(console, f"writing {options.out}"):
-            left_out = write_gaussians(options.out, scene.gaussians, antialiased=scene.antialiased, **look)
+            left_out = write_gaussians(
+                options.out, scene.gaussians, antialiased=scene.antialiased, origin=scene.origin, **look
+            )
         for what in left_out:
             notes.warn(f"{options.out}: {written.name} leaves out {what}")
     size = options.out.stat().st_size

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float
 
 from gsjax.io.scenes import read_gaussians
-from gsjax.scene.origin import in_world
+from gsjax.scene.origin import in_numbers, in_world
 
 
 def describe_scene(file: Path) -> dict[str, str]:
@@ -42,4 +42,4 @@ def origin_fact(origin: Float[np.ndarray, "3"] | None) -> dict[str, str]:
     Args:
         origin: what was taken off; None for data near 0.
     """
-    return {} if origin is None else {"origin": f"({', '.join(f'{value:.12g}' for value in origin)})"}
+    return {} if origin is None else {"origin": in_numbers(origin)}

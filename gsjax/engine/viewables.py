@@ -1,6 +1,6 @@
 """The scenes that `gsjax view` opens: a run of any kind, or a file of Gaussians."""
 
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Literal
 
@@ -53,7 +53,13 @@ def open_viewable(path: Path, notes: Notes, now: Whereabouts = AS_IT_WAS) -> tup
     if path.is_file():
         _expect_only((), now, f"{path} is a file")
         gaussians, report = read_drawable(path)
-        scene = Viewable(path.name, gaussians, report.labels, antialiased=bool(report.antialiased))
+        scene = Viewable(
+            path.name,
+            gaussians,
+            report.labels,
+            antialiased=bool(report.antialiased),
+            origin=report.origin,
+        )
         return scene, path.absolute().parent
     if not path.is_dir():
         raise FileNotFoundError(
@@ -99,6 +105,7 @@ def _of_field(path: Path, notes: Notes, now: Whereabouts) -> Viewable:
         shots=None if run.photographs is None else _shots_of(run.photographs),
         antialiased=run.rasterize_mode == "antialiased",
         unit=run.unit,
+        origin=run.origin,
         asking=asking_of(QueryableField(run, many=True)),
     )
 
@@ -151,6 +158,7 @@ def _of_fit(path: Path, notes: Notes, now: Whereabouts) -> Viewable:
         shots=shots,
         background=background,
         antialiased=antialiased,
+        origin=origin,
         asking=None if field is None else asking_of(QueryableField(field, many=True)),
     )
 
@@ -163,8 +171,9 @@ def _of_deformation(path: Path, notes: Notes, weights: Path | None) -> Viewable:
     if weights is not None and kind in (None, "classes", "closed"):
         raise ValueError(f"--weights: {path} has no CLIP features; leave it out")
     first, labels, asking, times = result.at(0.0), None, None, result.timeline.times
+    origin = origin_of(path / DEFORMATION)
     if result.meaning is not None and first.features is not None:
-        asking = asking_of(QueryableScene(path, result, weights, origin_of(path / DEFORMATION)))
+        asking = asking_of(QueryableScene(path, result, weights, origin))
         likely = probabilities_of(first.features, jnp.asarray(result.meaning.codebook, jnp.float32))
         labels = 1 + most_likely(np.asarray(likely))
     return Viewable(
@@ -176,6 +185,7 @@ def _of_deformation(path: Path, notes: Notes, weights: Path | None) -> Viewable:
         times=times * result.timeline.seconds,
         shots=_shots_of_deformation(path, result, notes),
         unit="m" if result.timeline.metric else "",
+        origin=origin,
         asking=asking,
     )
 
@@ -187,11 +197,12 @@ def _of_track(path: Path, notes: Notes) -> Viewable:
     try:
         saved = open_run(path)
     except ValueError as error:
-        tracking = read_tracking(path)  # if that is damaged, it is an error
+        tracking, origin = read_tracking(path)  # if that is damaged, it is an error
         notes.warn(f"its recording is not shown: {error}")
     else:
         tracking, names = saved.tracking, saved.names
         recording = saved.recording.judged
+        origin = recording.origin
         shots, times = _shots_of_recording(saved.recording), recording.times[: tracking.num_frames]
     count = tracking.scene.num_moving
     return Viewable(
@@ -203,12 +214,13 @@ def _of_track(path: Path, notes: Notes) -> Viewable:
         times=times,
         shots=shots,
         unit="m",
+        origin=origin,
     )
 
 
 def _of_parts(path: Path, notes: Notes) -> Viewable:
     """The scene of a run of `gsjax parts` over time, with its cameras if the recording is still there."""
-    layer, names = read_parts(path)
+    layer, names, origin = read_parts(path)
     saved, shots = None, None
     try:
         saved = open_parts_run(path)
@@ -221,7 +233,8 @@ def _of_parts(path: Path, notes: Notes) -> Viewable:
             notes.warn("a partial run: it has only the frames that were followed, and no cameras")
     times, blend = np.asarray(layer.trajectory.times), blend_of(path) if saved is None else saved.blend
     filmed = Filmed(path.absolute().name, names, blend, times - times[0], shots)
-    return filmed.viewable((layer,), None if saved is None else editing_of(saved, filmed))
+    scene = filmed.viewable((layer,), None if saved is None else editing_of(saved, filmed))
+    return replace(scene, origin=origin)
 
 
 def _shots_of(photographs: Photographs) -> Shots:

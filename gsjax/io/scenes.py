@@ -10,11 +10,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import equinox as eqx
+import numpy as np
+from jaxtyping import Float
 
 from gsjax.io import glb, ksplat, page, ply, sog, splat, spz
 from gsjax.io.compressed_ply import write_compressed_ply
 from gsjax.io.scene_file import SceneError, SceneReport
 from gsjax.scene.gaussians import Gaussians, cull_invalid
+from gsjax.scene.origin import in_numbers
 
 Reader = Callable[[Path], tuple[Gaussians, SceneReport]]
 
@@ -38,11 +41,11 @@ class Format:
 
 FORMATS = {
     ".compressed.ply": Format("PlayCanvas's compressed PLY", write_compressed_ply),
-    ".ply": Format("PLY of 3DGS", ply.write_ply, options=("antialiased",)),
+    ".ply": Format("PLY of 3DGS", ply.write_ply, options=("antialiased", "origin")),
     ".splat": Format(".splat", splat.write_splat, degree=0),
     ".spz": Format("SPZ", spz.write_spz, options=("antialiased",)),
     ".sog": Format("SOG", sog.write_sog, options=("antialiased",)),
-    ".glb": Format("glTF", glb.write_glb),
+    ".glb": Format("glTF", glb.write_glb, options=("origin",)),
     ".html": Format("a page", page.write_page, degree=0, options=("antialiased", "up", "background")),
 }
 """The formats that are written, by the ending of a file; of two that fit, the first."""
@@ -107,6 +110,7 @@ def write_gaussians(
     gaussians: Gaussians,
     *,
     antialiased: bool = False,
+    origin: Float[np.ndarray, "3"] | None = None,
     up: Sequence[float] | None = None,
     background: Sequence[float] | None = None,
 ) -> tuple[str, ...]:
@@ -118,6 +122,8 @@ def write_gaussians(
         path: a .ply, .compressed.ply, .splat, .spz, .sog, .glb, or .html, a page that shows the scene.
         gaussians: the scene, on the host or a device.
         antialiased: whether it is to be drawn antialiased, which .ply, .spz, .sog and a page say.
+        origin: what means are relative to (`SceneReport.origin`, `Photographs.origin`). A .ply and a .glb
+            have room for it, and it is put back; others would round places, which stay relative to it.
         up: of a page alone: the direction that points up; default: -y, as in most PLY files.
         background: of a page alone: RGB, 0 to 1; default: black.
 
@@ -139,14 +145,17 @@ def write_gaussians(
     if drawn.features is not None:
         left_out.append("features")
         drawn = _without(drawn, "features")
-    asked = {"antialiased": antialiased or None, "up": up, "background": background}
+    asked = {"antialiased": antialiased or None, "origin": origin, "up": up, "background": background}
     options = {name: value for name, value in asked.items() if value is not None}
-    for name in options.keys() - set(written.options):
-        if name != "antialiased":
+    no_room = {"antialiased": "that the scene is antialiased"}
+    if origin is not None:
+        no_room["origin"] = f"the origin {in_numbers(origin)}, to which its places are relative"
+    for name in [name for name in options if name not in written.options]:
+        if name not in no_room:
             raise ValueError(
                 f"{name}: expected a page (.html), which alone has it, found {path}; leave it out"
             )
-        left_out.append("that the scene is antialiased")
+        left_out.append(no_room[name])
         del options[name]
     written.write(Path(path), drawn, **options)
     return tuple(left_out)

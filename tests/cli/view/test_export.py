@@ -4,7 +4,9 @@ import numpy as np
 import pytest
 
 from gsjax.cli import main
+from gsjax.io.ply import write_ply
 from gsjax.io.scenes import FORMATS, read_gaussians
+from gsjax.scene.origin import in_world
 from tests.cli.view.conftest import some
 from tests.io.scenes_to_write import ROUNDING, assert_alike
 
@@ -69,6 +71,21 @@ def test_what_is_read_in_one_format_is_written_in_another(export, ply, tmp_path)
     np.testing.assert_allclose(
         np.sort(read_gaussians(ply)[0].means, axis=0), np.sort(some().means, axis=0), atol=0.02
     )
+
+
+@pytest.mark.filterwarnings("ignore:.*they are taken relative to the origin")
+def test_a_scene_far_from_0_keeps_its_places(export, tmp_path):
+    """In UTM coordinates, to a .ply and back from it; other formats have no room for these digits."""
+    far, origin = tmp_path / "far.ply", np.array([500_000.0, 5_000_000.0, 300.0])
+    write_ply(far, some(), origin=origin)
+    assert export(far, tmp_path / "again.ply")[0] == 0
+    back, report = read_gaussians(tmp_path / "again.ply")
+    found = in_world(np.asarray(back.means), report.origin)
+    np.testing.assert_allclose(found, np.asarray(some().means) + origin, rtol=0, atol=1e-6)
+    code, said = export(far, tmp_path / "scene.spz")
+    assert code == 0
+    assert "SPZ leaves out the origin (500000, 5000000, 300), to which its places are relative" in said
+    assert_alike(some(), read_gaussians(tmp_path / "scene.spz")[0], ROUNDING[".spz"])
 
 
 def test_what_is_refused(export, ply, tmp_path):
