@@ -25,9 +25,7 @@ _FLOAT, _BYTE, _POINTS, _VERTICES = 5126, 5121, 0, 34962
 _SHAPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
 
 
-def write_glb(
-    path: Path, gaussians: Gaussians, *, origin: Float[np.ndarray, "3"] | None = None
-) -> None:
+def write_glb(path: Path, gaussians: Gaussians, *, origin: Float[np.ndarray, "3"] | None = None) -> None:
     """Write a .glb, atomically.
 
     Args:
