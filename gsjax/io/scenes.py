@@ -11,7 +11,7 @@ from pathlib import Path
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from gsjax.io import glb, ksplat, page, ply, sog, splat, spz
 from gsjax.io.compressed_ply import write_compressed_ply
@@ -40,11 +40,11 @@ class Format:
 
 
 FORMATS = {
-    ".compressed.ply": Format("PlayCanvas's compressed PLY", write_compressed_ply),
+    ".compressed.ply": Format("PlayCanvas's compressed PLY", write_compressed_ply, options=("order",)),
     ".ply": Format("PLY of 3DGS", ply.write_ply, options=("antialiased", "origin")),
     ".splat": Format(".splat", splat.write_splat, degree=0),
     ".spz": Format("SPZ", spz.write_spz, options=("antialiased",)),
-    ".sog": Format("SOG", sog.write_sog, options=("antialiased",)),
+    ".sog": Format("SOG", sog.write_sog, options=("antialiased", "order")),
     ".glb": Format("glTF", glb.write_glb, options=("origin",)),
     ".html": Format("a page", page.write_page, degree=0, options=("antialiased", "up", "background")),
 }
@@ -111,6 +111,7 @@ def write_gaussians(
     *,
     antialiased: bool = False,
     origin: Float[np.ndarray, "3"] | None = None,
+    order: Int[np.ndarray, "N"] | None = None,
     up: Sequence[float] | None = None,
     background: Sequence[float] | None = None,
 ) -> tuple[str, ...]:
@@ -124,6 +125,8 @@ def write_gaussians(
         antialiased: whether it is to be drawn antialiased, which .ply, .spz, .sog and a page say.
         origin: what means are relative to (`SceneReport.origin`, `Photographs.origin`). A .ply and a .glb
             have room for it, and it is put back; others would round places, which stay relative to it.
+        order: of .compressed.ply and .sog alone: rows in the order of the file; default: spatial. The others
+            keep the order of the scene.
         up: of a page alone: the direction that points up; default: -y, as in most PLY files.
         background: of a page alone: RGB, 0 to 1; default: black.
 
@@ -138,6 +141,8 @@ def write_gaussians(
     drawn, culled = cull_invalid(gaussians)
     if drawn.num == 0:
         raise ValueError(f"{path}: expected Gaussians that can be drawn, found none of {gaussians.num}")
+    if order is not None and len(order) != drawn.num:
+        raise ValueError(f"order: expected {drawn.num} rows, as many as can be drawn, found {len(order)}")
     left_out = [f"what cannot be drawn, {culled} of {gaussians.num} Gaussians"] if culled else []
     if drawn.sh_degree > written.degree:
         left_out.append("view-dependent colour")
@@ -146,6 +151,8 @@ def write_gaussians(
         left_out.append("features")
         drawn = _without(drawn, "features")
     asked = {"antialiased": antialiased or None, "origin": origin, "up": up, "background": background}
+    if "order" in written.options:
+        asked["order"] = order
     options = {name: value for name, value in asked.items() if value is not None}
     no_room = {"antialiased": "that the scene is antialiased"}
     if origin is not None:
