@@ -4,14 +4,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
+import numpy as np
 import tyro
 from rich.console import Console
 
 from gsjax.engine.messages import Notes, stage
 from gsjax.engine.options import Common
 from gsjax.engine.viewables import UP, Up, open_viewable
+from gsjax.io.page import Film
 from gsjax.io.scenes import FORMATS, format_of, write_gaussians
+from gsjax.viz.viewer import Viewable
 from gsjax.viz.viewer.cameras import scene_up
+from gsjax.viz.viewer.player import frame_pause
 
 HELP = (
     " The ending of OUT names the format: .ply (3DGS), .compressed.ply (PlayCanvas), .splat, .spz (Niantic), "
@@ -48,13 +52,14 @@ def run(options: Options) -> int:
     with Notes(console) as notes:
         with stage(console, f"reading {options.path}"):
             scene, _ = open_viewable(options.path, notes)
-        if scene.num_frames > 1:
+        if scene.num_frames > 1 and "film" not in written.options:
             notes.warn(f"{options.path} moves; only its first of {scene.num_frames} frames is written")
         look: dict[str, Any] = {}
         if "up" in written.options:
             known = scene_up(scene) if options.path.is_dir() else UP["-y"]
             look["up"] = (known if options.up == "auto" else UP[options.up]).tolist()
             look["background"] = scene.background
+            look["film"] = _film_of(scene)
         with stage(console, f"writing {options.out}"):
             left_out = write_gaussians(
                 options.out, scene.gaussians, antialiased=scene.antialiased, origin=scene.origin, **look
@@ -65,6 +70,16 @@ def run(options: Options) -> int:
     text = f"{scene.gaussians.num:,} Gaussians, {written.name}, {_megabytes(size)}"
     Console(highlight=False).print(f"[bold]scene[/]  {options.out}: {text}", soft_wrap=True)
     return 0
+
+
+def _film_of(scene: Viewable) -> Film | None:
+    """A scene over time, at the rate of its recording; None if it stands still."""
+    if scene.num_frames == 1:
+        return None
+    times = scene.times
+    if times is None:
+        times = np.arange(scene.num_frames) * frame_pause(None)
+    return Film(scene.at, times, scene.num_moving)
 
 
 def _check(options: Options) -> None:
