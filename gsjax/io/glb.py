@@ -2,8 +2,8 @@
 
 Attributes of one primitive of points: POSITION, rotations x y z w, logarithms of scales, opacities 0 to 1 and
 an accessor for each coefficient of the harmonics, all float32; and COLOR_0, by which programs without the
-extension show points. Y of glTF points up and that of a 3DGS PLY down, so the node is turned half around X. It
-is also shifted to the origin of a scene far from 0, for JSON has the digits that float32 lacks.
+extension show points. Y of glTF points up and that of a 3DGS PLY down, so the node is turned half around X.
+It is also shifted to the origin of a scene far from 0, for JSON has the digits that float32 lacks.
 Source: extensions/2.0/Khronos/KHR_gaussian_splatting in github.com/KhronosGroup/glTF.
 """
 

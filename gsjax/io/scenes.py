@@ -46,7 +46,7 @@ FORMATS = {
     ".spz": Format("SPZ", spz.write_spz, options=("antialiased",)),
     ".sog": Format("SOG", sog.write_sog, options=("antialiased", "order")),
     ".glb": Format("glTF", glb.write_glb, options=("origin",)),
-    ".html": Format("a page", page.write_page, degree=0, options=("antialiased", "up", "background")),
+    ".html": Format("a page", page.write_page, degree=0, options=("antialiased", "up", "background", "film")),
 }
 """The formats that are written, by the ending of a file; of two that fit, the first."""
 
@@ -114,6 +114,7 @@ def write_gaussians(
     order: Int[np.ndarray, "N"] | None = None,
     up: Sequence[float] | None = None,
     background: Sequence[float] | None = None,
+    film: page.Film | None = None,
 ) -> tuple[str, ...]:
     """Write Gaussians in the format that the ending of `path` names, atomically.
 
@@ -129,13 +130,14 @@ def write_gaussians(
             keep the order of the scene.
         up: of a page alone: the direction that points up; default: -y, as in most PLY files.
         background: of a page alone: RGB, 0 to 1; default: black.
+        film: of a page alone: the scene over time, which it plays; `gaussians` is its first frame.
 
     Returns:
         What was left out, each in a few words.
 
     Raises:
         ValueError: no format has that ending, none of the Gaussians can be drawn, the format has no room for
-            them, or an option is given that it does not take.
+            them, an option is given that it does not take, or not all Gaussians of a film can be drawn.
     """
     written = format_of(path)
     drawn, culled = cull_invalid(gaussians)
@@ -143,6 +145,8 @@ def write_gaussians(
         raise ValueError(f"{path}: expected Gaussians that can be drawn, found none of {gaussians.num}")
     if order is not None and len(order) != drawn.num:
         raise ValueError(f"order: expected {drawn.num} rows, as many as can be drawn, found {len(order)}")
+    if film is not None and culled:
+        raise ValueError(f"film: expected Gaussians that can all be drawn, found {culled} that cannot")
     left_out = [f"what cannot be drawn, {culled} of {gaussians.num} Gaussians"] if culled else []
     if drawn.sh_degree > written.degree:
         left_out.append("view-dependent colour")
@@ -150,9 +154,9 @@ def write_gaussians(
     if drawn.features is not None:
         left_out.append("features")
         drawn = _without(drawn, "features")
-    asked = {"antialiased": antialiased or None, "origin": origin, "up": up, "background": background}
-    if "order" in written.options:
-        asked["order"] = order
+    asked = {"antialiased": antialiased or None, "origin": origin}
+    asked |= {"up": up, "background": background, "film": film}
+    asked |= {"order": order} if "order" in written.options else {}
     options = {name: value for name, value in asked.items() if value is not None}
     no_room = {"antialiased": "that the scene is antialiased"}
     if origin is not None:
