@@ -1,5 +1,7 @@
-"""`gsjax export`: the Gaussians of a run or a file in another format, or as a page that shows them; of a scene
-that moves, as numbered files or as a page that plays."""
+"""`gsjax export`: the Gaussians of a run or a file in another format, or as a page that shows them.
+
+A scene that moves is written as numbered files, or as a page that plays.
+"""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,7 +17,7 @@ from gsjax.engine.recording import parse_frames
 from gsjax.engine.viewables import UP, Up, open_viewable
 from gsjax.io.page import Film
 from gsjax.io.scenes import FORMATS, Format, format_of, write_gaussians
-from gsjax.io.sequences import frame_path, is_numbered, write_frames
+from gsjax.io.sequences import frame_files, frame_path, is_numbered, write_frames
 from gsjax.scene.gaussians import Gaussians
 from gsjax.viz.viewer import Viewable
 from gsjax.viz.viewer.cameras import scene_up
@@ -72,8 +74,8 @@ def run(options: Options) -> int:
         _expect_new(files, options)
         if len(frames) > 1 and not numbered and "film" not in written.options:
             notes.warn(
-                f"{options.path} moves; only frame {frames[0]} of {scene.num_frames} is written (--frames chooses "
-                "another; a page plays all, and %04d in the name makes a file of each)"
+                f"{options.path} moves; only frame {frames[0]} of {scene.num_frames} is written (--frames "
+                "chooses another; a page plays all, and %04d in the name makes a file of each)"
             )
         known = {"antialiased": scene.antialiased, "origin": scene.origin}
         with stage(console, f"writing {options.out}"):
@@ -84,6 +86,11 @@ def run(options: Options) -> int:
                 left_out = write_gaussians(options.out, _at(scene, frames[0]), **known, **look)
         for what in left_out:
             notes.warn(f"{options.out}: {written.name} leaves out {what}")
+        if numbered and (others := set(frame_files(options.out.parent)) - set(files)):
+            notes.warn(
+                f"{options.out.parent} holds {len(others)} more numbered files, such as {min(others).name}, which "
+                "programs take for frames of the same scene"
+            )
     size = sum(file.stat().st_size for file in files)
     text = f"{scene.gaussians.num:,} Gaussians, {written.name}, {_megabytes(size)}"
     if len(frames) > 1 and (numbered or "film" in written.options):
@@ -121,13 +128,18 @@ def _check(options: Options, written: Format) -> None:
         raise IsADirectoryError(
             f"{out}: expected a file, found a folder; name one in it that ends in {', '.join(FORMATS)}"
         )
-    if out.exists() and options.path.exists() and out.samefile(options.path):
-        raise FileExistsError(f"{out}: expected another file than the one that is read; name another OUT")
+    _expect_new([out], options)  # before anything is read
 
 
 def _expect_new(files: list[Path], options: Options) -> None:
     """Raises a FileExistsError where a file must not be replaced."""
     there = [file for file in files if file.exists()]
+    read = {file.resolve() for file in frame_files(options.path) or [options.path]}
+    for file in there:
+        if file.resolve() in read:
+            raise FileExistsError(
+                f"{file}: expected another file than the one that is read; name another OUT"
+            )
     if there and not options.overwrite:
         raise FileExistsError(
             f"{there[0]}: is there already; name another OUT, or replace it with --overwrite"

@@ -1,5 +1,6 @@
 """What a file of Gaussians holds, as `gsjax info` prints it."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -34,6 +35,18 @@ def describe_scene(file: Path) -> dict[str, str]:
     if report.extra:
         facts["not read"] = ", ".join(report.extra)
     return facts
+
+
+def describe_frames(files: Sequence[Path]) -> dict[str, str]:
+    """Facts about a scene that moves.
+
+    Args:
+        files: of its frames, of which the first is described.
+
+    Raises:
+        SceneError: the first holds no Gaussians.
+    """
+    return {"frames": f"{len(files)}, {files[0].name} to {files[-1].name}"} | describe_scene(files[0])
 
 
 def origin_fact(origin: Float[np.ndarray, "3"] | None) -> dict[str, str]:

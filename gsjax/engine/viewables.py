@@ -1,5 +1,6 @@
-"""The scenes that `gsjax view` opens: a run of any kind, or a file of Gaussians."""
+"""The scenes that `gsjax view` opens: a run of any kind, a file of Gaussians, or a folder of numbered ones."""
 
+import warnings
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Literal
@@ -18,7 +19,7 @@ from gsjax.engine.distill.file import NAME
 from gsjax.engine.distill.query import QueryableField
 from gsjax.engine.distill.saved import AS_IT_WAS, FieldRun, Whereabouts, field_of, open_field_run
 from gsjax.engine.files import read_drawable, reopen
-from gsjax.engine.folder import expect_run
+from gsjax.engine.folder import expect_run, is_run
 from gsjax.engine.messages import Notes, describe
 from gsjax.engine.parts.saved import blend_of, open_parts_run, read_parts
 from gsjax.engine.parts.viewer import Filmed, camera_names, editing_of
@@ -26,14 +27,17 @@ from gsjax.engine.photographs import photographs_of_run
 from gsjax.engine.query import asking_of
 from gsjax.engine.recording import Recording
 from gsjax.engine.track.saved import open_run, read_tracking
+from gsjax.io.sequences import frame_files
 from gsjax.methods.deform import DeformResult
 from gsjax.methods.deform.query import most_likely
+from gsjax.scene.origin import moved_to
 from gsjax.viz.colors import to_uint8
 from gsjax.viz.viewer import Motion, Shots, Viewable, moved
 
 Up = Literal["auto", "x", "y", "z", "-x", "-y", "-z"]
 UP = {sign + axis: s * np.eye(3)[i] for sign, s in (("", 1), ("-", -1)) for i, axis in enumerate("xyz")}
 """Directions by their names."""
+_SAME_COLOR = 0.1  # of a coefficient: two steps of the coarsest format
 _AGAIN = "reconstruct it again with this version of gsjax"
 
 
@@ -41,7 +45,8 @@ def open_viewable(path: Path, notes: Notes, now: Whereabouts = AS_IT_WAS) -> tup
     """The scene at a path, and the folder for screenshots.
 
     Args:
-        path: a run, a field, or a file of Gaussians in any format that `read_gaussians` reads.
+        path: a run, a field, a file of Gaussians in any format that `read_gaussians` reads, or a folder of
+            numbered ones, the frames of a scene that moves.
         notes: collects warnings.
         now: the present paths of what a field or a fit refers to.
 
@@ -65,6 +70,9 @@ def open_viewable(path: Path, notes: Notes, now: Whereabouts = AS_IT_WAS) -> tup
         raise FileNotFoundError(
             f"{path}: expected a run or a file of Gaussians, found nothing there; check the path"
         )
+    if not is_run(path) and (files := frame_files(path)):
+        _expect_only((), now, f"{path} is a folder of files")
+        return _of_files(path, files, notes), path
     if (path / NAME).is_file():
         return _of_field(path, notes, now), path
     expect_run(path)
@@ -85,6 +93,33 @@ def open_viewable(path: Path, notes: Notes, now: Whereabouts = AS_IT_WAS) -> tup
                 )
             return of_run(path, notes), path
     return _of_fit(path, notes, now), path
+
+
+def _of_files(path: Path, files: list[Path], notes: Notes) -> Viewable:
+    """The scene whose frames are files, in their order; in the coordinates of the first."""
+    first, report = read_drawable(files[0])
+    frames = [first]
+    for file in files[1:]:
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", ".*relative to the origin")  # as was said of the first
+            there, known = read_drawable(file)
+        if (there.num, there.sh_degree) != (first.num, first.sh_degree):
+            raise ValueError(
+                f"{file}: expected {first.num} Gaussians of degree {first.sh_degree} as in {files[0].name}, "
+                f"found {there.num} of degree {there.sh_degree}; view it alone"
+            )
+        frames.append(moved_to(there, known.origin, report.origin))
+    colors = np.asarray(first.sh0)
+    if max(np.abs(np.asarray(each.sh0) - colors).max() for each in frames) > _SAME_COLOR:
+        notes.warn("colours change from frame to frame; all are shown in those of the first")
+    return Viewable(
+        path.absolute().name,
+        first,
+        report.labels,
+        motion=Motion(len(frames), first.num, frames.__getitem__),
+        antialiased=bool(report.antialiased),
+        origin=report.origin,
+    )
 
 
 def _expect_only(used: tuple[str, ...], now: Whereabouts, because: str) -> None:
