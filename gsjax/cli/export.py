@@ -88,8 +88,8 @@ def run(options: Options) -> int:
             notes.warn(f"{options.out}: {written.name} leaves out {what}")
         if numbered and (others := set(frame_files(options.out.parent)) - set(files)):
             notes.warn(
-                f"{options.out.parent} holds {len(others)} more numbered files, such as {min(others).name}, which "
-                "programs take for frames of the same scene"
+                f"{options.out.parent} holds {len(others)} more numbered files, such as {min(others).name}, "
+                "which programs take for frames of the same scene"
             )
     size = sum(file.stat().st_size for file in files)
     text = f"{scene.gaussians.num:,} Gaussians, {written.name}, {_megabytes(size)}"

@@ -1,4 +1,4 @@
-"""The scenes that `gsjax view` opens: a run of any kind, a file of Gaussians, or a folder of numbered ones."""
+"""The scenes that `gsjax view` opens: a run of any kind, a file of Gaussians or a folder of numbered ones."""
 
 import warnings
 from dataclasses import fields, replace

@@ -5,7 +5,6 @@ import numpy as np
 import pytest
 
 from gsjax.cli import main
-from gsjax.io.ply import write_ply
 from gsjax.engine.viewables import open_viewable
 from gsjax.io.ply import write_ply
 from gsjax.io.scenes import FORMATS, read_gaussians
