@@ -14,7 +14,7 @@ from gsjax.data import Photographs, Sequence, open_photographs, open_sequence, p
 from gsjax.data.consistency import check_photographs, check_recording
 from gsjax.data.errors import MissingFile
 from gsjax.data.open import is_photographs, is_recording
-from gsjax.engine.folder import expect_dataset, is_run
+from gsjax.engine.folder import expect_dataset
 from gsjax.engine.info_picture import by_camera, by_split, write_picture
 from gsjax.engine.info_scene import describe_frames, describe_scene, origin_fact
 from gsjax.engine.messages import Notes
@@ -49,7 +49,7 @@ def run(options: Options) -> int:
             f"--picture: expected a name that ends in {', '.join(PICTURES)}, found {options.picture.name!r}"
         )
     path = Path(options.dataset)
-    files = frame_files(path) if not is_run(path) else []
+    files = frame_files(path)
     if files or (path.is_file() and is_scene(path)):
         if options.picture is not None:
             raise ValueError(f"--picture: draws cameras, and {path} has none; leave it out")

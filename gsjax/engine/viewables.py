@@ -19,7 +19,7 @@ from gsjax.engine.distill.file import NAME
 from gsjax.engine.distill.query import QueryableField
 from gsjax.engine.distill.saved import AS_IT_WAS, FieldRun, Whereabouts, field_of, open_field_run
 from gsjax.engine.files import read_drawable, reopen
-from gsjax.engine.folder import expect_run, is_run
+from gsjax.engine.folder import expect_run
 from gsjax.engine.messages import Notes, describe
 from gsjax.engine.parts.saved import blend_of, open_parts_run, read_parts
 from gsjax.engine.parts.viewer import Filmed, camera_names, editing_of
@@ -70,7 +70,7 @@ def open_viewable(path: Path, notes: Notes, now: Whereabouts = AS_IT_WAS) -> tup
         raise FileNotFoundError(
             f"{path}: expected a run or a file of Gaussians, found nothing there; check the path"
         )
-    if not is_run(path) and (files := frame_files(path)):
+    if files := frame_files(path):
         _expect_only((), now, f"{path} is a folder of files")
         return _of_files(path, files, notes), path
     if (path / NAME).is_file():
