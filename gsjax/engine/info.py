@@ -16,13 +16,14 @@ from gsjax.data.errors import MissingFile
 from gsjax.data.open import is_photographs, is_recording
 from gsjax.engine.folder import expect_dataset
 from gsjax.engine.info_picture import by_camera, by_split, write_picture
-from gsjax.engine.info_scene import describe_scene, origin_fact
+from gsjax.engine.info_scene import describe_frames, describe_scene, origin_fact
 from gsjax.engine.messages import Notes
 from gsjax.engine.options import Common, OneDataset, Reading
 from gsjax.engine.summary import Column, Table
 from gsjax.engine.terminal import print_facts, print_table
 from gsjax.geometry.sight import bent
 from gsjax.io.scenes import is_scene
+from gsjax.io.sequences import frame_files
 from gsjax.methods.fit import extent_of
 from gsjax.scene.origin import in_world
 
@@ -48,12 +49,14 @@ def run(options: Options) -> int:
         raise ValueError(
             f"--picture: expected a name that ends in {', '.join(PICTURES)}, found {options.picture.name!r}"
         )
-    if (file := Path(options.dataset)).is_file() and is_scene(file):
+    path = Path(options.dataset)
+    files = frame_files(path)
+    if files or (path.is_file() and is_scene(path)):
         if options.picture is not None:
-            raise ValueError(f"--picture: draws cameras, and {file} has none; leave it out")
+            raise ValueError(f"--picture: draws cameras, and {path} has none; leave it out")
         with Notes(Console(stderr=True, highlight=False)):
-            facts = describe_scene(file)
-        print_facts(facts, title=file.name)
+            facts = describe_frames(files) if files else describe_scene(path)
+        print_facts(facts, title=path.name)
         return 0
     expect_dataset(options.dataset)
     table = None

@@ -1,12 +1,13 @@
 """What a file of Gaussians holds, as `gsjax info` prints it."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
 
 from gsjax.io.scenes import read_gaussians
-from gsjax.scene.origin import in_world
+from gsjax.scene.origin import in_numbers, in_world
 
 
 def describe_scene(file: Path) -> dict[str, str]:
@@ -36,10 +37,22 @@ def describe_scene(file: Path) -> dict[str, str]:
     return facts
 
 
+def describe_frames(files: Sequence[Path]) -> dict[str, str]:
+    """Facts about a scene that moves.
+
+    Args:
+        files: of its frames, of which the first is described.
+
+    Raises:
+        SceneError: the first holds no Gaussians.
+    """
+    return {"frames": f"{len(files)}, {files[0].name} to {files[-1].name}"} | describe_scene(files[0])
+
+
 def origin_fact(origin: Float[np.ndarray, "3"] | None) -> dict[str, str]:
     """The fact about data that lie far from 0; none for others.
 
     Args:
         origin: what was taken off; None for data near 0.
     """
-    return {} if origin is None else {"origin": f"({', '.join(f'{value:.12g}' for value in origin)})"}
+    return {} if origin is None else {"origin": in_numbers(origin)}

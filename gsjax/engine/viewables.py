@@ -1,6 +1,7 @@
-"""The scenes that `gsjax view` opens: a run of any kind, or a file of Gaussians."""
+"""The scenes that `gsjax view` opens: a run of any kind, a file of Gaussians or a folder of numbered ones."""
 
-from dataclasses import fields
+import warnings
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Literal
 
@@ -26,14 +27,17 @@ from gsjax.engine.photographs import photographs_of_run
 from gsjax.engine.query import asking_of
 from gsjax.engine.recording import Recording
 from gsjax.engine.track.saved import open_run, read_tracking
+from gsjax.io.sequences import frame_files
 from gsjax.methods.deform import DeformResult
 from gsjax.methods.deform.query import most_likely
+from gsjax.scene.origin import moved_to
 from gsjax.viz.colors import to_uint8
 from gsjax.viz.viewer import Motion, Shots, Viewable, moved
 
 Up = Literal["auto", "x", "y", "z", "-x", "-y", "-z"]
 UP = {sign + axis: s * np.eye(3)[i] for sign, s in (("", 1), ("-", -1)) for i, axis in enumerate("xyz")}
 """Directions by their names."""
+_SAME_COLOR = 0.1  # of a coefficient: two steps of the coarsest format
 _AGAIN = "reconstruct it again with this version of gsjax"
 
 
@@ -41,7 +45,8 @@ def open_viewable(path: Path, notes: Notes, now: Whereabouts = AS_IT_WAS) -> tup
     """The scene at a path, and the folder for screenshots.
 
     Args:
-        path: a run, a field, or a file of Gaussians in any format that `read_gaussians` reads.
+        path: a run, a field, a file of Gaussians in any format that `read_gaussians` reads, or a folder of
+            numbered ones, the frames of a scene that moves.
         notes: collects warnings.
         now: the present paths of what a field or a fit refers to.
 
@@ -53,12 +58,21 @@ def open_viewable(path: Path, notes: Notes, now: Whereabouts = AS_IT_WAS) -> tup
     if path.is_file():
         _expect_only((), now, f"{path} is a file")
         gaussians, report = read_drawable(path)
-        scene = Viewable(path.name, gaussians, report.labels, antialiased=bool(report.antialiased))
+        scene = Viewable(
+            path.name,
+            gaussians,
+            report.labels,
+            antialiased=bool(report.antialiased),
+            origin=report.origin,
+        )
         return scene, path.absolute().parent
     if not path.is_dir():
         raise FileNotFoundError(
             f"{path}: expected a run or a file of Gaussians, found nothing there; check the path"
         )
+    if files := frame_files(path):
+        _expect_only((), now, f"{path} is a folder of files")
+        return _of_files(path, files, notes), path
     if (path / NAME).is_file():
         return _of_field(path, notes, now), path
     expect_run(path)
@@ -81,6 +95,33 @@ def open_viewable(path: Path, notes: Notes, now: Whereabouts = AS_IT_WAS) -> tup
     return _of_fit(path, notes, now), path
 
 
+def _of_files(path: Path, files: list[Path], notes: Notes) -> Viewable:
+    """The scene whose frames are files, in their order; in the coordinates of the first."""
+    first, report = read_drawable(files[0])
+    frames = [first]
+    for file in files[1:]:
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", ".*relative to the origin")  # as was said of the first
+            there, known = read_drawable(file)
+        if (there.num, there.sh_degree) != (first.num, first.sh_degree):
+            raise ValueError(
+                f"{file}: expected {first.num} Gaussians of degree {first.sh_degree} as in {files[0].name}, "
+                f"found {there.num} of degree {there.sh_degree}; view it alone"
+            )
+        frames.append(moved_to(there, known.origin, report.origin))
+    colors = np.asarray(first.sh0)
+    if max(np.abs(np.asarray(each.sh0) - colors).max() for each in frames) > _SAME_COLOR:
+        notes.warn("colours change from frame to frame; all are shown in those of the first")
+    return Viewable(
+        path.absolute().name,
+        first,
+        report.labels,
+        motion=Motion(len(frames), first.num, frames.__getitem__),
+        antialiased=bool(report.antialiased),
+        origin=report.origin,
+    )
+
+
 def _expect_only(used: tuple[str, ...], now: Whereabouts, because: str) -> None:
     """Raises a ValueError if a path is given that does not apply."""
     unused = [f.name for f in fields(now) if f.name not in used and getattr(now, f.name) is not None]
@@ -99,6 +140,7 @@ def _of_field(path: Path, notes: Notes, now: Whereabouts) -> Viewable:
         shots=None if run.photographs is None else _shots_of(run.photographs),
         antialiased=run.rasterize_mode == "antialiased",
         unit=run.unit,
+        origin=run.origin,
         asking=asking_of(QueryableField(run, many=True)),
     )
 
@@ -151,6 +193,7 @@ def _of_fit(path: Path, notes: Notes, now: Whereabouts) -> Viewable:
         shots=shots,
         background=background,
         antialiased=antialiased,
+        origin=origin,
         asking=None if field is None else asking_of(QueryableField(field, many=True)),
     )
 
@@ -163,8 +206,9 @@ def _of_deformation(path: Path, notes: Notes, weights: Path | None) -> Viewable:
     if weights is not None and kind in (None, "classes", "closed"):
         raise ValueError(f"--weights: {path} has no CLIP features; leave it out")
     first, labels, asking, times = result.at(0.0), None, None, result.timeline.times
+    origin = origin_of(path / DEFORMATION)
     if result.meaning is not None and first.features is not None:
-        asking = asking_of(QueryableScene(path, result, weights, origin_of(path / DEFORMATION)))
+        asking = asking_of(QueryableScene(path, result, weights, origin))
         likely = probabilities_of(first.features, jnp.asarray(result.meaning.codebook, jnp.float32))
         labels = 1 + most_likely(np.asarray(likely))
     return Viewable(
@@ -176,6 +220,7 @@ def _of_deformation(path: Path, notes: Notes, weights: Path | None) -> Viewable:
         times=times * result.timeline.seconds,
         shots=_shots_of_deformation(path, result, notes),
         unit="m" if result.timeline.metric else "",
+        origin=origin,
         asking=asking,
     )
 
@@ -187,11 +232,12 @@ def _of_track(path: Path, notes: Notes) -> Viewable:
     try:
         saved = open_run(path)
     except ValueError as error:
-        tracking = read_tracking(path)  # if that is damaged, it is an error
+        tracking, origin = read_tracking(path)  # if that is damaged, it is an error
         notes.warn(f"its recording is not shown: {error}")
     else:
         tracking, names = saved.tracking, saved.names
         recording = saved.recording.judged
+        origin = recording.origin
         shots, times = _shots_of_recording(saved.recording), recording.times[: tracking.num_frames]
     count = tracking.scene.num_moving
     return Viewable(
@@ -203,12 +249,13 @@ def _of_track(path: Path, notes: Notes) -> Viewable:
         times=times,
         shots=shots,
         unit="m",
+        origin=origin,
     )
 
 
 def _of_parts(path: Path, notes: Notes) -> Viewable:
     """The scene of a run of `gsjax parts` over time, with its cameras if the recording is still there."""
-    layer, names = read_parts(path)
+    layer, names, origin = read_parts(path)
     saved, shots = None, None
     try:
         saved = open_parts_run(path)
@@ -221,7 +268,8 @@ def _of_parts(path: Path, notes: Notes) -> Viewable:
             notes.warn("a partial run: it has only the frames that were followed, and no cameras")
     times, blend = np.asarray(layer.trajectory.times), blend_of(path) if saved is None else saved.blend
     filmed = Filmed(path.absolute().name, names, blend, times - times[0], shots)
-    return filmed.viewable((layer,), None if saved is None else editing_of(saved, filmed))
+    scene = filmed.viewable((layer,), None if saved is None else editing_of(saved, filmed))
+    return replace(scene, origin=origin)
 
 
 def _shots_of(photographs: Photographs) -> Shots:

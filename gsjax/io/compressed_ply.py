@@ -23,7 +23,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float, UInt32
+from jaxtyping import Float, Int, UInt32
 from plyfile import PlyData, PlyElement
 
 from gsjax.io.atomic import atomic_write
@@ -196,17 +196,21 @@ def _range_fault(chunks: np.ndarray) -> Fault | None:
     return None
 
 
-def write_compressed_ply(path: Path, gaussians: Gaussians) -> None:
-    """Write a compressed PLY, atomically. Gaussians come in spatial order, so that chunks are small.
+def write_compressed_ply(
+    path: Path, gaussians: Gaussians, *, order: Int[np.ndarray, "N"] | None = None
+) -> None:
+    """Write a compressed PLY, atomically. Gaussians come in spatial order unless another is given, so that
+    chunks are small.
 
     Coefficients of view-dependent colour are clipped to -4 to 4.
 
     Args:
         path: the file.
         gaussians: Gaussians that can all be drawn.
+        order: their rows in the order of the file.
     """
     columns = columns_of(gaussians)
-    order = spatial_order(columns.means)
+    order = spatial_order(columns.means) if order is None else order
     columns = Columns(*(value[order] for value in columns))
     chunks = np.empty(-(-gaussians.num // CHUNK_SIZE), [(name, "<f4") for name in [*_BOUNDS, *_COLOR_BOUNDS]])
     packed = np.empty(gaussians.num, [(name, "<u4") for name in PACKED])

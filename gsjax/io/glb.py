@@ -3,6 +3,7 @@
 Attributes of one primitive of points: POSITION, rotations x y z w, logarithms of scales, opacities 0 to 1 and
 an accessor for each coefficient of the harmonics, all float32; and COLOR_0, by which programs without the
 extension show points. Y of glTF points up and that of a 3DGS PLY down, so the node is turned half around X.
+It is also shifted to the origin of a scene far from 0, for JSON has the digits that float32 lacks.
 Source: extensions/2.0/Khronos/KHR_gaussian_splatting in github.com/KhronosGroup/glTF.
 """
 
@@ -12,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
 from gsjax.io.atomic import atomic_write
 from gsjax.io.scene_file import SH_C0, columns_of, to_bytes
@@ -23,12 +25,13 @@ _FLOAT, _BYTE, _POINTS, _VERTICES = 5126, 5121, 0, 34962
 _SHAPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
 
 
-def write_glb(path: Path, gaussians: Gaussians) -> None:
+def write_glb(path: Path, gaussians: Gaussians, *, origin: Float[np.ndarray, "3"] | None = None) -> None:
     """Write a .glb, atomically.
 
     Args:
         path: the file.
         gaussians: Gaussians that can all be drawn.
+        origin: what means are relative to; None for 0.
     """
     attributes = _attributes(gaussians)
     views, accessors, start = [], [], 0
@@ -42,12 +45,15 @@ def write_glb(path: Path, gaussians: Gaussians) -> None:
         "mode": _POINTS,
         "extensions": {_EXTENSION: {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}},
     }
+    node: dict[str, Any] = {"mesh": 0, "rotation": [1, 0, 0, 0]}
+    if origin is not None:
+        node["translation"] = (origin * [1, -1, -1]).tolist()  # glTF turns a node before it shifts it
     scene = {
         "asset": {"version": "2.0", "generator": "gsjax"},
         "extensionsUsed": [_EXTENSION],
         "scene": 0,
         "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0, "rotation": [1, 0, 0, 0]}],
+        "nodes": [node],
         "meshes": [{"primitives": [primitive]}],
         "buffers": [{"byteLength": start}],
         "bufferViews": views,

@@ -10,11 +10,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import equinox as eqx
+import numpy as np
+from jaxtyping import Float, Int
 
 from gsjax.io import glb, ksplat, page, ply, sog, splat, spz
 from gsjax.io.compressed_ply import write_compressed_ply
 from gsjax.io.scene_file import SceneError, SceneReport
 from gsjax.scene.gaussians import Gaussians, cull_invalid
+from gsjax.scene.origin import in_numbers
 
 Reader = Callable[[Path], tuple[Gaussians, SceneReport]]
 
@@ -37,13 +40,13 @@ class Format:
 
 
 FORMATS = {
-    ".compressed.ply": Format("PlayCanvas's compressed PLY", write_compressed_ply),
-    ".ply": Format("PLY of 3DGS", ply.write_ply, options=("antialiased",)),
+    ".compressed.ply": Format("PlayCanvas's compressed PLY", write_compressed_ply, options=("order",)),
+    ".ply": Format("PLY of 3DGS", ply.write_ply, options=("antialiased", "origin")),
     ".splat": Format(".splat", splat.write_splat, degree=0),
     ".spz": Format("SPZ", spz.write_spz, options=("antialiased",)),
-    ".sog": Format("SOG", sog.write_sog, options=("antialiased",)),
-    ".glb": Format("glTF", glb.write_glb),
-    ".html": Format("a page", page.write_page, degree=0, options=("antialiased", "up", "background")),
+    ".sog": Format("SOG", sog.write_sog, options=("antialiased", "order")),
+    ".glb": Format("glTF", glb.write_glb, options=("origin",)),
+    ".html": Format("a page", page.write_page, degree=0, options=("antialiased", "up", "background", "film")),
 }
 """The formats that are written, by the ending of a file; of two that fit, the first."""
 
@@ -107,8 +110,11 @@ def write_gaussians(
     gaussians: Gaussians,
     *,
     antialiased: bool = False,
+    origin: Float[np.ndarray, "3"] | None = None,
+    order: Int[np.ndarray, "N"] | None = None,
     up: Sequence[float] | None = None,
     background: Sequence[float] | None = None,
+    film: page.Film | None = None,
 ) -> tuple[str, ...]:
     """Write Gaussians in the format that the ending of `path` names, atomically.
 
@@ -118,20 +124,29 @@ def write_gaussians(
         path: a .ply, .compressed.ply, .splat, .spz, .sog, .glb, or .html, a page that shows the scene.
         gaussians: the scene, on the host or a device.
         antialiased: whether it is to be drawn antialiased, which .ply, .spz, .sog and a page say.
+        origin: what means are relative to (`SceneReport.origin`, `Photographs.origin`). A .ply and a .glb
+            have room for it, and it is put back; others would round places, which stay relative to it.
+        order: of .compressed.ply and .sog alone: rows in the order of the file; default: spatial. The others
+            keep the order of the scene.
         up: of a page alone: the direction that points up; default: -y, as in most PLY files.
         background: of a page alone: RGB, 0 to 1; default: black.
+        film: of a page alone: the scene over time, which it plays; `gaussians` is its first frame.
 
     Returns:
         What was left out, each in a few words.
 
     Raises:
         ValueError: no format has that ending, none of the Gaussians can be drawn, the format has no room for
-            them, or an option is given that it does not take.
+            them, an option is given that it does not take, or not all Gaussians of a film can be drawn.
     """
     written = format_of(path)
     drawn, culled = cull_invalid(gaussians)
     if drawn.num == 0:
         raise ValueError(f"{path}: expected Gaussians that can be drawn, found none of {gaussians.num}")
+    if order is not None and len(order) != drawn.num:
+        raise ValueError(f"order: expected {drawn.num} rows, as many as can be drawn, found {len(order)}")
+    if film is not None and culled:
+        raise ValueError(f"film: expected Gaussians that can all be drawn, found {culled} that cannot")
     left_out = [f"what cannot be drawn, {culled} of {gaussians.num} Gaussians"] if culled else []
     if drawn.sh_degree > written.degree:
         left_out.append("view-dependent colour")
@@ -139,14 +154,19 @@ def write_gaussians(
     if drawn.features is not None:
         left_out.append("features")
         drawn = _without(drawn, "features")
-    asked = {"antialiased": antialiased or None, "up": up, "background": background}
+    asked = {"antialiased": antialiased or None, "origin": origin}
+    asked |= {"up": up, "background": background, "film": film}
+    asked |= {"order": order} if "order" in written.options else {}
     options = {name: value for name, value in asked.items() if value is not None}
-    for name in options.keys() - set(written.options):
-        if name != "antialiased":
+    no_room = {"antialiased": "that the scene is antialiased"}
+    if origin is not None:
+        no_room["origin"] = f"the origin {in_numbers(origin)}, to which its places are relative"
+    for name in [name for name in options if name not in written.options]:
+        if name not in no_room:
             raise ValueError(
                 f"{name}: expected a page (.html), which alone has it, found {path}; leave it out"
             )
-        left_out.append("that the scene is antialiased")
+        left_out.append(no_room[name])
         del options[name]
     written.write(Path(path), drawn, **options)
     return tuple(left_out)

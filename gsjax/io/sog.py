@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import Int, UInt8
 
 from gsjax.io.atomic import atomic_write
 from gsjax.io.codebooks import codebook, nearest, palette
@@ -226,8 +226,15 @@ def _rest(meta: _Meta, load: Load, pixels: Callable[[str], np.ndarray]) -> np.nd
     return table[index]
 
 
-def write_sog(path: Path, gaussians: Gaussians, *, antialiased: bool = False) -> None:
-    """Write a .sog of version 2, atomically. Gaussians come in spatial order, which compresses better.
+def write_sog(
+    path: Path,
+    gaussians: Gaussians,
+    *,
+    antialiased: bool = False,
+    order: Int[np.ndarray, "N"] | None = None,
+) -> None:
+    """Write a .sog of version 2, atomically. Gaussians come in spatial order, which compresses better,
+    unless another is given.
 
     Scales and colours are rounded to codebooks of 256 values. More than 65,536 Gaussians share as many sets
     of view-dependent colour.
@@ -236,9 +243,10 @@ def write_sog(path: Path, gaussians: Gaussians, *, antialiased: bool = False) ->
         path: the file.
         gaussians: Gaussians that can all be drawn.
         antialiased: whether the scene was fitted with antialiasing.
+        order: rows of the Gaussians in the order of the file.
     """
     columns = columns_of(gaussians)
-    order = spatial_order(columns.means)
+    order = spatial_order(columns.means) if order is None else order
     columns = Columns(*(value[order] for value in columns))
     logs = np.sign(columns.means) * np.log1p(np.abs(columns.means))
     mins, maxs = logs.min(axis=0), logs.max(axis=0)

@@ -87,11 +87,16 @@ def moved_to(
     return eqx.tree_at(lambda g: g.means, gaussians, jnp.asarray(means, gaussians.means.dtype))
 
 
+def in_numbers(origin: Float[np.ndarray, "3"]) -> str:
+    """An origin as it is said: "(500000, 5000000, 300)"."""
+    return f"({', '.join(f'{value:.12g}' for value in origin)})"
+
+
 def in_words(places: Float[np.ndarray, "n 3"], origin: Float[np.ndarray, "3"]) -> str:
     """What is said of coordinates that are taken relative to an origin."""
     largest = np.abs(places[np.isfinite(places).all(1)]).max()
     step = np.spacing(np.float32(largest))
     return (
         f"coordinates reach {largest:.4g}, where float32 has steps of {step:.2g}; they are taken relative to "
-        f"the origin ({', '.join(f'{value:.12g}' for value in origin)})"
+        f"the origin {in_numbers(origin)}"
     )

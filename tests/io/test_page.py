@@ -7,13 +7,17 @@ import json
 import re
 import shutil
 import subprocess
+import zlib
 
 import cv2
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from gsjax.geometry.cameras import Camera, intrinsics
+from gsjax.io.page import Film
+from gsjax.io.scene_file import columns_of
 from gsjax.io.scenes import read_gaussians, write_gaussians
 from gsjax.metrics.image import psnr
 from gsjax.scene.render import plan_render, render
@@ -52,17 +56,87 @@ def camera_at(yaw, pitch, distance, center) -> Camera:
     return Camera(jnp.asarray(viewmat, jnp.float32)[None], jnp.asarray(K, jnp.float32)[None], WIDTH, HEIGHT)
 
 
+def film_of(scene, *, scales: bool) -> Film:
+    """Three frames in which all but the last 20 Gaussians shift, turn and fade, and perhaps grow."""
+
+    def at(frame):
+        some = (jnp.arange(scene.num) < scene.num - 20)[:, None] * frame * 1.0
+        changed = (
+            scene.means + some * jnp.array([0.2, -0.1, 0.3]),
+            scene.quats + some * jnp.array([0.0, 0.1, -0.2, 0.3]),
+            scene.log_scales + 0.2 * some * scales,
+            scene.logit_opacities - 0.2 * some[:, 0],
+        )
+        return eqx.tree_at(lambda g: (g.means, g.quats, g.log_scales, g.logit_opacities), scene, changed)
+
+    return Film(at, np.array([5.0, 5.5, 1005.0]), scene.num - 10)
+
+
+@pytest.mark.parametrize("scales", [False, True])
+def test_it_holds_what_moves_to_16_bits(tmp_path, scales):
+    scene = flat(make_scene(50))
+    film = film_of(scene, scales=scales)
+    assert write_gaussians(tmp_path / "scene.html", scene, film=film) == ()
+    text = (tmp_path / "scene.html").read_text()
+    motion = json.loads(re.search(r"const about = (\{.*\});", text)[1])["motion"]
+    assert (motion["times"], motion["moving"], motion["texels"]) == ([0, 0.5, 1000], 30, 2 + scales)
+    packed = zlib.decompress(base64.b64decode(re.search(r'id="motion" type="text/plain">([^<]*)<', text)[1]))
+    planes = np.frombuffer(packed, np.uint8).reshape(3, -1, 2, 30).astype(np.int64)
+    zigzag = planes[:, :, 0] + 256 * planes[:, :, 1]
+    steps = np.cumsum(np.where(zigzag % 2, -(zigzag + 1) // 2, zigzag // 2), axis=0) % 65536
+    for frame in range(3):
+        wanted, found = columns_of(film.at(frame)), steps[frame].T / 65535
+        means = motion["low"] + motion["span"] * found[:, :3]
+        np.testing.assert_allclose(means, wanted.means[:30], atol=np.max(motion["span"]) / 65535)
+        np.testing.assert_allclose(found[:, 3], wanted.opacities[:30], atol=1e-5)
+        np.testing.assert_allclose(2 * found[:, 4:8] - 1, wanted.quats[:30], atol=2e-5)
+        if scales:
+            sizes = motion["sizes"][0] + motion["sizes"][1] * found[:, 8:11]
+            np.testing.assert_allclose(sizes, wanted.log_scales[:30], atol=2e-4)
+
+
+def test_what_cannot_be_played_is_refused(tmp_path):
+    scene = make_scene(50)
+    film = film_of(scene, scales=False)
+    lost = film._replace(at=lambda frame: eqx.tree_at(lambda g: g.means, scene, scene.means / (1 - frame)))
+    with pytest.raises(ValueError, match="film: expected finite places, rotations and scales in each frame"):
+        write_gaussians(tmp_path / "scene.html", scene, film=lost)
+    bad = eqx.tree_at(lambda g: g.means, scene, scene.means.at[0].set(jnp.nan))
+    with pytest.raises(
+        ValueError, match="film: expected Gaussians that can all be drawn, found 1 that cannot"
+    ):
+        write_gaussians(tmp_path / "scene.html", bad, film=film)
+    with pytest.raises(ValueError, match=r"film: expected a page \(.html\), which alone has it"):
+        write_gaussians(tmp_path / "scene.spz", scene, film=film)
+    assert not list(tmp_path.iterdir())
+
+
+def browse(*arguments) -> str:
+    """What Chromium prints."""
+    command = [BROWSER, *OPTIONS, f"--window-size={WIDTH},{HEIGHT}", "--hide-scrollbars", *arguments]
+    return subprocess.run(command, capture_output=True, timeout=120, text=True).stdout
+
+
 @pytest.mark.skipif(BROWSER is None, reason="there is no Chromium")
-@pytest.mark.parametrize("antialiased", [False, True])
-def test_a_browser_shows_what_the_rasterizer_does(tmp_path, antialiased):
+def test_a_browser_plays_it(tmp_path):
+    """It starts by itself, and keeps the times of the frames: the second is shown from 0.5 s on."""
+    scene = flat(make_scene(50))
+    write_gaussians(tmp_path / "scene.html", scene, film=film_of(scene, scales=False))
+    page = browse("--virtual-time-budget=4000", "--dump-dom", (tmp_path / "scene.html").as_uri())
+    assert ">0.50 s of 1000.00 s</output>" in page
+
+
+@pytest.mark.skipif(BROWSER is None, reason="there is no Chromium")
+@pytest.mark.parametrize(("antialiased", "frame"), [(False, None), (True, None), (False, 2)])
+def test_a_browser_shows_what_the_rasterizer_does(tmp_path, antialiased, frame):
     scene = flat(make_scene(200))
     page, picture = tmp_path / "scene.html", tmp_path / "page.png"
-    write_gaussians(page, scene, antialiased=antialiased)
-    write_gaussians(tmp_path / "scene.splat", scene)
+    film = None if frame is None else film_of(scene, scales=True)
+    write_gaussians(page, scene, antialiased=antialiased, film=film)
+    write_gaussians(tmp_path / "scene.splat", scene if film is None else film.at(frame))
     view = (0.4, 0.3, 14.0, (1.0, 1.0, 1.0))
-    address = f"{page.as_uri()}#{view[0]},{view[1]},{view[2]},1,1,1"
-    command = [BROWSER, *OPTIONS, f"--window-size={WIDTH},{HEIGHT}", "--timeout=10000", "--hide-scrollbars"]
-    subprocess.run([*command, f"--screenshot={picture}", address], capture_output=True, timeout=120)
+    address = f"{page.as_uri()}#{view[0]},{view[1]},{view[2]},1,1,1" + ("" if frame is None else f",{frame}")
+    browse("--timeout=10000", f"--screenshot={picture}", address)
     shown = cv2.imread(str(picture))[..., ::-1] / 255
     held, camera = read_gaussians(tmp_path / "scene.splat")[0], camera_at(*view[:3], np.array(view[3]))
     plan = plan_render(held, camera, rasterize_mode="antialiased" if antialiased else "classic")

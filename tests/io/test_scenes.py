@@ -16,6 +16,7 @@ from gsjax.io.compressed_ply import write_compressed_ply
 from gsjax.io.scene_file import columns_of
 from gsjax.io.scenes import FORMATS, format_of, is_scene, read_gaussians, write_gaussians
 from gsjax.scene.gaussians import take
+from gsjax.scene.origin import in_world
 from tests.io.scenes_to_write import ROUNDING, assert_alike, flat, ksplat, make_scene, spz, spz4
 
 READ_BACK = sorted(ROUNDING)
@@ -72,6 +73,25 @@ def test_antialiasing_is_said(tmp_path, ending):
         assert read_gaussians(tmp_path / f"scene{ending}")[1].antialiased is antialiased
     said = write_gaussians(tmp_path / "scene.splat", make_scene(3), antialiased=True)
     assert said == ("that the scene is antialiased",)
+
+
+UTM = np.array([500_000.0, 5_000_000.0, 300.0])
+
+
+@pytest.mark.filterwarnings("ignore:.*they are taken relative to the origin")
+@pytest.mark.parametrize("ending", READ_BACK)
+def test_an_origin_is_put_back_where_there_is_room_and_named_elsewhere(tmp_path, ending):
+    scene = make_scene(50)
+    left_out = write_gaussians(tmp_path / f"scene{ending}", scene, origin=UTM)
+    back, report = read_gaussians(tmp_path / f"scene{ending}")
+    if ending == ".ply":
+        assert left_out == ()
+        found = in_world(np.asarray(back.means), report.origin)
+        np.testing.assert_allclose(found, np.asarray(scene.means) + UTM, rtol=0, atol=1e-6)
+    else:
+        assert left_out == ("the origin (500000, 5000000, 300), to which its places are relative",)
+        assert report.origin is None
+        assert_alike(scene, back, ROUNDING[ending])
 
 
 def test_extremes_are_clipped_not_wrapped(tmp_path):
@@ -153,7 +173,7 @@ def test_ksplat(tmp_path, level, degree):
 
 def test_glb_is_what_the_extension_says(tmp_path):
     scene = make_scene(7, 2)
-    assert write_gaussians(tmp_path / "scene.glb", scene) == ()
+    assert write_gaussians(tmp_path / "scene.glb", scene, origin=UTM) == ()
     data = (tmp_path / "scene.glb").read_bytes()
     magic, version, total, size, kind = struct.unpack_from("<4sIII4s", data)
     assert (magic, version, total, kind) == (b"glTF", 2, len(data), b"JSON")
@@ -172,6 +192,7 @@ def test_glb_is_what_the_extension_says(tmp_path):
         found = np.frombuffer(data, "<f4", 7 * width, start + view["byteOffset"])
         return found.reshape(7, width) if width > 1 else found
 
+    assert tree["nodes"] == [{"mesh": 0, "rotation": [1, 0, 0, 0], "translation": [5e5, -5e6, -300]}]
     np.testing.assert_allclose(attribute("POSITION", 3), columns.means, atol=1e-6)
     np.testing.assert_allclose(tree["accessors"][0]["max"], columns.means.max(0), atol=1e-6)
     prefix = "KHR_gaussian_splatting:"

@@ -86,14 +86,15 @@ def _blend(settings: Mapping[str, Any]) -> Blend:
     return settings["parts"]["stream"]["blend"]
 
 
-def read_parts(path: str | Path) -> tuple[Layer, Names]:
-    """The scene of a run with its parts, and their names, without opening its recording.
+def read_parts(path: str | Path) -> tuple[Layer, Names, Float[np.ndarray, "3"] | None]:
+    """The scene of a run with its parts, their names, and the origin of the scene, without opening its
+    recording.
 
     Raises:
         FileNotFoundError, ValueError: as for `open_parts_run`.
     """
-    layer, names, *_ = _read(Path(path))
-    return layer, names
+    layer, names, _, origin = _read(Path(path))
+    return layer, names, origin
 
 
 def read_parts_about(path: str | Path, origin: Float[np.ndarray, "3"] | None) -> tuple[Layer, Names]:

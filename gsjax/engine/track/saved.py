@@ -59,7 +59,7 @@ def open_run(path: Path) -> SavedRun:
     missing = [n for n in ("trajectory.npz", "scene.ply", "metrics.json") if not (path / n).is_file()]
     if missing:
         raise FileNotFoundError(f"{path}: expected a complete run, found no {missing[0]}; {_AGAIN}")
-    tracking, origin = _read_tracking(path)
+    tracking, origin = read_tracking(path)
     recording = about_scene(reopen(path / "config.yml", _AGAIN)[0], origin)
     if recording.tracked.num_frames < tracking.num_frames:
         found = f"{recording.tracked.num_frames} frames where the run has {tracking.num_frames}"
@@ -69,17 +69,12 @@ def open_run(path: Path) -> SavedRun:
     return SavedRun(path, tracking, recording, first if camera is None else camera, names)
 
 
-def read_tracking(path: Path) -> Tracking:
-    """The scene of scene.ply with the poses of trajectory.npz.
+def read_tracking(path: Path) -> tuple[Tracking, Float[np.ndarray, "3"] | None]:
+    """The scene of scene.ply with the poses of trajectory.npz, and the origin that they are relative to.
 
     Raises:
         ValueError: they do not match, or one of them cannot be read.
     """
-    return _read_tracking(path)[0]
-
-
-def _read_tracking(path: Path) -> tuple[Tracking, Float[np.ndarray, "3"] | None]:
-    """The same, and the origin that it is relative to."""
     wanted = ("means", "quats", "normals", "labels", "label_ids", "lost", "turn_known")
     arrays = read_arrays(path / "trajectory.npz", wanted, _AGAIN)
     means, quats, labels = arrays["means"], arrays["quats"], arrays["labels"]

@@ -171,6 +171,7 @@ class Viewable:
         background: RGB behind the scene, 0 to 1.
         antialiased: whether the scene was fitted with `rasterize_mode="antialiased"`.
         unit: unit of lengths, such as "m"; empty if the scale is unknown.
+        origin: what places are relative to, [3] float64, where the data lie far from 0.
         editing: how the scene can be edited.
         asking: how the scene can be queried, if it cannot be edited.
 
@@ -189,6 +190,7 @@ class Viewable:
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
     antialiased: bool = False
     unit: str = ""
+    origin: Float[np.ndarray, "..."] | None = None
     editing: Editing | None = None
     asking: Asking | None = None
 

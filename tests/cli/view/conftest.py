@@ -89,3 +89,17 @@ def view(capfd, monkeypatch):
         return code, " ".join(said.split())
 
     return call
+
+
+@pytest.fixture
+def export(capfd):
+    """Runs the command; returns the exit code and what was said, spaces as one."""
+
+    def call(*arguments) -> tuple[int, str]:
+        capfd.readouterr()
+        code = main(["export", *map(str, arguments)])
+        said = "".join(capfd.readouterr())
+        assert "Traceback" not in said
+        return code, " ".join(said.split())
+
+    return call

@@ -1,26 +1,20 @@
 """`gsjax export`: runs and files in every format, what it says, and what it refuses."""
 
+import json
+import os
+import re
+
+import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gsjax.cli import main
+from gsjax.data.open import open_sequence
+from gsjax.io.ply import write_ply
 from gsjax.io.scenes import FORMATS, read_gaussians
+from gsjax.scene.origin import in_world
 from tests.cli.view.conftest import some
 from tests.io.scenes_to_write import ROUNDING, assert_alike
-
-
-@pytest.fixture
-def export(capfd):
-    """Runs the command; returns the exit code and what was said, spaces as one."""
-
-    def call(*arguments) -> tuple[int, str]:
-        capfd.readouterr()
-        code = main(["export", *map(str, arguments)])
-        said = "".join(capfd.readouterr())
-        assert "Traceback" not in said
-        return code, " ".join(said.split())
-
-    return call
 
 
 @pytest.mark.parametrize("ending", FORMATS)
@@ -46,8 +40,54 @@ def test_a_fit_keeps_its_antialiasing(export, fitted, tmp_path):
 def test_a_tracked_scene_is_its_first_frame(export, tracked, tmp_path):
     code, said = export(tracked, tmp_path / "scene.sog")
     assert code == 0
-    assert "moves; only its first of 4 frames is written" in said
+    assert "moves; only its first of 4 frames is written. A page (.html) plays all, and " in said
+    assert "'frame_####.sog' writes a file for each" in said
     assert_alike(some(), read_gaussians(tmp_path / "scene.sog")[0], ROUNDING[".sog"])
+
+
+def test_a_page_of_a_tracked_scene_plays_at_the_rate_of_its_recording(export, tracked, recording, tmp_path):
+    code, said = export(tracked, tmp_path / "scene.html", "--frames=1:")
+    assert code == 0
+    assert "warning" not in said
+    assert "30 Gaussians, a page of 3 frames, " in said
+    about = json.loads(re.search(r"const about = (\{.*\});", (tmp_path / "scene.html").read_text())[1])
+    assert about["motion"]["moving"] == 12
+    times = open_sequence(str(recording)).times[1:4]
+    np.testing.assert_allclose(about["motion"]["times"], times - times[0], atol=1e-6)
+
+
+@pytest.mark.parametrize("ending", [".ply", ".sog"])
+def test_a_file_for_each_frame(export, tracked, tmp_path, ending):
+    out = tmp_path / "out" / f"frame_####{ending}"
+    code, said = export(tracked, out, "--frames=1::2")
+    assert code == 0
+    assert "moves" not in said
+    assert f"scene {out}: 2 files of 30 Gaussians, " in said
+    names = [f"frame_0001{ending}", f"frame_0003{ending}"]
+    assert sorted(file.name for file in out.parent.iterdir()) == names
+    moved = jnp.where(jnp.arange(30)[:, None] < 12, some().means + 0.03, some().means)
+    wanted = eqx.tree_at(lambda g: g.means, some(), moved)
+    assert_alike(wanted, read_gaussians(out.parent / names[1])[0], ROUNDING[ending])
+    code, said = export(tracked, out)
+    assert code == 2
+    assert f"frame_0001{ending}: is there already" in said
+    assert len(list(out.parent.iterdir())) == 2
+
+
+def test_ctrl_c_leaves_whole_files_only(export, tracked, tmp_path, monkeypatch):
+    replace, calls = os.replace, []
+
+    def interrupted(*paths):
+        calls.append(paths)
+        if len(calls) > 2:
+            raise KeyboardInterrupt
+        replace(*paths)
+
+    monkeypatch.setattr("gsjax.io.atomic.os.replace", interrupted)
+    code, said = export(tracked, tmp_path / "out" / "#.splat")
+    assert code == 130
+    assert "2 files of 4 (stopped by Ctrl-C) of 30 Gaussians" in said
+    assert sorted(file.name for file in (tmp_path / "out").iterdir()) == ["0.splat", "1.splat"]
 
 
 def test_a_page_of_a_run_has_the_up_of_its_photographs(export, fitted, ply, tmp_path):
@@ -71,6 +111,21 @@ def test_what_is_read_in_one_format_is_written_in_another(export, ply, tmp_path)
     )
 
 
+@pytest.mark.filterwarnings("ignore:.*they are taken relative to the origin")
+def test_a_scene_far_from_0_keeps_its_places(export, tmp_path):
+    """In UTM coordinates, to a .ply and back from it; other formats have no room for these digits."""
+    far, origin = tmp_path / "far.ply", np.array([500_000.0, 5_000_000.0, 300.0])
+    write_ply(far, some(), origin=origin)
+    assert export(far, tmp_path / "again.ply")[0] == 0
+    back, report = read_gaussians(tmp_path / "again.ply")
+    found = in_world(np.asarray(back.means), report.origin)
+    np.testing.assert_allclose(found, np.asarray(some().means) + origin, rtol=0, atol=1e-6)
+    code, said = export(far, tmp_path / "scene.spz")
+    assert code == 0
+    assert "SPZ leaves out the origin (500000, 5000000, 300), to which its places are relative" in said
+    assert_alike(some(), read_gaussians(tmp_path / "scene.spz")[0], ROUNDING[".spz"])
+
+
 def test_what_is_refused(export, ply, tmp_path):
     out = tmp_path / "scene.spz"
     for arguments, says in (
@@ -81,6 +136,9 @@ def test_what_is_refused(export, ply, tmp_path):
             (tmp_path / "none.ply", out),
             "none.ply: expected a run or a file of Gaussians, found nothing there",
         ),
+        ((ply, tmp_path / "#_#.ply"), "expected one run of # for the number of the frame, found several"),
+        ((ply, out, "--frames=5:"), "--frames: 5: selects no frame of the scene, which has 1"),
+        ((ply, out, "--frames=5"), "--frames: expected START:STOP or START:STOP:STEP"),
         ((ply, out, "--up=z"), "--up: expected OUT to be a page (.html), found"),
     ):
         code, said = export(*arguments)
