@@ -24,6 +24,7 @@ from gsjax.scene.gaussians import Gaussians, take
 
 _FOCAL = 1.2  # of the height: 45 degrees from top to bottom
 _MOST = 65535
+_LEAST_STEP = 1e-3  # seconds that the last frame is shown
 _TEMPLATE = Path(__file__).with_name("page.html")
 
 
@@ -115,7 +116,7 @@ def _packed(film: Film) -> tuple[np.ndarray, dict[str, Any] | None, bytes]:
     times = np.asarray(film.times, np.float64) - film.times[0]
     motion = {
         "times": np.round(times, 6).tolist(),
-        "step": float(np.median(np.diff(times))),
+        "step": float(max(np.median(np.diff(times)), _LEAST_STEP)),
         "moving": int(moves.sum()),
         "texels": steps.shape[2] // 4,
         "low": low.tolist(),

@@ -3,6 +3,7 @@
 import json
 import os
 import re
+import shutil
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -10,6 +11,9 @@ import numpy as np
 import pytest
 
 from gsjax.data.open import open_sequence
+from gsjax.engine.folder import RunFolder
+from gsjax.engine.track.outputs import write_tracking
+from gsjax.engine.track.saved import read_tracking
 from gsjax.io.ply import write_ply
 from gsjax.io.scenes import FORMATS, read_gaussians
 from gsjax.scene.origin import in_world
@@ -124,6 +128,20 @@ def test_a_scene_far_from_0_keeps_its_places(export, tmp_path):
     assert code == 0
     assert "SPZ leaves out the origin (500000, 5000000, 300), to which its places are relative" in said
     assert_alike(some(), read_gaussians(tmp_path / "scene.spz")[0], ROUNDING[".spz"])
+
+
+@pytest.mark.filterwarnings("ignore:.*they are taken relative to the origin")
+def test_a_run_far_from_0_keeps_its_places_in_each_frame(export, tracked, tmp_path):
+    origin = np.array([500_000.0, 5_000_000.0, 300.0])
+    far = RunFolder(tmp_path / "far")
+    write_tracking(far, read_tracking(tracked)[0], np.arange(4) / 10, origin)
+    for name in ("config.yml", "metrics.json"):
+        shutil.copy(tracked / name, far.path)
+    assert export(far.path, tmp_path / "#.ply", "--frames=2:3")[0] == 0
+    back, report = read_gaussians(tmp_path / "2.ply")
+    wanted = np.asarray(some().means) + origin
+    wanted[:12] += 0.02
+    np.testing.assert_allclose(in_world(np.asarray(back.means), report.origin), wanted, rtol=0, atol=1e-6)
 
 
 def test_what_is_refused(export, ply, tmp_path):
