@@ -30,7 +30,7 @@ from gsjax.data.masks import read_shades
 from gsjax.data.objects import Truth
 from gsjax.data.origin import near_origin
 from gsjax.data.sequence import Sequence
-from gsjax.data.validation import check_poses
+from gsjax.data.validation import check_intrinsics, check_poses
 
 CAMERAS, POSES = "scene_camera.json", "scene_gt.json"
 _MM = 0.001
@@ -86,6 +86,8 @@ def read_bop(path: str | Path, *, world: str | None = None, depth_unit_m: float 
     complete = {"an image": images, "depth": depths or None, "annotations": instances if annotated else None}
     numbers = _complete_frames(root, views, complete | {"a pose of the camera": viewmats})
     followed = _Followed.over([instances.get(n, []) for n in numbers], [viewmats[n] for n in numbers])
+    Ks = np.stack([views[n].K for n in numbers])[:, None]
+    check_intrinsics(Ks, lambda t, _: f"frame {numbers[t]} in {root / CAMERAS}")
     width, height = image_size(images[numbers[0]])
     files = {"image": images, "depth": depths}
 
@@ -111,7 +113,7 @@ def read_bop(path: str | Path, *, world: str | None = None, depth_unit_m: float 
         height=height,
         times=np.array(numbers) / DEFAULT_RATE_HZ,
         frame_ids=tuple(numbers),
-        Ks=np.stack([views[n].K for n in numbers])[:, None],
+        Ks=Ks,
         viewmats=np.stack([viewmats[n] for n in numbers])[:, None],
         load_image=lambda t, c: read_image(images[numbers[t]], width, height),
         load_depth=load_depth if depths else None,

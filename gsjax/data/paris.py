@@ -23,7 +23,7 @@ from gsjax.data.objects import Truth
 from gsjax.data.origin import near_origin
 from gsjax.data.pictures import SUFFIXES
 from gsjax.data.sequence import Sequence
-from gsjax.data.validation import check_poses
+from gsjax.data.validation import check_intrinsics, check_poses
 from gsjax.geometry.cameras import viewmat_from_opengl
 from gsjax.geometry.joints import Joint
 
@@ -114,6 +114,7 @@ def _read_state(root: Path, state: str, split: str) -> _State:
     except (AttributeError, TypeError, KeyError, ValueError, OverflowError) as error:
         found = f"something else ({type(error).__name__}: {error}) in {key!r}"
         raise DataError(path, "K of 3x3 and poses of 4x4 numbers, by name", found, _ADVICE) from None
+    check_intrinsics(K[None, None], lambda *_: str(path))
     files = {name: _find(root / state / split, name) for name in poses}
     images = {name: file for name, file in files.items() if file is not None}
     if poses and not images:
@@ -157,8 +158,8 @@ def _joint(part: dict[str, Any]) -> Joint:
     turns = part.get("type", "rotate" if "rotate" in part else "translate") == "rotate"
     travel = part["rotate" if turns else "translate"]
     values = np.array([travel["l"], travel["r"]], np.float64)
-    if not np.isfinite(values).all():
-        raise ValueError(f"{values.tolist()} is not finite")
     point = np.array(part["axis"]["o"], np.float64)
+    if not (np.isfinite(values).all() and np.isfinite(point).all()):
+        raise ValueError("not finite")
     kind, values = ("revolute", np.deg2rad(values)) if turns else ("prismatic", values)
     return Joint(kind, direction / max(np.linalg.norm(direction), 1e-12), point, values)

@@ -120,7 +120,7 @@ BOP = (
     Fault("no frame", holds(CAMERA, "{}"), ("DATA",)),
     Fault("frame that is no number", change(CAMERA, lambda c: c.update(first=c.pop("0"))), (CAMERA, "first")),
     Fault("K of 8 numbers", change(CAMERA, lambda c: c["1"]["cam_K"].pop()), (CAMERA, "'1'")),
-    Fault("focal length of 0", change(CAMERA, lambda c: c["1"].update(cam_K=[0] * 9)), ("frame 1",)),
+    Fault("focal length of 0", change(CAMERA, lambda c: c["1"].update(cam_K=[0] * 9)), (CAMERA, "frame 1")),
     Fault("depth_scale of 0", change(CAMERA, lambda c: c["0"].update(depth_scale=0)), (CAMERA, "'0'")),
     Fault(
         "NaN in a pose of the camera",
@@ -168,6 +168,7 @@ PARIS = (
     Fault("not JSON", holds(END, b"\x80\x04"), (END,)),
     Fault("cut off", cut(END), (END,)),
     Fault("no K", change(END, lambda c: c.pop("K")), (END, "'K'")),
+    Fault("NaN as focal length", change(END, lambda c: c["K"][0].__setitem__(0, NAN[0][0])), (END,)),
     Fault("wrong shape of a pose", change(END, lambda c: c["0001"].pop()), (END, "'0001'")),
     Fault("NaN in a pose", change(END, lambda c: c.update({"0001": NAN})), ("0001",)),
     Fault("pose is no rotation", change(END, lambda c: c.update({"0001": SKEW})), (END, "0001")),
@@ -179,6 +180,11 @@ PARIS = (
     Fault("depth image missing", gone("end/train/depth/0001.png"), ("depth/0001.png",)),
     Fault(
         "joint without an axis", change("trans.json", lambda t: t["trans_info"].pop("axis")), ("trans.json",)
+    ),
+    Fault(
+        "NaN in a joint",
+        change("trans.json", lambda t: t["trans_info"]["axis"].update(o=NAN[0][:3])),
+        ("trans.json",),
     ),
     Fault(
         "axis of length 0",
