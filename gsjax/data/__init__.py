@@ -1,5 +1,6 @@
 """Recordings, real and simulated: every reader returns the same sequence type."""
 
+from gsjax.data.bop import read_bop
 from gsjax.data.clip import read_clip
 from gsjax.data.colmap import read_colmap
 from gsjax.data.endonerf import read_endonerf
@@ -9,6 +10,7 @@ from gsjax.data.objects import PointModel, Truth
 from gsjax.data.open import ReadOptions, open_photographs, open_sequence
 from gsjax.data.open3d_rgbd import read_open3d
 from gsjax.data.panoptic import read_panoptic, write_panoptic
+from gsjax.data.paris import read_paris
 from gsjax.data.photographs import Cloud, Photographs, photographs_of
 from gsjax.data.poses_bounds import read_dynerf, read_llff
 from gsjax.data.push_t import read_push_t
@@ -31,6 +33,7 @@ __all__ = [
     "open_photographs",
     "open_sequence",
     "photographs_of",
+    "read_bop",
     "read_clip",
     "read_colmap",
     "read_dynerf",
@@ -39,6 +42,7 @@ __all__ = [
     "read_llff",
     "read_open3d",
     "read_panoptic",
+    "read_paris",
     "read_push_t",
     "read_seven_scenes",
     "read_transforms",

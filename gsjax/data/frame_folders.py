@@ -28,6 +28,14 @@ def pictures(folder: Path) -> list[Path]:
     return found
 
 
+def numbered_pictures(folder: Path) -> dict[int, Path]:
+    """The pictures of a folder whose names are numbers, by number; none if it does not exist."""
+    if not folder.is_dir():
+        return {}
+    numbered = (file for file in folder.iterdir() if is_picture(file) and file.stem.isdecimal())
+    return {int(file.stem): file for file in numbered}
+
+
 def pictures_beside(folder: Path, count: int, frames: str) -> list[Path]:
     """One picture per frame, such as the masks or depth images of a recording, sorted by name.
 

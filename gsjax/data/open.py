@@ -11,12 +11,14 @@ from urllib.parse import parse_qsl
 import numpy as np
 
 from gsjax.data import clip, colmap, poses_bounds, transforms
+from gsjax.data.bop import read_bop
 from gsjax.data.duplicates import without_duplicates
 from gsjax.data.endonerf import is_endonerf, is_unambiguous_endonerf, read_endonerf
 from gsjax.data.endovis import LEFT, is_endovis, read_endovis
 from gsjax.data.errors import DataError, shortened
 from gsjax.data.open3d_rgbd import is_open3d, read_open3d
 from gsjax.data.panoptic import read_panoptic
+from gsjax.data.paris import Split, read_paris
 from gsjax.data.photographs import Photographs, photographs_of
 from gsjax.data.pictures import is_picture, refuse_unread
 from gsjax.data.push_t import read_push_t
@@ -45,6 +47,9 @@ _LAYOUTS = {
     "frame-*.pose.txt": ("7-Scenes", read_seven_scenes),
     "frame-*.color.*": ("7-Scenes", read_seven_scenes),
     "seq-*": ("7-Scenes", read_seven_scenes),
+    "scene_camera*.json": ("BOP", read_bop),
+    "*/scene_camera.json": ("BOP", read_bop),
+    "start/camera_*.json": ("PARIS", read_paris),
 }
 _RECORDINGS = {mark: layout for mark, (layout, _) in _LAYOUTS.items()} | {LEFT: "EndoVis"}
 _RECORDINGS |= {"poses_bounds.npy and depth or masks": "EndoNeRF", "poses_bounds.npy and cam*.mp4": "DyNeRF"}
@@ -83,13 +88,19 @@ class ReadOptions:
     """Photographs by fisheyes (COLMAP, nerfstudio): undistort to pinhole views, which lose what lies far off
     the axis, or keep as they are and render through the same lens."""
     depth_unit_m: float | None = None
-    """Metres per unit of the stored depth values (TUM, 7-Scenes, Panoptic, Open3D, nerfstudio, EndoNeRF);
-    default: the value given in the data, else that of the layout: 0.0002 for TUM, 0.001 for others."""
+    """Metres per unit of the stored depth values (TUM, 7-Scenes, BOP, PARIS, Panoptic, Open3D, nerfstudio,
+    EndoNeRF); default: the value given in the data, else that of the layout: 0.0002 for TUM, 0.001 for
+    others."""
     depth_percentiles: tuple[float, float] | None = None
     """Lowest and highest percentile of each frame's depth to keep (EndoNeRF), for example 3 99.8 for depth
     from stereo matching; default: keep all."""
     pose_unit_m: float = 1.0
     """Metres per unit of the poses (EndoNeRF), for a camera that moves."""
+    world: str | None = None
+    """What stands still in a recording without poses of its camera (BOP): camera, or the number of an object,
+    such as 5, whose frame is then the world."""
+    split: Split = "train"
+    """Which pictures of the two states (PARIS): train, val or test."""
     baseline_m: float | None = None
     """Metres from the left eye to the right one (EndoNeRF, EndoVis without a calibration)."""
     near: float = NEAR

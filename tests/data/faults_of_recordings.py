@@ -1,5 +1,6 @@
 """Recordings with depth in every layout, scenes of Gaussians, and their faults."""
 
+import json
 from pathlib import Path
 
 import jax.numpy as jnp
@@ -31,6 +32,7 @@ from tests.data.faulty import (
     picture,
     swap,
 )
+from tests.data.written import write_bop, write_paris
 
 
 def build_open3d(root: Path) -> None:
@@ -107,6 +109,91 @@ SEVEN_SCENES = (
 )
 
 
+def build_bop(root: Path) -> None:
+    write_bop(tabletop(frames=2, width=WIDTH, height=HEIGHT, cameras=1), root)
+
+
+CAMERA, GT = "scene_camera.json", "scene_gt.json"
+BOP = (
+    Fault("not JSON", holds(CAMERA, b"\x80\x04"), (CAMERA,)),
+    Fault("cut off", cut(GT), (GT,)),
+    Fault("no frame", holds(CAMERA, "{}"), ("DATA",)),
+    Fault("frame that is no number", change(CAMERA, lambda c: c.update(first=c.pop("0"))), (CAMERA, "first")),
+    Fault("K of 8 numbers", change(CAMERA, lambda c: c["1"]["cam_K"].pop()), (CAMERA, "'1'")),
+    Fault("focal length of 0", change(CAMERA, lambda c: c["1"].update(cam_K=[0] * 9)), (CAMERA, "frame 1")),
+    Fault("depth_scale of 0", change(CAMERA, lambda c: c["0"].update(depth_scale=0)), (CAMERA, "'0'")),
+    Fault(
+        "NaN in a pose of the camera",
+        change(CAMERA, lambda c: c["1"].update(cam_t_w2c=[NAN[0][0]] * 3)),
+        (CAMERA,),
+    ),
+    Fault(
+        "pose of an object is no rotation",
+        change(GT, lambda g: g["1"][0].update(cam_R_m2c=[1] * 9)),
+        (GT, "frame 1"),
+    ),
+    Fault(
+        "no poses of the camera",
+        change(CAMERA, lambda c: [v.pop("cam_R_w2c") for v in c.values()]),
+        (CAMERA,),
+    ),
+    Fault(
+        "frame without a pose of the camera", change(CAMERA, lambda c: c["1"].pop("cam_R_w2c")), ("000001",)
+    ),
+    Fault("several scenes", lambda root: build_bop(root / "000002") or (root / CAMERA).unlink(), ("000002",)),
+    Fault(
+        "several cameras", lambda root: (root / CAMERA).rename(root / "scene_camera_rgb.json"), ("_rgb.json",)
+    ),
+    Fault("all images missing", gone("rgb/000000.png", "rgb/000001.png"), ("DATA",)),
+    Fault("image missing", gone("rgb/000001.png"), ("000001",)),
+    Fault("image cut off", cut("rgb/000001.png"), ("rgb/000001.png",)),
+    Fault("depth image missing", gone("depth/000001.png"), ("000001",)),
+    Fault("8-bit depth", drawn("depth/000001.png", picture(0)[..., 0]), ("depth/000001.png",)),
+    Fault("frame without annotations", change(GT, lambda g: g.pop("1")), ("000001",)),
+    Fault("object not in all frames", change(GT, lambda g: g["1"].pop()), (GT, "obj_000015")),
+    Fault("mask missing", gone("mask_visib/000001_000002.png"), ("mask_visib", "000001_000002.png")),
+    Fault("mask cut off", cut("mask_visib/000001_000002.png"), ("mask_visib/000001_000002.png",)),
+)
+
+
+def build_paris(root: Path) -> None:
+    write_paris(tabletop(frames=2, width=WIDTH, height=HEIGHT, cameras=2), root)
+    hinge = {"axis": {"o": [0, 0, 0], "d": [0, 0, 1]}, "type": "rotate", "rotate": {"l": 0, "r": 30}}
+    (root / "trans.json").write_text(json.dumps({"trans_info": hinge}))
+
+
+END = "end/camera_train.json"
+PARIS = (
+    Fault("no other state", gone(END), (END,)),
+    Fault("not JSON", holds(END, b"\x80\x04"), (END,)),
+    Fault("cut off", cut(END), (END,)),
+    Fault("no K", change(END, lambda c: c.pop("K")), (END, "'K'")),
+    Fault("NaN as focal length", change(END, lambda c: c["K"][0].__setitem__(0, NAN[0][0])), (END,)),
+    Fault("wrong shape of a pose", change(END, lambda c: c["0001"].pop()), (END, "'0001'")),
+    Fault("NaN in a pose", change(END, lambda c: c.update({"0001": NAN})), ("0001",)),
+    Fault("pose is no rotation", change(END, lambda c: c.update({"0001": SKEW})), (END, "0001")),
+    Fault("all images missing", gone("end/train/0000.png", "end/train/0001.png"), ("end/train",)),
+    Fault("image missing", gone("end/train/0001.png"), ("0001",)),
+    Fault("image cut off", cut("end/train/0001.png"), ("end/train/0001.png",)),
+    Fault("wrong size", drawn("end/train/0001.png", picture(0, 16, 12)), ("end/train/0001.png",)),
+    Fault("no name in common", change(END, lambda c: [c.pop(k) for k in ("0000", "0001")]), ("DATA",)),
+    Fault("depth image missing", gone("end/train/depth/0001.png"), ("depth/0001.png",)),
+    Fault(
+        "joint without an axis", change("trans.json", lambda t: t["trans_info"].pop("axis")), ("trans.json",)
+    ),
+    Fault(
+        "NaN in a joint",
+        change("trans.json", lambda t: t["trans_info"]["axis"].update(o=NAN[0][:3])),
+        ("trans.json",),
+    ),
+    Fault(
+        "axis of length 0",
+        change("trans.json", lambda t: t["trans_info"]["axis"].update(d=[0, 0, 0])),
+        ("trans.json",),
+    ),
+)
+
+
 def build_panoptic(root: Path) -> None:
     write_panoptic(tabletop(frames=2, width=WIDTH, height=HEIGHT, cameras=2), root)
 
@@ -154,6 +241,8 @@ RECORDINGS = {
     "Open3D RGB-D": Layout(build_open3d, lambda r: load_all(read_open3d(r, K)), OPEN3D),
     "TUM RGB-D": Layout(build_tum, lambda r: load_all(open_sequence(r)), TUM),
     "7-Scenes": Layout(build_seven_scenes, lambda r: load_all(open_sequence(r)), SEVEN_SCENES),
+    "BOP": Layout(build_bop, lambda r: load_all(open_sequence(r)), BOP),
+    "PARIS": Layout(build_paris, lambda r: load_all(open_sequence(r)), PARIS),
     "Panoptic": Layout(build_panoptic, lambda r: load_all(open_sequence(r)), PANOPTIC),
     "PLY of Gaussians": Layout(build_gaussians, lambda r: read_ply(r / SCENE), GAUSSIANS),
 }
