@@ -50,8 +50,10 @@ def pinhole(local: list[Columns], K: Float[Array, "3 3"], plan: Plan) -> Lineari
 
 
 def fisheye(local: list[Columns], coeffs: Float[Array, "4"]) -> Linearised:
-    """A fisheye (Kannala and Brandt, PAMI 28(8), 2006, in OpenCV's form): with the unit vector n to a point
-    and its angle theta off axis, the image is F A (n_x, n_y), where
+    """A fisheye, by the model of Kannala and Brandt.
+
+    In OpenCV's form of it (PAMI 28(8), 2006), with the unit vector n to a point and its angle theta off
+    axis, the image is F A (n_x, n_y), where
 
         A = theta / sin(theta)          F = 1 + k1 theta^2 + k2 theta^4 + k3 theta^6 + k4 theta^8
 
