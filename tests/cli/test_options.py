@@ -35,6 +35,7 @@ OWN = {
     ("deform", "masks"),  # of every frame
     ("query", "weights"),  # also where they are now, of what CLIP taught
     ("view", "weights"),  # only that
+    ("export", "frames"),  # of a scene; a run has chosen its own
     ("export", "overwrite"),  # of a file
 }
 
