@@ -20,6 +20,7 @@ from gsjax.data.panoptic import read_panoptic
 from gsjax.data.photographs import Photographs, photographs_of
 from gsjax.data.pictures import is_picture, refuse_unread
 from gsjax.data.push_t import read_push_t
+from gsjax.data.record3d import EXPORT_THIS, is_record3d, read_record3d
 from gsjax.data.sequence import Sequence
 from gsjax.data.seven_scenes import read_seven_scenes
 from gsjax.data.simulated import articulated, bar, hard_parts, tabletop, tissue
@@ -47,6 +48,7 @@ _LAYOUTS = {
 }
 _RECORDINGS = {mark: layout for mark, (layout, _) in _LAYOUTS.items()} | {LEFT: "EndoVis"}
 _RECORDINGS |= {"poses_bounds.npy and depth or masks": "EndoNeRF", "poses_bounds.npy and cam*.mp4": "DyNeRF"}
+_RECORDINGS |= {"rgb and depth/*.exr": "Record3D"}
 
 # Option -> what it is about, and whether data that were read have that.
 _ABOUT = {
@@ -128,6 +130,8 @@ def _sequence(path: str | Path, options: ReadOptions) -> Sequence:
             return _read(layout, read, root, options)
     if is_open3d(root):
         return _read("Open3D", read_open3d, root, options)
+    if is_record3d(root):
+        return _read("Record3D", read_record3d, root, options)
     if poses_bounds.find(root) and next(root.glob("cam*.mp4"), None):
         return _read("DyNeRF", poses_bounds.read_dynerf, root, options)
     if is_endonerf(root, options.images):
@@ -209,7 +213,7 @@ def is_recording(path: str | Path) -> bool:
     """Whether a path holds a recording over time, judged by its files."""
     root = Path(path)
     known = any(next(root.glob(mark), None) for mark in _LAYOUTS)
-    known = known or any(layout(root) for layout in (is_open3d, is_endonerf, is_endovis))
+    known = known or any(layout(root) for layout in (is_open3d, is_record3d, is_endonerf, is_endovis))
     return str(path).startswith(SIMULATED_PREFIX) or known or next(root.glob("cam*.mp4"), None) is not None
 
 
@@ -279,6 +283,8 @@ def _folder(path: str | Path) -> Path:
         advice = f"Pass its folder, or a built-in scene: {known}."
         if clip.is_clip(root):
             found, advice = "a video, which has no poses", _find_poses(root)
+        elif root.suffix.lower() == ".r3d":
+            found, advice = "an .r3d file, whose depth is not read", EXPORT_THIS
         raise DataError(root, "a folder with a recording", found, advice)
     return root
 

@@ -17,10 +17,9 @@ from jaxtyping import Float
 
 from gsjax.data.errors import DataError, DataWarning, shortened
 from gsjax.data.files import image_size, read_depth, read_image, read_text
-from gsjax.data.frame_folders import DEFAULT_RATE_HZ
+from gsjax.data.frame_folders import DEFAULT_RATE_HZ, numbered
 from gsjax.data.lens import intrinsics_matrix
 from gsjax.data.origin import near_origin
-from gsjax.data.pictures import is_picture
 from gsjax.data.sequence import Sequence
 from gsjax.data.text import fields
 from gsjax.data.validation import check_poses
@@ -80,7 +79,7 @@ def read_open3d(
             else f"one of {', '.join(_TRAJECTORIES)}"
         )
         raise DataError(root, missing, "none of them", "Give the folder of an Open3D recording.")
-    poses, images, depths = _read_log(log), _numbered(folder), _numbered(root / "depth")
+    poses, images, depths = _read_log(log), numbered(folder), numbered(root / "depth")
     numbers = sorted(images.keys() & depths.keys() & poses.keys())
     if not numbers:
         found = f"{len(images)} images, {len(depths)} depths and {len(poses)} poses with no number in common"
@@ -112,14 +111,6 @@ def read_open3d(
 
 def _first(root: Path, names: tuple[str, ...]) -> Path | None:
     return next((root / name for name in names if (root / name).exists()), None)
-
-
-def _numbered(folder: Path) -> dict[int, Path]:
-    """The pictures of a folder, by the number in their name."""
-    if not folder.is_dir():
-        return {}
-    numbered = (file for file in folder.iterdir() if is_picture(file) and file.stem.isdecimal())
-    return {int(file.stem): file for file in numbered}
 
 
 def _read_log(path: Path) -> dict[int, Float[np.ndarray, "4 4"]]:
