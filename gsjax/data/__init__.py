@@ -12,6 +12,7 @@ from gsjax.data.panoptic import read_panoptic, write_panoptic
 from gsjax.data.photographs import Cloud, Photographs, photographs_of
 from gsjax.data.poses_bounds import read_dynerf, read_llff
 from gsjax.data.push_t import read_push_t
+from gsjax.data.realsense import read_realsense
 from gsjax.data.record3d import read_record3d
 from gsjax.data.sequence import Sequence
 from gsjax.data.seven_scenes import read_seven_scenes
@@ -41,6 +42,7 @@ __all__ = [
     "read_open3d",
     "read_panoptic",
     "read_push_t",
+    "read_realsense",
     "read_record3d",
     "read_seven_scenes",
     "read_transforms",

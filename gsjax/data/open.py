@@ -10,7 +10,7 @@ from urllib.parse import parse_qsl
 
 import numpy as np
 
-from gsjax.data import clip, colmap, poses_bounds, transforms
+from gsjax.data import clip, colmap, poses_bounds, realsense, transforms
 from gsjax.data.duplicates import without_duplicates
 from gsjax.data.endonerf import is_endonerf, is_unambiguous_endonerf, read_endonerf
 from gsjax.data.endovis import LEFT, is_endovis, read_endovis
@@ -81,8 +81,9 @@ class ReadOptions:
     tool: Tool = "white"
     """Colour of the tool in black-and-white masks (EndoNeRF, videos): white or black."""
     depth_unit_m: float | None = None
-    """Metres per unit of the stored depth values (TUM, 7-Scenes, Panoptic, Open3D, nerfstudio, EndoNeRF);
-    default: the value given in the data, else that of the layout: 0.0002 for TUM, 0.001 for others."""
+    """Metres per unit of the stored depth values (TUM, 7-Scenes, Panoptic, Open3D, nerfstudio, EndoNeRF,
+    RealSense); default: the value given in the data, else that of the layout: 0.0002 for TUM, 0.001 for
+    others."""
     depth_percentiles: tuple[float, float] | None = None
     """Lowest and highest percentile of each frame's depth to keep (EndoNeRF), for example 3 99.8 for depth
     from stereo matching; default: keep all."""
@@ -124,6 +125,8 @@ def _sequence(path: str | Path, options: ReadOptions) -> Sequence:
     root = Path(path)
     if root.is_file() and clip.is_clip(root):
         return _read("video", clip.read_clip, root, options, unused={"images"})
+    if root.is_file() and root.suffix.lower() == realsense.SUFFIX:
+        return _read("RealSense", realsense.read_realsense, root, options)
     root = _folder(path)
     for mark, (layout, read) in _LAYOUTS.items():
         if next(root.glob(mark), None):
