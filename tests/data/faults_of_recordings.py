@@ -10,7 +10,7 @@ from gsjax.data import open_sequence, read_open3d, write_panoptic
 from gsjax.data.simulated import tabletop
 from gsjax.io.ply import read_ply, write_ply
 from gsjax.scene.gaussians import Gaussians
-from tests.data import dots
+from tests.data import dots, realsense_bag
 from tests.data.exports import write_exr, write_record3d
 from tests.data.faults_of_photographs import build_transforms
 from tests.data.faulty import (
@@ -185,6 +185,28 @@ RECORD3D = (
 )
 
 
+BAG = "desk.bag"
+
+
+def recorded(**changes) -> Damage:
+    return lambda root: realsense_bag.write(root / BAG, **({"lates": (0.0, 0.0)} | changes))
+
+
+REALSENSE = (
+    Fault("another format", holds(BAG, b"PK\3\4"), (BAG,)),
+    Fault("cut off", cut(BAG), (BAG,)),
+    Fault("no depth", recorded(drop=("Depth_0/image",)), (BAG, "Depth_0")),
+    Fault("no intrinsics", recorded(drop=("Color_0/info",)), (BAG, "Color_0")),
+    Fault("no places of the cameras", recorded(drop=("/tf/0",)), (BAG, "tf/0")),
+    Fault("colour as YUV", recorded(encoding="yuv422"), (BAG,)),
+    Fault("lines that are too short", recorded(step=40), (BAG,)),
+    Fault("size that the images do not have", recorded(info_size=(64, 48)), (BAG,)),
+    Fault("quaternion not normalised", recorded(turn=0), (BAG,)),
+    Fault("depth that is late", recorded(lates=(0.0, 0.025)), (BAG,)),
+    Fault("distorting lens", recorded(distortion=[0.1, 0, 0, 0, 0]), (BAG,)),
+)
+
+
 def build_gaussians(root: Path) -> None:
     random = np.random.default_rng(0)
     shapes = ((3,), (4,), (3,), (), (1, 3))
@@ -211,5 +233,6 @@ RECORDINGS = {
     "7-Scenes": Layout(build_seven_scenes, lambda r: load_all(open_sequence(r)), SEVEN_SCENES),
     "Panoptic": Layout(build_panoptic, lambda r: load_all(open_sequence(r)), PANOPTIC),
     "Record3D": Layout(build_record3d, lambda r: load_all(open_sequence(r)), RECORD3D),
+    "RealSense": Layout(recorded(), lambda r: load_all(open_sequence(r / BAG)), REALSENSE),
     "PLY of Gaussians": Layout(build_gaussians, lambda r: read_ply(r / SCENE), GAUSSIANS),
 }

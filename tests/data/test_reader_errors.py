@@ -44,7 +44,7 @@ listed once.
 this file; a test compares it.
 """
 SHARED = "Several layouts"
-NEEDS = {"Record3D": "OpenEXR"}  # packages of extras
+NEEDS = {"Record3D": "OpenEXR", "RealSense": "rosbags"}  # packages of extras
 
 # Messages of other libraries, and file sizes of encoders, differ from version to version.
 _FOREIGN = re.compile(
