@@ -14,6 +14,8 @@ from gsjax.data.paris import read_paris
 from gsjax.data.photographs import Cloud, Photographs, photographs_of
 from gsjax.data.poses_bounds import read_dynerf, read_llff
 from gsjax.data.push_t import read_push_t
+from gsjax.data.realsense import read_realsense
+from gsjax.data.record3d import read_record3d
 from gsjax.data.sequence import Sequence
 from gsjax.data.seven_scenes import read_seven_scenes
 from gsjax.data.transforms import read_transforms
@@ -44,6 +46,8 @@ __all__ = [
     "read_panoptic",
     "read_paris",
     "read_push_t",
+    "read_realsense",
+    "read_record3d",
     "read_seven_scenes",
     "read_transforms",
     "read_tum",

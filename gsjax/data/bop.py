@@ -25,7 +25,7 @@ from scipy.optimize import linear_sum_assignment
 
 from gsjax.data.errors import DataError, DataWarning, shortened
 from gsjax.data.files import image_size, read_depth, read_image, read_json
-from gsjax.data.frame_folders import DEFAULT_RATE_HZ, numbered_pictures
+from gsjax.data.frame_folders import DEFAULT_RATE_HZ, numbered
 from gsjax.data.masks import read_shades
 from gsjax.data.objects import Truth
 from gsjax.data.origin import near_origin
@@ -78,8 +78,8 @@ def read_bop(path: str | Path, *, world: str | None = None, depth_unit_m: float 
     root = Path(path)
     _check_is_one_scene(root)
     views = _by_frame(root / CAMERAS, _view)
-    images = numbered_pictures(root / "rgb") or numbered_pictures(root / "gray")
-    depths, annotated = numbered_pictures(root / "depth"), (root / POSES).exists()
+    images = numbered(root / "rgb") or numbered(root / "gray")
+    depths, annotated = numbered(root / "depth"), (root / POSES).exists()
     instances = _by_frame(root / POSES, _instances) if annotated else {}
     _check(root / POSES, {n: [i.pose for i in some] for n, some in instances.items()}, "Correct that entry.")
     viewmats = _viewmats(root, views, instances, world)

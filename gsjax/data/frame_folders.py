@@ -6,7 +6,7 @@ from pathlib import Path
 
 from gsjax.data.errors import DataError, DataWarning
 from gsjax.data.files import picture_size
-from gsjax.data.pictures import is_picture, refuse_unread
+from gsjax.data.pictures import SUFFIXES, is_picture, refuse_unread
 
 DEFAULT_RATE_HZ = 30.0
 """Frame rate assumed if the data has no times."""
@@ -28,14 +28,6 @@ def pictures(folder: Path) -> list[Path]:
     return found
 
 
-def numbered_pictures(folder: Path) -> dict[int, Path]:
-    """The pictures of a folder whose names are numbers, by number; none if it does not exist."""
-    if not folder.is_dir():
-        return {}
-    numbered = (file for file in folder.iterdir() if is_picture(file) and file.stem.isdecimal())
-    return {int(file.stem): file for file in numbered}
-
-
 def pictures_beside(folder: Path, count: int, frames: str) -> list[Path]:
     """One picture per frame, such as the masks or depth images of a recording, sorted by name.
 
@@ -53,6 +45,17 @@ def pictures_beside(folder: Path, count: int, frames: str) -> list[Path]:
         advice = "Was the folder copied completely? Pictures are paired in order of name."
         raise DataError(folder, expected, f"{len(found)}", advice)
     return found
+
+
+def numbered(folder: Path, suffixes: tuple[str, ...] = SUFFIXES) -> dict[int, Path]:
+    """The pictures in a folder whose names are numbers, by number; none if it does not exist.
+
+    Args:
+        folder: the folder.
+        suffixes: extensions, in lower case.
+    """
+    files = folder.iterdir() if folder.is_dir() else ()
+    return {int(f.stem): f for f in files if f.suffix.lower() in suffixes and f.stem.isdecimal()}
 
 
 def frame_numbers(frames: list[Path]) -> tuple[int, ...]:

@@ -10,7 +10,7 @@ from urllib.parse import parse_qsl
 
 import numpy as np
 
-from gsjax.data import clip, colmap, poses_bounds, transforms
+from gsjax.data import clip, colmap, poses_bounds, realsense, transforms
 from gsjax.data.bop import read_bop
 from gsjax.data.duplicates import without_duplicates
 from gsjax.data.endonerf import is_endonerf, is_unambiguous_endonerf, read_endonerf
@@ -22,6 +22,7 @@ from gsjax.data.paris import Split, read_paris
 from gsjax.data.photographs import Photographs, photographs_of
 from gsjax.data.pictures import is_picture, refuse_unread
 from gsjax.data.push_t import read_push_t
+from gsjax.data.record3d import EXPORT_THIS, is_record3d, read_record3d
 from gsjax.data.sequence import Sequence
 from gsjax.data.seven_scenes import read_seven_scenes
 from gsjax.data.simulated import articulated, bar, hard_parts, tabletop, tissue
@@ -53,6 +54,7 @@ _LAYOUTS = {
 }
 _RECORDINGS = {mark: layout for mark, (layout, _) in _LAYOUTS.items()} | {LEFT: "EndoVis"}
 _RECORDINGS |= {"poses_bounds.npy and depth or masks": "EndoNeRF", "poses_bounds.npy and cam*.mp4": "DyNeRF"}
+_RECORDINGS |= {"rgb and depth/*.exr": "Record3D"}
 
 # Option -> what it is about, and whether data that were read have that.
 _ABOUT = {
@@ -89,8 +91,8 @@ class ReadOptions:
     the axis, or keep as they are and render through the same lens."""
     depth_unit_m: float | None = None
     """Metres per unit of the stored depth values (TUM, 7-Scenes, BOP, PARIS, Panoptic, Open3D, nerfstudio,
-    EndoNeRF); default: the value given in the data, else that of the layout: 0.0002 for TUM, 0.001 for
-    others."""
+    EndoNeRF, RealSense); default: the value given in the data, else that of the layout: 0.0002 for TUM,
+    0.001 for others."""
     depth_percentiles: tuple[float, float] | None = None
     """Lowest and highest percentile of each frame's depth to keep (EndoNeRF), for example 3 99.8 for depth
     from stereo matching; default: keep all."""
@@ -137,12 +139,16 @@ def _sequence(path: str | Path, options: ReadOptions) -> Sequence:
     root = Path(path)
     if root.is_file() and clip.is_clip(root):
         return _read("video", clip.read_clip, root, options, unused={"images"})
+    if root.is_file() and root.suffix.lower() == realsense.SUFFIX:
+        return _read("RealSense", realsense.read_realsense, root, options)
     root = _folder(path)
     for mark, (layout, read) in _LAYOUTS.items():
         if next(root.glob(mark), None):
             return _read(layout, read, root, options)
     if is_open3d(root):
         return _read("Open3D", read_open3d, root, options)
+    if is_record3d(root):
+        return _read("Record3D", read_record3d, root, options)
     if poses_bounds.find(root) and next(root.glob("cam*.mp4"), None):
         return _read("DyNeRF", poses_bounds.read_dynerf, root, options)
     if is_endonerf(root, options.images):
@@ -224,7 +230,7 @@ def is_recording(path: str | Path) -> bool:
     """Whether a path holds a recording over time, judged by its files."""
     root = Path(path)
     known = any(next(root.glob(mark), None) for mark in _LAYOUTS)
-    known = known or any(layout(root) for layout in (is_open3d, is_endonerf, is_endovis))
+    known = known or any(layout(root) for layout in (is_open3d, is_record3d, is_endonerf, is_endovis))
     return str(path).startswith(SIMULATED_PREFIX) or known or next(root.glob("cam*.mp4"), None) is not None
 
 
@@ -294,6 +300,8 @@ def _folder(path: str | Path) -> Path:
         advice = f"Pass its folder, or a built-in scene: {known}."
         if clip.is_clip(root):
             found, advice = "a video, which has no poses", _find_poses(root)
+        elif root.suffix.lower() == ".r3d":
+            found, advice = "an .r3d file, whose depth is not read", EXPORT_THIS
         raise DataError(root, "a folder with a recording", found, advice)
     return root
 

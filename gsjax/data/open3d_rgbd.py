@@ -17,7 +17,7 @@ from jaxtyping import Float
 
 from gsjax.data.errors import DataError, DataWarning, shortened
 from gsjax.data.files import image_size, read_depth, read_image, read_text
-from gsjax.data.frame_folders import DEFAULT_RATE_HZ, numbered_pictures
+from gsjax.data.frame_folders import DEFAULT_RATE_HZ, numbered
 from gsjax.data.lens import intrinsics_matrix
 from gsjax.data.origin import near_origin
 from gsjax.data.sequence import Sequence
@@ -79,7 +79,7 @@ def read_open3d(
             else f"one of {', '.join(_TRAJECTORIES)}"
         )
         raise DataError(root, missing, "none of them", "Give the folder of an Open3D recording.")
-    poses, images, depths = _read_log(log), numbered_pictures(folder), numbered_pictures(root / "depth")
+    poses, images, depths = _read_log(log), numbered(folder), numbered(root / "depth")
     numbers = sorted(images.keys() & depths.keys() & poses.keys())
     if not numbers:
         found = f"{len(images)} images, {len(depths)} depths and {len(poses)} poses with no number in common"

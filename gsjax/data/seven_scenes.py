@@ -24,6 +24,7 @@ from gsjax.data.lens import intrinsics_matrix
 from gsjax.data.names import find_file
 from gsjax.data.origin import near_origin
 from gsjax.data.pictures import SUFFIXES
+from gsjax.data.registration import registered
 from gsjax.data.sequence import Sequence
 from gsjax.data.text import fields
 from gsjax.data.validation import check_poses
@@ -74,16 +75,20 @@ def read_seven_scenes(
     numbers, poses, images, depths = _read_frames(root)
     frames, (width, height) = len(numbers), (WIDTH, HEIGHT) if K is None else image_size(images[0])
     register = register and K is None
+    depth_K = intrinsics(DEPTH_FOCAL, WIDTH, HEIGHT)
+    if K is None:
+        K = intrinsics(COLOR_FOCAL, WIDTH, HEIGHT) if register else depth_K
+    matrix = intrinsics_matrix(K)
     from_depth = np.eye(4)
     from_depth[0, 3] = -BASELINE_M if register else 0.0
 
     def load_depth(t: int, c: int) -> Float[np.ndarray, "height width"]:
         depth = read_depth(depths[t], depth_unit_m, width, height)
-        return _warped_to_color(depth) if register else depth
+        if not register:
+            return depth
+        return registered(depth, depth_K, matrix, from_depth, width, height)
 
     files = {"image": images, "depth": depths}
-    if K is None:
-        K = intrinsics(COLOR_FOCAL if register else DEPTH_FOCAL, WIDTH, HEIGHT)
     return Sequence(
         name=_name(root.resolve()),
         camera_ids=(0,),
@@ -91,7 +96,7 @@ def read_seven_scenes(
         height=height,
         times=np.array(numbers) / RATE_HZ,
         frame_ids=tuple(numbers),
-        Ks=np.broadcast_to(intrinsics_matrix(K), (frames, 1, 3, 3)),
+        Ks=np.broadcast_to(matrix, (frames, 1, 3, 3)),
         viewmats=(from_depth @ np.linalg.inv(poses))[:, None],
         load_image=lambda t, c: read_image(images[t], width, height),
         load_depth=load_depth,
@@ -102,23 +107,6 @@ def read_seven_scenes(
 def _name(root: Path) -> str:
     """The folder's name, preceded by that of the scene if the folder is one of its sequences."""
     return f"{root.parent.name}_{root.name}" if root.name.startswith("seq-") else root.name
-
-
-def _warped_to_color(depth: Float[np.ndarray, "height width"]) -> Float[np.ndarray, "height width"]:
-    """Depth of the depth camera warped into the colour camera's view; 0 where no point falls.
-
-    The colour camera's pixels are wider, so surfaces that face it have no holes.
-    """
-    rows, columns = np.nonzero(depth)
-    z = depth[rows, columns]
-    scale = COLOR_FOCAL / DEPTH_FOCAL
-    x = (columns + 0.5 - WIDTH / 2) * scale - COLOR_FOCAL * BASELINE_M / z + WIDTH / 2
-    y = (rows + 0.5 - HEIGHT / 2) * scale + HEIGHT / 2
-    column, row = np.floor(x).astype(int), np.floor(y).astype(int)
-    inside = (column >= 0) & (column < WIDTH) & (row >= 0) & (row < HEIGHT)
-    nearest = np.full((HEIGHT, WIDTH), np.inf, np.float32)
-    np.minimum.at(nearest, (row[inside], column[inside]), z[inside])
-    return np.where(np.isfinite(nearest), nearest, np.float32(0))
 
 
 def _read_frames(root: Path) -> tuple[list[int], Float[np.ndarray, "t 4 4"], list[Path], list[Path]]:

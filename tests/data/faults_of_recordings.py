@@ -1,6 +1,7 @@
 """Recordings with depth in every layout, scenes of Gaussians, and their faults."""
 
 import json
+import struct
 from pathlib import Path
 
 import jax.numpy as jnp
@@ -10,7 +11,8 @@ from gsjax.data import open_sequence, read_open3d, write_panoptic
 from gsjax.data.simulated import tabletop
 from gsjax.io.ply import read_ply, write_ply
 from gsjax.scene.gaussians import Gaussians
-from tests.data import dots
+from tests.data import dots, realsense_bag
+from tests.data.exports import write_exr, write_record3d
 from tests.data.faults_of_photographs import build_transforms
 from tests.data.faulty import (
     HEIGHT,
@@ -217,6 +219,81 @@ PANOPTIC = (
 )
 
 
+def build_record3d(root: Path) -> None:
+    write_record3d(root, tabletop(frames=1, width=WIDTH, height=HEIGHT, cameras=3), (16, 12))
+
+
+def meta(key: str, value: object) -> Damage:
+    return change("metadata.json", lambda m: m.update({key: value}))
+
+
+def in_frame(key: str, value: object) -> Damage:
+    return change("metadata.json", lambda m: m[key].__setitem__(1, value))
+
+
+def claims_size(side: int) -> Damage:
+    def damage(root: Path) -> None:
+        window, claimed = (struct.pack("<4i", 0, 0, x, y) for x, y in ((15, 11), (side - 1, side - 1)))
+        content = (root / EXR).read_bytes()
+        assert window in content
+        (root / EXR).write_bytes(content.replace(window, claimed, 1))
+
+    return damage
+
+
+def turned(root: Path) -> None:
+    for n in range(3):
+        dots.save(root / f"rgb/{n}.png", picture(n, HEIGHT, WIDTH))
+
+
+EXR, META = "depth/1.exr", "metadata.json"
+RECORD3D = (
+    Fault("metadata missing", gone(META), (META,)),
+    Fault("metadata cut off", cut(META), (META,)),
+    Fault("metadata are a list", holds(META, "[]"), (META,)),
+    Fault("no poses", change(META, lambda m: m.pop("poses")), (META, "poses")),
+    Fault("poses of another form", meta("poses", [[1, 2], [3]]), (META, "poses")),
+    Fault("quaternion not normalised", in_frame("poses", [0, 0, 0, 2, 0, 0, 0]), (META, "frame 1")),
+    Fault("NaN in a pose", in_frame("poses", [np.nan] * 7), ("DATA",)),
+    Fault("poses all zero, as by the front camera", meta("poses", [[0] * 7] * 3), ("DATA",)),
+    Fault("more pictures than poses", change(META, lambda m: m["poses"].pop()), ("DATA",)),
+    Fault("no size", change(META, lambda m: m.pop("w")), (META, "w")),
+    Fault("times that do not increase", in_frame("frameTimestamps", 0.0), ("DATA",)),
+    Fault("depth missing", gone(EXR), ("DATA",)),
+    Fault("depth cut off", cut(EXR), (EXR,)),
+    Fault("depth in another format", holds(EXR, b"PK\3\4"), (EXR,)),
+    Fault("depth that claims a huge size", claims_size(100_000), (EXR,)),
+    Fault("depth of integers", lambda root: write_exr(root / EXR, R=np.ones((12, 16), np.uint32)), (EXR,)),
+    Fault("depth of another shape", lambda r: write_exr(r / EXR, R=np.ones((16, 12), np.float32)), (EXR,)),
+    Fault("image missing", gone("rgb/1.png"), ("DATA",)),
+    Fault("image cut off", cut("rgb/1.png"), ("rgb/1.png",)),
+    Fault("wrong size", drawn("rgb/1.png", picture(0, 16, 12)), ("rgb/1.png",)),
+    Fault("pictures turned by 90 degrees", turned, ("rgb/0.png",)),
+)
+
+
+BAG = "desk.bag"
+
+
+def recorded(**changes) -> Damage:
+    return lambda root: realsense_bag.write(root / BAG, **({"lates": (0.0, 0.0)} | changes))
+
+
+REALSENSE = (
+    Fault("another format", holds(BAG, b"PK\3\4"), (BAG,)),
+    Fault("cut off", cut(BAG), (BAG,)),
+    Fault("no depth", recorded(drop=("Depth_0/image",)), (BAG, "Depth_0")),
+    Fault("no intrinsics", recorded(drop=("Color_0/info",)), (BAG, "Color_0")),
+    Fault("no places of the cameras", recorded(drop=("/tf/0",)), (BAG, "tf/0")),
+    Fault("colour as YUV", recorded(encoding="yuv422"), (BAG,)),
+    Fault("lines that are too short", recorded(step=40), (BAG,)),
+    Fault("size that the images do not have", recorded(info_size=(64, 48)), (BAG,)),
+    Fault("quaternion not normalised", recorded(turn=0), (BAG,)),
+    Fault("depth that is late", recorded(lates=(0.0, 0.025)), (BAG,)),
+    Fault("distorting lens", recorded(distortion=[0.1, 0, 0, 0, 0]), (BAG,)),
+)
+
+
 def build_gaussians(root: Path) -> None:
     random = np.random.default_rng(0)
     shapes = ((3,), (4,), (3,), (), (1, 3))
@@ -244,5 +321,7 @@ RECORDINGS = {
     "BOP": Layout(build_bop, lambda r: load_all(open_sequence(r)), BOP),
     "PARIS": Layout(build_paris, lambda r: load_all(open_sequence(r)), PARIS),
     "Panoptic": Layout(build_panoptic, lambda r: load_all(open_sequence(r)), PANOPTIC),
+    "Record3D": Layout(build_record3d, lambda r: load_all(open_sequence(r)), RECORD3D),
+    "RealSense": Layout(recorded(), lambda r: load_all(open_sequence(r / BAG)), REALSENSE),
     "PLY of Gaussians": Layout(build_gaussians, lambda r: read_ply(r / SCENE), GAUSSIANS),
 }

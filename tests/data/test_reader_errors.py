@@ -44,6 +44,7 @@ listed once.
 this file; a test compares it.
 """
 SHARED = "Several layouts"
+NEEDS = {"Record3D": "OpenEXR", "RealSense": "rosbags"}  # packages of extras
 
 # Messages of other libraries, and file sizes of encoders, differ from version to version.
 _FOREIGN = re.compile(
@@ -149,8 +150,14 @@ def _problem(cases: list[Case], name_layouts: bool) -> str:
     return "; ".join(f"{what} ({', '.join(of)})" if name_layouts else what for what, of in layouts.items())
 
 
+def _skip_without_package_of(layout: str) -> None:
+    if layout in NEEDS:
+        pytest.importorskip(NEEDS[layout])
+
+
 @pytest.mark.parametrize("layout", LAYOUTS)
 def test_sound_data_raises_no_warnings(layout):
+    _skip_without_package_of(layout)
     with warnings.catch_warnings():
         warnings.simplefilter("error", DataWarning)
         LAYOUTS[layout].read(_sound(layout))
@@ -160,6 +167,7 @@ def test_sound_data_raises_no_warnings(layout):
     ("layout", "fault"), [pytest.param(*case, id=f"{case[0]}-{case[1].what}") for case in CASES]
 )
 def test_messages_name_the_file_and_say_what_to_do(layout, fault, tmp_path):
+    _skip_without_package_of(layout)
     refused, message = outcome_of(layout, fault, tmp_path)
     assert all(name in message for name in fault.names), message
     if refused:
@@ -171,6 +179,8 @@ def test_messages_name_the_file_and_say_what_to_do(layout, fault, tmp_path):
 
 
 def test_the_page_and_the_messages_are_up_to_date(tmp_path):
+    for layout in NEEDS:
+        _skip_without_package_of(layout)
     found = found_in(tmp_path)
     for path, text in ((PAGE, page(found)), (MESSAGES, messages(found))):
         assert path.read_text(encoding="utf-8") == text, "run python -m tests.data.test_reader_errors"

@@ -1,0 +1,41 @@
+"""Depth moved from the camera that measured it to another one beside it: registration."""
+
+import numpy as np
+from jaxtyping import Float
+
+
+def registered(
+    depth: Float[np.ndarray, "rows columns"],
+    K: Float[np.ndarray, "3 3"],
+    other_K: Float[np.ndarray, "3 3"],
+    to_other: Float[np.ndarray, "4 4"],
+    width: int,
+    height: int,
+) -> Float[np.ndarray, "height width"]:
+    """Depth as another camera would measure it: moved point by point, of which the nearest counts; 0 where
+    no point falls.
+
+    Where the other camera's pixels are narrower, each point counts for as many of them as it is wide, so
+    surfaces that face it have no holes.
+
+    Args:
+        depth: metres, 0 = invalid.
+        K: intrinsics of the camera that measured it, pixel centres at +0.5.
+        other_K: those of the other camera.
+        to_other: from coordinates of the first camera to those of the other one, OpenCV axes, metres.
+        width, height: size of the other camera's pictures, pixels.
+    """
+    finer = [max(1, int(np.ceil(other_K[i, i] / K[i, i] - 1e-9))) for i in (0, 1)]
+    fine = depth.repeat(finer[1], axis=0).repeat(finer[0], axis=1)
+    rows, columns = np.nonzero(fine)
+    z = fine[rows, columns]
+    rays = [((np.arange(n) + 0.5) / finer[i] - K[i, 2]) / K[i, i] for i, n in enumerate(fine.shape[::-1])]
+    local = np.stack([rays[0][columns] * z, rays[1][rows] * z, z])
+    there = to_other[:3, :3] @ local + to_other[:3, 3:]
+    there = there[:, there[2] > 0]
+    column, row = (np.floor(other_K[i, i] * there[i] / there[2] + other_K[i, 2]) for i in (0, 1))
+    inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+    pixels = (row[inside] * width + column[inside]).astype(int)
+    nearest = np.full(height * width, np.inf, np.float32)
+    np.minimum.at(nearest, pixels, there[2, inside].astype(np.float32))
+    return np.where(np.isfinite(nearest), nearest, np.float32(0)).reshape(height, width)
