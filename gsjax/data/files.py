@@ -4,8 +4,6 @@ import io
 import json
 import re
 import warnings
-import zipfile
-import zlib
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +14,7 @@ from jaxtyping import Float, UInt8
 from gsjax.data.errors import DataError, MissingFile
 from gsjax.data.pictures import is_cut_off, is_raw, unread_format
 from gsjax.data.text import decoded
+from gsjax.io.arrays import ArraysError, load_arrays
 
 SATURATED_DEPTH = 65535
 """The largest 16-bit value: converters clip to it, and the Kinect writes it where it measured nothing."""
@@ -60,7 +59,7 @@ def read_json(path: Path) -> Any:
     text = read_text(path, "a JSON file")
     try:
         return _parsed(text)
-    except (json.JSONDecodeError, RecursionError) as error:
+    except (ValueError, RecursionError) as error:  # a number of too many digits is no JSONDecodeError
         raise DataError(path, "a JSON file", f"bad JSON ({error})", "Fetch the file again.") from None
 
 
@@ -80,16 +79,40 @@ def read_arrays(path: Path) -> dict[str, np.ndarray]:
         DataError: the file is missing, truncated, or does not hold plain arrays.
     """
     try:
-        loaded = np.load(path, allow_pickle=False)
-        if isinstance(loaded, np.ndarray):
-            return {"": loaded}
-        with loaded:
-            return dict(loaded)
+        return load_arrays(path)
     except FileNotFoundError:
         advice = "Check the folder; was it copied completely?"
         raise DataError(path, "arrays", "no such file", advice) from None
-    except (ValueError, EOFError, MemoryError, OverflowError, zipfile.BadZipFile, zlib.error) as error:
+    except ArraysError as error:
         raise DataError(path, "plain arrays", f"bad data ({error})", "Fetch the file again.") from None
+
+
+def as_numbers(path: Path, what: str, value: Any, shape: tuple[int | None, ...]) -> Float[np.ndarray, "..."]:
+    """Numbers of a file, of a given shape, as float64.
+
+    Args:
+        path: the file, for messages.
+        what: what they are, for messages.
+        value: what the file holds for them.
+        shape: the shape; None where any size will do.
+
+    Raises:
+        DataError: they are no numbers, or of another shape.
+    """
+    try:
+        found = np.asarray(value)
+        given = found.astype(np.float64) if found.dtype.kind in "iuf" else None
+    except (ValueError, TypeError, OverflowError):  # rows of several lengths
+        given = None
+    if (
+        given is None
+        or len(shape) != given.ndim
+        or any(size not in (None, count) for size, count in zip(shape, given.shape, strict=True))
+    ):
+        sizes = "x".join("N" if size is None else str(size) for size in shape)
+        has = repr(value) if given is None else f"{'x'.join(map(str, given.shape)) or 1} numbers"
+        raise DataError(path, f"{what} as {sizes or 1} numbers", has, "Fetch the file again.")
+    return given
 
 
 def image_size(path: Path) -> tuple[int, int]:

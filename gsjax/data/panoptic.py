@@ -19,7 +19,7 @@ import cv2
 import numpy as np
 
 from gsjax.data.errors import DataError, DataWarning
-from gsjax.data.files import SATURATED_DEPTH, read_arrays, read_depth, read_image, read_json
+from gsjax.data.files import SATURATED_DEPTH, as_numbers, read_arrays, read_depth, read_image, read_json
 from gsjax.data.frame_folders import DEFAULT_RATE_HZ
 from gsjax.data.masks import read_mask
 from gsjax.data.names import portable
@@ -232,9 +232,7 @@ def _check_cameras(meta: dict[str, Any], present: list[int]) -> None:
 def _stack(path: Path, key: str, values: list, side: int) -> np.ndarray:
     for t, frame in enumerate(values):
         for c, matrix in enumerate(frame):
-            if np.shape(matrix) != (side, side):
-                found = f"shape {np.shape(matrix)} in frame {t}, camera position {c}"
-                raise DataError(path, f"{key} of shape ({side}, {side})", found, _ADVICE_META)
+            as_numbers(path, f"{key} in frame {t}, camera position {c},", matrix, (side, side))
     return np.asarray(values, np.float64)
 
 
@@ -272,7 +270,10 @@ def _read_truth(root: Path, frames: int, present: list[int]) -> Truth | None:
                 raise DataError(path, expected, f"{poses.shape}", "Regenerate the file.")
             labels = np.arange(first_label, first_label + len(names))
             joints = _read_joints(path, described.get("joints", {}), arrays.get("q"), names, frames)
-            truth = Truth(names=names, label_ids=labels, poses=poses, robot=robot, joints=joints)
+            try:
+                truth = Truth(names=names, label_ids=labels, poses=poses, robot=robot, joints=joints)
+            except ValueError as error:
+                raise ValueError(f"{path}: {error}") from None
             return truth.select(present)
     return None
 

@@ -27,6 +27,7 @@ from jaxtyping import UInt8
 
 from gsjax.io.atomic import atomic_write
 from gsjax.io.codebooks import codebook, nearest, palette
+from gsjax.io.parsed import parse_json
 from gsjax.io.scene_file import (
     AGAIN,
     REST_SIZES,
@@ -106,8 +107,8 @@ class _Meta:
     def __init__(self, path: Path, text: bytes):
         self.path = path
         try:
-            self._values = json.loads(text[:_MOST_TEXT])
-        except (ValueError, RecursionError) as error:
+            self._values = parse_json(text[:_MOST_TEXT])
+        except ValueError as error:
             raise SceneError(path, f"JSON in {_META}", f"other text ({error})", AGAIN) from error
 
     def get(self, *keys: str, default: Any = None) -> Any:
