@@ -172,7 +172,7 @@ def try_apart(name: str, first: int, end: int, seed: int) -> Iterator[Case]:
         seed: of all cases.
     """
     context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(["benchmarks.fuzz_files"])  # imported once for all processes
+    context.set_forkserver_preload(["benchmarks.readers"])  # imported once for all processes
     while first < end:
         ours, theirs = context.Pipe(duplex=False)
         process = context.Process(target=_work, args=(name, first, end, seed, theirs))

@@ -91,7 +91,7 @@ def _scene(path: Path) -> Arrays:
 
 
 def _scene_reader(name: str, build: Callable[[Path], object]) -> Reader:
-    return Reader(lambda root: build(root / name), lambda root: _scene(root / name))
+    return Reader(lambda root: build(root / name), lambda root: _scene(root / name), 0.5)
 
 
 def _written(path: Path) -> None:
@@ -128,7 +128,7 @@ SCENES = {
     "SPZ 3": _scene_reader("scene.spz", _written),
     "SPZ 4": _scene_reader("scene.spz", lambda path: spz4(make_scene(20, 1), path)),
     "SOG": _scene_reader("scene.sog", lambda path: path.write_bytes(sog())),
-    "SOG in a folder": Reader(_sog_folder, lambda root: _scene(root / "meta.json")),
+    "SOG in a folder": Reader(_sog_folder, lambda root: _scene(root / "meta.json"), 0.5),
 } | {
     f".ksplat, level {level}": _scene_reader(
         "scene.ksplat", lambda path, level=level: path.write_bytes(ksplat(level, make_scene(20, 1), 1))
@@ -223,7 +223,7 @@ _OWN_K = ReadOptions(K=K)
 
 
 def _layout(
-    build: Callable[[Path], object], read: Callable[[Path], Photographs | Sequence], share: float = 1.0
+    build: Callable[[Path], object], read: Callable[[Path], Photographs | Sequence], share: float = 0.5
 ) -> Reader:
     return Reader(build, lambda root: _look(read(root)), share)
 
@@ -399,11 +399,11 @@ _MAP = np.random.default_rng(0).normal(size=(6, 8, 4)).astype(np.float32)
 KEPT = {
     "checkpoint": Reader(_checkpoint, _restored),
     "run of fit": Reader(_fit_run, _record),
-    "tracked poses": Reader(_trajectory, _tracking),
-    "run of parts": Reader(_parts_run, _parts),
-    "deforming scene": Reader(_deforming, _deformation),
-    "field": Reader(_field, _features_of_field),
-    "script of edits": Reader(lambda root: (root / "edit.yml").write_text(_SCRIPT), _script),
+    "tracked poses": Reader(_trajectory, _tracking, 0.5),
+    "run of parts": Reader(_parts_run, _parts, 0.3),
+    "deforming scene": Reader(_deforming, _deformation, 0.5),
+    "field": Reader(_field, _features_of_field, 0.5),
+    "script of edits": Reader(lambda root: (root / "edit.yml").write_text(_SCRIPT), _script, 0.1),
     "features, .npy": _features(lambda root: np.save(root / "a.npy", _MAP)),
     "features, .npz": _features(lambda root: np.savez_compressed(root / "a.npz", features=_MAP)),
     "features, a codebook": _features(_codebook),

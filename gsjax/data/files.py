@@ -15,6 +15,7 @@ from gsjax.data.errors import DataError, MissingFile
 from gsjax.data.pictures import is_cut_off, is_raw, unread_format
 from gsjax.data.text import decoded
 from gsjax.io.arrays import ArraysError, load_arrays
+from gsjax.io.pictures import PictureError, pillow_errors
 
 SATURATED_DEPTH = 65535
 """The largest 16-bit value: converters clip to it, and the Kinect writes it where it measured nothing."""
@@ -131,18 +132,18 @@ def picture_size(path: Path) -> tuple[int, int]:
     Raises:
         DataError: the file is missing or not an image.
     """
-    from PIL import Image, UnidentifiedImageError
+    from PIL import Image
 
     try:
         with path.open("rb") as file:
             head = file.read(_HEAD)
             if is_raw(path, head):
                 raise _not_read(path, "an image", head)
-            with Image.open(file) as image:
+            with pillow_errors(), Image.open(file) as image:
                 return image.size
     except (FileNotFoundError, IsADirectoryError, NotADirectoryError):
         raise _no_such_file(path, "an image") from None
-    except (UnidentifiedImageError, OSError, Image.DecompressionBombError) as error:
+    except PictureError as error:
         raise _not_read(path, "an image", head, f"{path.stat().st_size} bytes; {error}") from None
 
 
@@ -219,12 +220,12 @@ def _is_transparent(pixels: UInt8[np.ndarray, "height width channels"]) -> bool:
 
 def _has_transparency(path: Path) -> bool:
     """Whether a photograph has a channel or a colour for it, by its header."""
-    from PIL import Image, UnidentifiedImageError
+    from PIL import Image
 
     try:
-        with Image.open(path) as image:
+        with pillow_errors(), Image.open(path) as image:
             return image.has_transparency_data
-    except (UnidentifiedImageError, OSError, Image.DecompressionBombError):
+    except PictureError:
         return False  # whoever reads it tells
 
 
@@ -287,11 +288,11 @@ def _decoded_by_pillow(content: bytes) -> np.ndarray | None:
     from PIL import Image
 
     try:
-        with warnings.catch_warnings(), Image.open(io.BytesIO(content)) as image:
+        with pillow_errors(), warnings.catch_warnings(), Image.open(io.BytesIO(content)) as image:
             warnings.simplefilter("ignore")  # of damaged files, which become errors
             channels = "RGBA" if image.has_transparency_data else "RGB"
             pixels = np.asarray(image.convert(channels))
-    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError):
+    except PictureError:
         return None
     return cv2.cvtColor(pixels, cv2.COLOR_RGBA2BGRA if channels == "RGBA" else cv2.COLOR_RGB2BGR)
 
