@@ -1,5 +1,5 @@
-"""Damaged files of every reader are read or refused in a sentence, in bounds: see benchmarks/fuzz_files.py, which
-tries more of them."""
+"""Damaged files of every reader are read or refused in a sentence, in bounds; benchmarks/fuzz_files.py tries
+more of them."""
 
 import pytest
 
