@@ -260,14 +260,31 @@ def decode(path: Path, kind: str) -> np.ndarray:
         kind: what it is, for messages.
 
     Raises:
-        DataError: the file is missing, truncated, or not a picture that is read.
+        DataError: the file is missing, truncated, not a picture that is read, or says that it has far more
+            pixels than a camera takes.
     """
     content = read_complete(path, kind)
+    if _is_bomb(content):
+        found = f"{len(content)} bytes that say they are far more pixels than any camera takes"
+        raise DataError(path, kind, found, "Fetch the file again, or save it smaller.")
     image = None if _has_transparent_grey(content) else _decoded_by_opencv(content)
     image = _decoded_by_pillow(content) if image is None else image
     if image is None:
         raise _not_read(path, kind, content[:_HEAD], f"{len(content)} bytes")
     return image
+
+
+def _is_bomb(content: bytes) -> bool:
+    """Whether a picture, by its header, has more pixels than Pillow would decode; OpenCV would."""
+    from PIL import Image
+
+    try:
+        with pillow_errors(), warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            Image.open(io.BytesIO(content)).close()
+    except PictureError as error:
+        return isinstance(error.__cause__, Image.DecompressionBombError)
+    return False
 
 
 def _has_transparent_grey(content: bytes) -> bool:

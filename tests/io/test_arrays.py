@@ -1,4 +1,4 @@
-"""Arrays, JSON and YAML that are damaged or made to harm: a short reason, and no memory for what is claimed."""
+"""Arrays, JSON and YAML that are damaged or made to harm: a short reason, and no memory for mere claims."""
 
 import tracemalloc
 import zipfile
