@@ -28,7 +28,8 @@ from typing import NamedTuple
 import numpy as np
 
 from benchmarks.mutations import mutated
-from benchmarks.readers import READERS, Reader
+from benchmarks.readers import READERS
+from benchmarks.readers_of_data import Reader
 from gsjax.engine import machine
 from gsjax.engine.messages import describe
 from gsjax.engine.program import USER_ERRORS
