@@ -266,7 +266,8 @@ def _read_truth(root: Path, frames: int, present: list[int]) -> Truth | None:
         if key in arrays and names_key in described:
             names, poses = described[names_key], np.asarray(arrays[key], np.float64)
             if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
-                raise DataError(root / "meta.json", f"a list of names as {names_key}", repr(names), _ADVICE_META)
+                expected = f"a list of names as {names_key}"
+                raise DataError(root / "meta.json", expected, repr(names), _ADVICE_META)
             names = tuple(names)
             if poses.shape != (frames, len(names), 4, 4):
                 expected = f"{key} of shape {(frames, len(names), 4, 4)}: frames, {names_key} of meta.json"
