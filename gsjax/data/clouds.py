@@ -15,6 +15,7 @@ from jaxtyping import Float, Shaped
 from gsjax.data.errors import DataError, DataWarning
 from gsjax.data.photographs import Cloud
 from gsjax.geometry.spherical_harmonics import SH_C0
+from gsjax.io.arrays import load_arrays
 
 NAMES = ("sparse_pc.ply", "points3D.ply")
 """Files of points that nerfstudio and 3DGS write beside their poses without naming them there."""
@@ -104,7 +105,7 @@ def _read_ply(path: Path) -> Columns:
 
 
 def _read_npy(path: Path) -> Columns:
-    array = np.load(path, allow_pickle=False)
+    array = next(iter(load_arrays(path).values()), np.zeros(0))
     if array.dtype.names:
         return {name: array[name].ravel() for name in array.dtype.names}
     return _of_table(array)
@@ -150,6 +151,8 @@ def _read_pcd(path: Path) -> Columns:
     names, types = words["FIELDS"].split(), words["TYPE"].split()
     sizes = [int(size) for size in words["SIZE"].split()]
     counts = [int(count) for count in words.get("COUNT", "1 " * len(names)).split()]
+    if min(counts, default=1) < 1:
+        raise ValueError(f"COUNT {words['COUNT']}")
     fields = [
         (f"{name}_{i}", f"<{kind.lower()}{size}", (count,))
         for i, (name, kind, size, count) in enumerate(zip(names, types, sizes, counts, strict=True))

@@ -2,12 +2,14 @@
 
 from collections.abc import Iterable
 
+from gsjax.io.brief import brief
+
 
 class DataError(ValueError):
     """A file or folder that cannot be used: its path, what was expected, what was found, what to do."""
 
     def __init__(self, path: object, expected: str, found: str, advice: str):
-        super().__init__(f"{path}: expected {expected}, found {found}. {advice}")
+        super().__init__(f"{path}: expected {expected}, found {brief(found)}. {advice}")
         self.path = str(path)
 
 

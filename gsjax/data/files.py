@@ -4,8 +4,6 @@ import io
 import json
 import re
 import warnings
-import zipfile
-import zlib
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +14,8 @@ from jaxtyping import Float, UInt8
 from gsjax.data.errors import DataError, MissingFile
 from gsjax.data.pictures import is_cut_off, is_raw, unread_format
 from gsjax.data.text import decoded
+from gsjax.io.arrays import ArraysError, load_arrays
+from gsjax.io.pictures import PictureError, pillow_errors
 
 SATURATED_DEPTH = 65535
 """The largest 16-bit value: converters clip to it, and the Kinect writes it where it measured nothing."""
@@ -60,7 +60,7 @@ def read_json(path: Path) -> Any:
     text = read_text(path, "a JSON file")
     try:
         return _parsed(text)
-    except (json.JSONDecodeError, RecursionError) as error:
+    except (ValueError, RecursionError) as error:  # a number of too many digits is no JSONDecodeError
         raise DataError(path, "a JSON file", f"bad JSON ({error})", "Fetch the file again.") from None
 
 
@@ -80,16 +80,40 @@ def read_arrays(path: Path) -> dict[str, np.ndarray]:
         DataError: the file is missing, truncated, or does not hold plain arrays.
     """
     try:
-        loaded = np.load(path, allow_pickle=False)
-        if isinstance(loaded, np.ndarray):
-            return {"": loaded}
-        with loaded:
-            return dict(loaded)
+        return load_arrays(path)
     except FileNotFoundError:
         advice = "Check the folder; was it copied completely?"
         raise DataError(path, "arrays", "no such file", advice) from None
-    except (ValueError, EOFError, MemoryError, OverflowError, zipfile.BadZipFile, zlib.error) as error:
+    except ArraysError as error:
         raise DataError(path, "plain arrays", f"bad data ({error})", "Fetch the file again.") from None
+
+
+def as_numbers(path: Path, what: str, value: Any, shape: tuple[int | None, ...]) -> Float[np.ndarray, "..."]:
+    """Numbers of a file, of a given shape, as float64.
+
+    Args:
+        path: the file, for messages.
+        what: what they are, for messages.
+        value: what the file holds for them.
+        shape: the shape; None where any size will do.
+
+    Raises:
+        DataError: they are no numbers, or of another shape.
+    """
+    try:
+        found = np.asarray(value)
+        given = found.astype(np.float64) if found.dtype.kind in "iuf" else None
+    except (ValueError, TypeError, OverflowError):  # rows of several lengths
+        given = None
+    if (
+        given is None
+        or len(shape) != given.ndim
+        or any(size not in (None, count) for size, count in zip(shape, given.shape, strict=True))
+    ):
+        sizes = "x".join("N" if size is None else str(size) for size in shape)
+        has = repr(value) if given is None else f"{'x'.join(map(str, given.shape)) or 1} numbers"
+        raise DataError(path, f"{what} as {sizes or 1} numbers", has, "Fetch the file again.")
+    return given
 
 
 def image_size(path: Path) -> tuple[int, int]:
@@ -108,18 +132,18 @@ def picture_size(path: Path) -> tuple[int, int]:
     Raises:
         DataError: the file is missing or not an image.
     """
-    from PIL import Image, UnidentifiedImageError
+    from PIL import Image
 
     try:
         with path.open("rb") as file:
             head = file.read(_HEAD)
             if is_raw(path, head):
                 raise _not_read(path, "an image", head)
-            with Image.open(file) as image:
+            with pillow_errors(), Image.open(file) as image:
                 return image.size
     except (FileNotFoundError, IsADirectoryError, NotADirectoryError):
         raise _no_such_file(path, "an image") from None
-    except (UnidentifiedImageError, OSError, Image.DecompressionBombError) as error:
+    except PictureError as error:
         raise _not_read(path, "an image", head, f"{path.stat().st_size} bytes; {error}") from None
 
 
@@ -196,12 +220,12 @@ def _is_transparent(pixels: UInt8[np.ndarray, "height width channels"]) -> bool:
 
 def _has_transparency(path: Path) -> bool:
     """Whether a photograph has a channel or a colour for it, by its header."""
-    from PIL import Image, UnidentifiedImageError
+    from PIL import Image
 
     try:
-        with Image.open(path) as image:
+        with pillow_errors(), Image.open(path) as image:
             return image.has_transparency_data
-    except (UnidentifiedImageError, OSError, Image.DecompressionBombError):
+    except PictureError:
         return False  # whoever reads it tells
 
 
@@ -236,14 +260,31 @@ def decode(path: Path, kind: str) -> np.ndarray:
         kind: what it is, for messages.
 
     Raises:
-        DataError: the file is missing, truncated, or not a picture that is read.
+        DataError: the file is missing, truncated, not a picture that is read, or says that it has far more
+            pixels than a camera takes.
     """
     content = read_complete(path, kind)
+    if _is_bomb(content):
+        found = f"{len(content)} bytes that say they are far more pixels than any camera takes"
+        raise DataError(path, kind, found, "Fetch the file again, or save it smaller.")
     image = None if _has_transparent_grey(content) else _decoded_by_opencv(content)
     image = _decoded_by_pillow(content) if image is None else image
     if image is None:
         raise _not_read(path, kind, content[:_HEAD], f"{len(content)} bytes")
     return image
+
+
+def _is_bomb(content: bytes) -> bool:
+    """Whether a picture, by its header, has more pixels than Pillow would decode; OpenCV would."""
+    from PIL import Image
+
+    try:
+        with pillow_errors(), warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            Image.open(io.BytesIO(content)).close()
+    except PictureError as error:
+        return isinstance(error.__cause__, Image.DecompressionBombError)
+    return False
 
 
 def _has_transparent_grey(content: bytes) -> bool:
@@ -264,11 +305,11 @@ def _decoded_by_pillow(content: bytes) -> np.ndarray | None:
     from PIL import Image
 
     try:
-        with warnings.catch_warnings(), Image.open(io.BytesIO(content)) as image:
+        with pillow_errors(), warnings.catch_warnings(), Image.open(io.BytesIO(content)) as image:
             warnings.simplefilter("ignore")  # of damaged files, which become errors
             channels = "RGBA" if image.has_transparency_data else "RGB"
             pixels = np.asarray(image.convert(channels))
-    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError):
+    except PictureError:
         return None
     return cv2.cvtColor(pixels, cv2.COLOR_RGBA2BGRA if channels == "RGBA" else cv2.COLOR_RGB2BGR)
 

@@ -8,6 +8,7 @@ from jaxtyping import Int, UInt8
 
 from gsjax.data.errors import DataError
 from gsjax.data.files import check_size, decode, read_complete
+from gsjax.io.pictures import PictureError, pillow_errors
 
 _KIND, _EXPECTED = "a mask", "one label per pixel"
 _HALF = 128  # of alpha
@@ -87,16 +88,16 @@ def _opaque(path: Path, colors: np.ndarray, alpha: np.ndarray) -> np.ndarray:
 
 def _indexed(path: Path) -> tuple[np.ndarray, np.ndarray]:
     """The indices of a picture and its palette [n,3]; both are empty without a palette."""
-    from PIL import Image, UnidentifiedImageError
+    from PIL import Image
 
     none = np.zeros((0, 0), np.uint8), np.zeros((0, 3), np.uint8)
     content = read_complete(path, _KIND)
     try:
-        with Image.open(io.BytesIO(content)) as image:
+        with pillow_errors(), Image.open(io.BytesIO(content)) as image:
             if image.mode != "P":
                 return none
             return np.asarray(image), np.array(image.getpalette("RGB"), np.uint8).reshape(-1, 3)
-    except (UnidentifiedImageError, OSError, SyntaxError, Image.DecompressionBombError):
+    except PictureError:
         return none  # whoever decodes it tells
 
 

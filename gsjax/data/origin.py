@@ -9,7 +9,7 @@ from typing import Any, ParamSpec, TypeVar
 import numpy as np
 from jaxtyping import Float
 
-from gsjax.data.errors import DataWarning
+from gsjax.data.errors import DataError, DataWarning
 from gsjax.data.objects import PointModel, Truth
 from gsjax.data.photographs import Photographs
 from gsjax.data.sequence import Sequence
@@ -18,12 +18,14 @@ from gsjax.scene.origin import about, far_origin, in_words
 
 Data = TypeVar("Data", Photographs, Sequence)
 Given = ParamSpec("Given")
+_FARTHEST = 1e30  # squares of it are still finite
 _LEAST = 1.0  # size of what cameras that stand still see
 _STILL = 1e-9  # movement, relative to the distance from 0
 
 
 def near_origin(read: Callable[Given, Data]) -> Callable[Given, Data]:
-    """A reader whose data, where they lie far from 0, are relative to an `origin`; it warns of that.
+    """A reader whose data, where they lie far from 0, are relative to an `origin`; it warns of that. What its
+    data refuse (`Sequence`, `Photographs`) is told with the folder, which they do not know.
 
     Args:
         read: reads photographs or a recording in the coordinates of the files.
@@ -31,8 +33,17 @@ def near_origin(read: Callable[Given, Data]) -> Callable[Given, Data]:
 
     @functools.wraps(read)
     def reader(*args: Given.args, **options: Given.kwargs) -> Data:
-        data = read(*args, **options)
+        try:
+            data = read(*args, **options)
+        except ValueError as error:
+            where = str(args[0] if args else next(iter(options.values())))
+            if where in str(error):
+                raise
+            raise ValueError(f"{where}: {error}") from error
         centers = np.linalg.solve(data.viewmats, np.array([0.0, 0.0, 0.0, 1.0])[:, None])[..., :3, 0]
+        if not (np.abs(centers) < _FARTHEST).all():
+            expected, found = f"cameras within {_FARTHEST:g} of 0", f"one at {np.abs(centers).max():g}"
+            raise DataError(args[0] if args else data.name, expected, found, "Correct its pose.")
         cloud = data.cloud if isinstance(data, Photographs) else None
         least = _LEAST if _stand_still(centers) else NEAR
         origin = far_origin(centers.reshape(-1, 3), [] if cloud is None else [cloud.points], least)

@@ -19,7 +19,7 @@ import cv2
 import numpy as np
 
 from gsjax.data.errors import DataError, DataWarning
-from gsjax.data.files import SATURATED_DEPTH, read_arrays, read_depth, read_image, read_json
+from gsjax.data.files import SATURATED_DEPTH, as_numbers, read_arrays, read_depth, read_image, read_json
 from gsjax.data.frame_folders import DEFAULT_RATE_HZ
 from gsjax.data.masks import read_mask
 from gsjax.data.names import portable
@@ -232,9 +232,7 @@ def _check_cameras(meta: dict[str, Any], present: list[int]) -> None:
 def _stack(path: Path, key: str, values: list, side: int) -> np.ndarray:
     for t, frame in enumerate(values):
         for c, matrix in enumerate(frame):
-            if np.shape(matrix) != (side, side):
-                found = f"shape {np.shape(matrix)} in frame {t}, camera position {c}"
-                raise DataError(path, f"{key} of shape ({side}, {side})", found, _ADVICE_META)
+            as_numbers(path, f"{key} in frame {t}, camera position {c},", matrix, (side, side))
     return np.asarray(values, np.float64)
 
 
@@ -266,13 +264,20 @@ def _read_truth(root: Path, frames: int, present: list[int]) -> Truth | None:
     arrays = read_arrays(path)
     for key, names_key, first_label, robot in (("T_wo", "objects", 2, 1), ("T_wp", "parts", 1, None)):
         if key in arrays and names_key in described:
-            names, poses = tuple(described[names_key]), np.asarray(arrays[key], np.float64)
+            names, poses = described[names_key], np.asarray(arrays[key], np.float64)
+            if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+                expected = f"a list of names as {names_key}"
+                raise DataError(root / "meta.json", expected, repr(names), _ADVICE_META)
+            names = tuple(names)
             if poses.shape != (frames, len(names), 4, 4):
                 expected = f"{key} of shape {(frames, len(names), 4, 4)}: frames, {names_key} of meta.json"
                 raise DataError(path, expected, f"{poses.shape}", "Regenerate the file.")
             labels = np.arange(first_label, first_label + len(names))
             joints = _read_joints(path, described.get("joints", {}), arrays.get("q"), names, frames)
-            truth = Truth(names=names, label_ids=labels, poses=poses, robot=robot, joints=joints)
+            try:
+                truth = Truth(names=names, label_ids=labels, poses=poses, robot=robot, joints=joints)
+            except ValueError as error:
+                raise ValueError(f"{path}: {error}") from None
             return truth.select(present)
     return None
 

@@ -9,6 +9,7 @@ objects/tblock.json                     the T-block as Gaussians in its own fram
 """
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -16,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from gsjax.data.association import associate
 from gsjax.data.errors import DataError
-from gsjax.data.files import read_arrays, read_json
+from gsjax.data.files import as_numbers, read_arrays, read_json
 from gsjax.data.objects import PointModel
 from gsjax.data.origin import near_origin
 from gsjax.data.sequence import Sequence
@@ -52,16 +53,19 @@ def read_push_t(path: str | Path, demo: int = 0, *, max_skew: float = MAX_SKEW_S
     root = Path(path)
     folder = root / "sample_demos" / str(demo)
     described = read_json(folder / "cameras.json")
-    if not described:
+    if not isinstance(described, dict) or not described:
         raise DataError(folder / "cameras.json", "at least one camera", "none", "Choose another recording.")
     videos, Ks, poses, stamps = [], [], [], []
     for serial, entry in described.items():
         record = folder / "videos" / f"{serial}.json"
         meta = read_json(record)
-        stamps.append(np.asarray(_get(record, meta, "timestamps"), np.float64))
-        Ks.append(np.asarray(_get(record, meta, "K"), np.float64) + _HALF_PIXEL)
-        poses.append(_get(folder / "cameras.json", entry, "X_WC"))
-        videos.append(Video(record.with_suffix(".mp4"), *_get(record, meta, "resolution"), len(stamps[-1])))
+        stamps.append(_numbers(record, meta, "timestamps", (None,)))
+        Ks.append(_numbers(record, meta, "K", (3, 3)) + _HALF_PIXEL)
+        poses.append(_numbers(folder / "cameras.json", entry, "X_WC", (4, 4)))
+        size = _numbers(record, meta, "resolution", (2,))
+        if not (np.isfinite(size).all() and (size >= 1).all()):
+            raise DataError(record, "a width and a height above 0", f"{size.tolist()}", "Correct it.")
+        videos.append(Video(record.with_suffix(".mp4"), int(size[0]), int(size[1]), len(stamps[-1])))
         if (videos[-1].width, videos[-1].height) != (videos[0].width, videos[0].height):
             found = f"{videos[-1].width}x{videos[-1].height}"
             expected = f"{videos[0].width}x{videos[0].height} as for the first camera"
@@ -88,12 +92,12 @@ def _read_models(root: Path) -> tuple[PointModel, ...]:
     """The ground and the block, if their files exist."""
     ground, plane_path = root / "environment" / "ground.npy", root / "environment" / "ground_plane.json"
     block = root / "objects" / "tblock.json"
-    plane = (
-        np.asarray(_get(plane_path, read_json(plane_path), "plane"), float) if plane_path.exists() else None
-    )
+    plane = _numbers(plane_path, read_json(plane_path), "plane", (4,)) if plane_path.exists() else None
     models = []
     if ground.exists() and plane is not None:
-        models.append(_ground_model(read_arrays(ground)[""], plane))
+        models.append(
+            _ground_model(as_numbers(ground, "points", read_arrays(ground).get(""), (None, 3)), plane)
+        )
     if block.exists():
         models.append(_block_model(block, plane))
     return tuple(models)
@@ -124,15 +128,19 @@ def _block_model(path: Path, plane: Float[np.ndarray, "4"] | None) -> PointModel
     sky blue, while the block in the videos is orange.
     """
     gaussians = _get(path, read_json(path), "gaussians")
-    fields = {
-        name: np.asarray(_get(path, gaussians, name), np.float64)
-        for name in ("means", "quats", "scales", "opacities", "colors")
-    }
+    shapes = {"means": (None, 3), "quats": (None, 4), "scales": (None, 3), "opacities": (None,)}
+    shapes["colors"] = (None, 3)
+    fields = {name: _numbers(path, gaussians, name, shape) for name, shape in shapes.items()}
     fields["colors"] = fields["colors"][:, ::-1].copy()
     return PointModel(name="tblock", label=BLOCK_LABEL, plane=plane, **fields)
 
 
-def _get(path: Path, record: dict, key: str):
-    if key not in record:
-        raise DataError(path, f"the key {key!r}", f"only {', '.join(record)}", "Fetch the file again.")
+def _get(path: Path, record: Any, key: str) -> Any:
+    if not isinstance(record, dict) or key not in record:
+        found = f"only {', '.join(record)}" if isinstance(record, dict) else "something else"
+        raise DataError(path, f"the key {key!r}", found, "Fetch the file again.")
     return record[key]
+
+
+def _numbers(path: Path, record: Any, key: str, shape: tuple[int | None, ...]) -> Float[np.ndarray, "..."]:
+    return as_numbers(path, key, _get(path, record, key), shape)

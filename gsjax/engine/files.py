@@ -1,8 +1,6 @@
 """Files of a run read back, whichever command made it: arrays, the scene, the recording. `again` is the
 advice of error messages if a file is not as it was written."""
 
-import zipfile
-import zlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields, replace
 from pathlib import Path
@@ -10,13 +8,15 @@ from typing import Any
 
 import equinox as eqx
 import numpy as np
-import yaml
 from jaxtyping import Float, Int
 
 from gsjax.data import ReadOptions
 from gsjax.data.errors import DataError
 from gsjax.data.origin import relative_to_origin
 from gsjax.engine.recording import Opener, Recording, open_recording
+from gsjax.io.arrays import ArraysError, load_arrays
+from gsjax.io.brief import brief
+from gsjax.io.parsed import parse_yaml
 from gsjax.io.ply import write_ply
 from gsjax.io.scene_file import SceneReport
 from gsjax.io.scenes import read_gaussians
@@ -37,15 +37,14 @@ def read_arrays(file: Path, wanted: Sequence[str], again: str) -> dict[str, np.n
         ValueError: it cannot be read, or lacks one of them.
     """
     try:
-        with np.load(file, allow_pickle=False) as saved:
-            arrays = dict(saved)
-    except (ValueError, TypeError, EOFError, zipfile.BadZipFile, zlib.error) as error:
+        arrays = load_arrays(file)
+    except ArraysError as error:
         raise ValueError(
             f"{file}: expected plain arrays, found a file that cannot be read; {again}"
         ) from error
     missing = [name for name in wanted if name not in arrays]
     if missing:
-        raise ValueError(f"{file}: expected an array {missing[0]}, found {', '.join(arrays)}; {again}")
+        raise ValueError(f"{file}: expected an array {missing[0]}, found {brief(', '.join(arrays))}; {again}")
     return arrays
 
 
@@ -165,14 +164,17 @@ def reopen(
         ValueError: the settings are not those of a run, or the recording cannot be opened.
     """
     try:
-        settings = yaml.safe_load(config.read_text(encoding="utf-8"))
+        settings = parse_yaml(config.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise ValueError(f"{config}: expected a run's settings, found others ({error}); {again}") from error
+    try:
         wanted = also(settings)
         read = read_options(settings.get("read") or {})
         scale = float(settings.get("scale", 1.0))
         dataset, cameras, frames = (settings[name] for name in _SETTINGS)
         held_out = settings.get("eval_cameras") or ()  # which not all commands have
         return open_recording(dataset, cameras, held_out, frames, read, scale, opened), wanted
-    except (yaml.YAMLError, KeyError, TypeError, AttributeError) as error:
+    except (KeyError, TypeError, AttributeError) as error:
         listed = ", ".join(_SETTINGS)
         raise ValueError(f"{config}: expected a run's settings ({listed}), found others; {again}") from error
     except DataError as error:

@@ -2,10 +2,9 @@
 
 import dataclasses
 import enum
-import json
 import os
 import shutil
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from fnmatch import fnmatch
 from pathlib import Path
@@ -15,7 +14,9 @@ import yaml
 
 from gsjax.engine.locks import LOCK, lock, locked
 from gsjax.io.atomic import atomic_write, write_json, write_npz
+from gsjax.io.brief import brief
 from gsjax.io.labels import ENDING
+from gsjax.io.parsed import parse_json, parse_yaml
 from gsjax.io.scenes import is_scene
 
 _WRITTEN = (
@@ -35,7 +36,19 @@ _RESUMED = ("resume/*", "canonical/resume/*", "canonical/scene.ply")
 OF_QUERY = ("query.json", "selection.npz", "masks", "frames", "video.mp4", "overview.png")
 OF_QUERY += ("object.ply", "without.ply", "recolored.ply", "moved.ply", f"*{ENDING}")
 """The files that `gsjax query` writes."""
+_ANEW = "restore it, or replace the run with --overwrite"
 SIGNATURE = "# gsjax run"  # the first line of config.yml: other programs write files of that name too
+
+
+def _stored(file: Path, parse: Callable[[str], Any]) -> dict[str, Any]:
+    """What a run stored by name; raises a ValueError if the file holds something else."""
+    try:
+        found = parse(file.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise ValueError(f"{file}: expected what a run wrote, found other text ({error}); {_ANEW}") from error
+    if not isinstance(found, dict):
+        raise ValueError(f"{file}: expected names and values, found {brief(repr(found))}; {_ANEW}")
+    return found
 
 
 def is_run(folder: Path) -> bool:
@@ -193,7 +206,7 @@ class RunFolder:
         """Whether a run that was not stopped has written everything: its report comes last."""
         if not self.metrics.is_file():
             return False
-        found = json.loads(self.metrics.read_text(encoding="utf-8"))
+        found = _stored(self.metrics, parse_json)
         return found.get("complete", True) and (self.report.is_file() or not found.get("report", True))
 
     def forget_resume(self) -> None:
@@ -237,11 +250,11 @@ class RunFolder:
 
     def setting(self, name: str) -> Any:
         """A setting of config.yml."""
-        return _flat(yaml.safe_load(self.config.read_text(encoding="utf-8"))).get(name)
+        return _flat(_stored(self.config, parse_yaml)).get(name)
 
     def check_config(self, config: Any, *, but: tuple[str, ...]) -> None:
         """Raises ValueError if config.yml differs from `config` in settings other than `but`."""
-        stored = _flat(yaml.safe_load(self.config.read_text(encoding="utf-8")))
+        stored = _flat(_stored(self.config, parse_yaml))
         given = _flat(plain(dataclasses.asdict(config)))
         names = [n for n in dict.fromkeys([*given, *stored]) if n.split(".")[0] not in but]
         others = [name for name in names if stored.get(name) != given.get(name)]

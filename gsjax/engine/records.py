@@ -1,15 +1,14 @@
 """The record of a run, read from its files: its settings, its scores, its curve."""
 
 import hashlib
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-import yaml
-
 from gsjax.engine.folder import expect_run, is_run
+from gsjax.io.brief import brief
+from gsjax.io.parsed import parse_json, parse_yaml
 
 Kind = Literal["fit", "track", "parts", "distill", "deform"]
 EVALUATION = Path("eval", "metrics.json")
@@ -101,8 +100,8 @@ def read_config(file: Path) -> dict[str, Any]:
         ValueError: the file holds something else.
     """
     try:
-        config = yaml.safe_load(file.read_text(encoding="utf-8"))
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        config = parse_yaml(file.read_text(encoding="utf-8"))
+    except ValueError as error:
         raise ValueError(f"{file}: expected the settings of a run, found invalid YAML ({error})") from error
     if not isinstance(config, dict):
         raise ValueError(f"{file}: expected the settings of a run, found none")
@@ -123,7 +122,7 @@ def _kind(path: Path, config: Mapping[str, Any]) -> Kind:
             return kind
     raise ValueError(
         f"{path}: expected a run of {', '.join(f'`gsjax {kind}`' for kind in sorted(marks))}, found settings "
-        f"of another command or version ({', '.join(list(config)[:6])})"
+        f"of another command or version ({brief(', '.join(map(str, list(config)[:6])))})"
     )
 
 
@@ -132,7 +131,7 @@ def _object(file: Path, wanted: tuple[str, ...]) -> dict[str, Any] | None:
     if not file.is_file():
         return None
     try:
-        found = json.loads(file.read_text(encoding="utf-8"))
+        found = parse_json(file.read_text(encoding="utf-8"))
     except ValueError as error:
         raise ValueError(f"{file}: expected the scores of a run, found invalid JSON ({error})") from error
     _expect(file, found, wanted)
@@ -143,7 +142,7 @@ def _lines(file: Path, kind: Kind) -> list[dict[str, Any]]:
     if not file.is_file():
         return []
     try:
-        rows = [json.loads(line) for line in file.read_text(encoding="utf-8").splitlines() if line]
+        rows = [parse_json(line) for line in file.read_text(encoding="utf-8").splitlines() if line]
     except ValueError as error:
         raise ValueError(f"{file}: expected JSON on each line, found something else ({error})") from error
     for row in rows:

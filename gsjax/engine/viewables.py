@@ -7,7 +7,6 @@ from typing import Literal
 
 import jax.numpy as jnp
 import numpy as np
-import yaml
 
 from gsjax.data.ordered import open_as_sequence
 from gsjax.data.origin import relative_to_origin
@@ -27,6 +26,7 @@ from gsjax.engine.photographs import photographs_of_run
 from gsjax.engine.query import asking_of
 from gsjax.engine.recording import Recording
 from gsjax.engine.track.saved import open_run, read_tracking
+from gsjax.io.parsed import parse_yaml
 from gsjax.io.sequences import frame_files
 from gsjax.methods.deform import DeformResult
 from gsjax.methods.deform.query import most_likely
@@ -172,7 +172,7 @@ def _of_fit(path: Path, notes: Notes, now: Whereabouts) -> Viewable:
     else:
         gaussians, labels, origin = field.gaussians, field.labels, field.origin
     try:
-        settings = yaml.safe_load(config.read_text(encoding="utf-8"))
+        settings = parse_yaml(config.read_text(encoding="utf-8"))
         antialiased = bool(settings["fit"]["antialiased"])
         behind = settings["fit"]["background"]
         shots, photographs = None, None
@@ -181,7 +181,7 @@ def _of_fit(path: Path, notes: Notes, now: Whereabouts) -> Viewable:
             shots = _shots_of(photographs)
         except (ValueError, OSError) as error:
             notes.warn(f"its photographs are not shown: {describe(error)}")
-    except (yaml.YAMLError, KeyError, TypeError, AttributeError) as error:
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise ValueError(f"{config}: expected the settings of a fit, found others ({error})") from error
     background = photographs.background if photographs is not None and behind == "data" else None
     if background is None:

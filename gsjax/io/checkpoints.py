@@ -10,8 +10,6 @@ import dataclasses
 import hashlib
 import json
 import os
-import zipfile
-import zlib
 from collections.abc import Mapping
 from importlib import import_module
 from pathlib import Path
@@ -22,7 +20,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from gsjax.io.arrays import load_arrays
 from gsjax.io.atomic import write_npz
+from gsjax.io.brief import brief
+from gsjax.io.parsed import parse_json
 
 _FORMAT = 2  # 1 needed a template
 _HEADER = "__header__"
@@ -71,7 +72,7 @@ def load_checkpoint(path: str | os.PathLike) -> tuple[Any, dict[str, Any]]:
     except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
         raise CheckpointError(
             f"{path}: expected a checkpoint of gsjax {import_module('gsjax').__version__}, found one of "
-            f"gsjax {header.get('version')} that differs ({error}); {_ANEW}"
+            f"gsjax {header.get('version')} that differs ({brief(error)}); {_ANEW}"
         ) from error
 
 
@@ -199,28 +200,20 @@ def _read(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     if not path.is_file():
         raise FileNotFoundError(f"{path}: expected a checkpoint, found no file. Check the path")
     try:
-        with np.load(path, allow_pickle=False) as archive:
-            stored = {name: archive[name] for name in archive.files}
-        header = json.loads(str(stored.pop(_HEADER)))
+        stored = load_arrays(path)
+        header = parse_json(str(stored.pop(_HEADER)))
         written, intact = header["format"], header["sha256"] == _checksum(stored)
-    except (
-        zipfile.BadZipFile,
-        zlib.error,
-        ValueError,
-        KeyError,
-        TypeError,
-        EOFError,
-        OSError,
-        AttributeError,
-    ) as error:
+        if not isinstance(header["metadata"], dict):
+            raise ValueError("metadata without names")
+    except (ValueError, KeyError, TypeError) as error:
         raise CheckpointError(
-            f"{path}: expected a checkpoint, found a file that cannot be read as one ({error}). "
+            f"{path}: expected a checkpoint, found a file that cannot be read as one ({brief(error)}). "
             "It may be truncated or damaged; use another one"
         ) from error
     if written != _FORMAT:
         raise CheckpointError(
-            f"{path}: expected a checkpoint of format {_FORMAT}, found format {written}, written by another "
-            f"version of gsjax; {_ANEW}"
+            f"{path}: expected a checkpoint of format {_FORMAT}, found format {brief(written)}, written by "
+            f"another version of gsjax; {_ANEW}"
         )
     if not intact:
         raise CheckpointError(

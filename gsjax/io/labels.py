@@ -2,13 +2,12 @@
 
 import os
 import warnings
-import zipfile
-import zlib
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Int, Integer
 
+from gsjax.io.arrays import ArraysError, load_arrays
 from gsjax.io.atomic import write_npz
 
 ENDING = "_labels.npz"
@@ -44,9 +43,8 @@ def read_labels(path: str | os.PathLike, count: int) -> Int[np.ndarray, "N"] | N
         return None
     expected = f"expected {count} integers called {_NAME}, one for each Gaussian of {Path(path).name}"
     try:
-        with np.load(file, allow_pickle=False) as saved:
-            found = saved[_NAME]
-    except (ValueError, KeyError, TypeError, EOFError, OSError, zipfile.BadZipFile, zlib.error):
+        found = load_arrays(file)[_NAME]
+    except (ArraysError, KeyError):
         said = "a file without them"
     else:
         if found.shape == (count,) and np.issubdtype(found.dtype, np.integer):

@@ -1,11 +1,37 @@
-"""Writing pictures to files."""
+"""Writing pictures to files, and the errors of damaged ones."""
 
+import struct
+import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import cv2
 import numpy as np
 
 from gsjax.io.atomic import atomic_write
+from gsjax.io.brief import brief
+
+# Pillow's plug-ins check little of what a file says before they use it.
+_DAMAGED = (
+    *(OSError, ValueError, TypeError, LookupError, ArithmeticError, AttributeError, AssertionError),
+    *(SyntaxError, EOFError, MemoryError, RuntimeError, struct.error, zlib.error),
+)
+
+
+class PictureError(ValueError):
+    """Pillow cannot read a picture; the message says why in a few words, and does not name the file."""
+
+
+@contextmanager
+def pillow_errors() -> Iterator[None]:
+    """Whatever Pillow raises in the block for a damaged picture is raised as a PictureError."""
+    from PIL import Image
+
+    try:
+        yield
+    except (*_DAMAGED, Image.DecompressionBombError) as error:
+        raise PictureError(brief(error) or type(error).__name__) from error
 
 
 def write_png(path: Path, picture: np.ndarray) -> None:

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
+from gsjax.io.brief import brief
 from gsjax.scene.gaussians import SH_SIZES, Gaussians, take, valid_rows
 
 REST_SIZES = tuple(size - 1 for size in SH_SIZES)
@@ -25,7 +26,7 @@ class SceneError(ValueError):
     """A file is not one of Gaussians; the message has the path, what was expected and found, and advice."""
 
     def __init__(self, path: str | os.PathLike, expected: str, found: str, advice: str):
-        super().__init__(f"{path}: expected {expected}, found {found}. {advice}")
+        super().__init__(f"{path}: expected {expected}, found {brief(found)}. {advice}")
 
 
 @dataclass(frozen=True)

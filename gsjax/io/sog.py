@@ -27,6 +27,8 @@ from jaxtyping import Int, UInt8
 
 from gsjax.io.atomic import atomic_write
 from gsjax.io.codebooks import codebook, nearest, palette
+from gsjax.io.parsed import parse_json
+from gsjax.io.pictures import PictureError, pillow_errors
 from gsjax.io.scene_file import (
     AGAIN,
     REST_SIZES,
@@ -46,6 +48,7 @@ from gsjax.scene.gaussians import Gaussians
 MAGIC = b"PK"
 _META = "meta.json"
 _MOST_TEXT = 1 << 24
+_LONGEST_NAME = 255
 _PALETTE_ROW = 64
 _MOST_PALETTE = 1 << 16
 _LARGEST = 252
@@ -106,8 +109,8 @@ class _Meta:
     def __init__(self, path: Path, text: bytes):
         self.path = path
         try:
-            self._values = json.loads(text[:_MOST_TEXT])
-        except (ValueError, RecursionError) as error:
+            self._values = parse_json(text[:_MOST_TEXT])
+        except ValueError as error:
             raise SceneError(path, f"JSON in {_META}", f"other text ({error})", AGAIN) from error
 
     def get(self, *keys: str, default: Any = None) -> Any:
@@ -141,6 +144,8 @@ class _Meta:
         for name in value[:count]:
             if name != Path(name).name or "\\" in name or name in ("", ".", ".."):
                 raise self._fault(keys, "names of files without a folder", name)
+            if len(name) > _LONGEST_NAME or "\0" in name:
+                raise self._fault(keys, "names of files", name)
         return value[:count]
 
     def _fault(self, keys: tuple[str, ...], expected: str, value: Any) -> SceneError:
@@ -181,17 +186,16 @@ def _read(path: Path, load: Load) -> tuple[Gaussians, SceneReport]:
 
 def _picture(path: Path, name: str, data: bytes) -> UInt8[np.ndarray, "H W 4"]:
     """A picture as RGBA, whose size is known before it is decoded."""
-    from PIL import Image, UnidentifiedImageError
+    from PIL import Image
 
     try:
-        with warnings.catch_warnings():
+        with pillow_errors(), warnings.catch_warnings():
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # the size is checked here
             picture = Image.open(io.BytesIO(data), formats=("WEBP", "PNG"))
         expect_room(path, 4 * picture.width * picture.height, len(data), name)
-        return np.asarray(picture.convert("RGBA"))
-    except SceneError:
-        raise
-    except (UnidentifiedImageError, OSError, ValueError, Image.DecompressionBombError) as error:
+        with pillow_errors():
+            return np.asarray(picture.convert("RGBA"))
+    except PictureError as error:
         raise SceneError(path, f"a WebP or PNG picture as {name}", f"another ({error})", AGAIN) from error
 
 

@@ -31,6 +31,7 @@ _LAYOUTS = (
     "NAME_s.npy with NAME_f.npy (LangSplat), NAME_fmap_CxHxW.npy or .pt (Feature-3DGS), level_0.npy or "
     "one .npy of all images (LERF), NAME.npy, or NAME.npz with features, or with ids and codebook"
 )
+_LONGEST = 200  # characters of what is quoted of a file
 # Masks compress a thousandfold but are small; features are large but compress far less.
 _LARGE, _MOST_PACKED = 2**30, 100  # bytes; largest compression ratio
 
@@ -189,7 +190,7 @@ def _archive(path: Path) -> PictureFeatures:
         _expect(path, ids, 2, "ids of shape [H,W]")
         _expect(path, codebook, 2, "a codebook of shape [n,C]")
         return PictureFeatures(path, _rows(path, ids, len(codebook)), codebook.astype(np.float32))
-    listed = ", ".join(entries) or "nothing"
+    listed = ", ".join(entries)[:_LONGEST] or "nothing"
     raise ValueError(f"{path}: expected features, or ids and codebook, found {listed}")
 
 
@@ -237,7 +238,7 @@ def _refusing(path: Path, expected: str) -> Iterator[None]:
     try:
         yield
     except Exception as error:
-        reason = str(error) or type(error).__name__
+        reason = str(error)[:_LONGEST] or type(error).__name__
         raise ValueError(
             f"{path}: expected {expected}, found a file that cannot be read ({reason}); make it again, with "
             f"{'numpy.savez' if path.suffix == '.npz' else 'numpy.save'}"

@@ -157,6 +157,7 @@ def test_files_without_colours_are_grey(tmp_path):
         ("a.pcd", pcd_bytes("F").replace(b"POINTS 2", b"POINTS 99999999999999999999"), "a PCD file"),
         ("a.pcd", PCD.format(name="rgb", kind="F", data="binary_compressed"), "save it as binary"),
         ("a.pcd", PCD.format(name="rgb", kind="Q", data="binary"), "a PCD file"),
+        ("a.pcd", pcd_bytes("F").replace(b"COUNT 1", b"COUNT 0"), "COUNT 0 1 1 1"),
     ],
 )
 def test_other_files_that_are_no_points(tmp_path, name, content, says):

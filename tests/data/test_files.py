@@ -1,6 +1,8 @@
 """Single pictures in all formats that programs save."""
 
 import io
+import struct
+import zlib
 
 import cv2
 import numpy as np
@@ -9,6 +11,7 @@ from PIL import Image
 
 from gsjax.data import DataError
 from gsjax.data.files import (
+    as_numbers,
     background_behind,
     image_size,
     picture_size,
@@ -230,3 +233,31 @@ def test_what_is_no_text_is_refused(tmp_path, content):
 def test_json_with_backslashes_that_were_not_escaped(tmp_path):
     (tmp_path / "a.json").write_text(r'{"a": "images\000.png", "b": "c\\d", "e": "f\"g", "h": "i\test"}')
     assert read_json(tmp_path / "a.json") == {"a": r"images\000.png", "b": r"c\d", "e": 'f"g', "h": r"i\test"}
+
+
+@pytest.mark.parametrize("side", [20_000, 30_000, 50_000])
+def test_a_picture_that_says_it_is_huge_is_not_decoded(tmp_path, side):
+    def chunk(kind, data):
+        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+    head = struct.pack(">IIBBBBB", side, side, 8, 2, 0, 0, 0)
+    parts = (chunk(b"IHDR", head), chunk(b"IDAT", zlib.compress(bytes(1000))), chunk(b"IEND", b""))
+    (tmp_path / "a.png").write_bytes(b"\x89PNG\r\n\x1a\n" + b"".join(parts))
+    with pytest.raises(
+        DataError, match=r"a.png: expected an image, found \d+ bytes that say they are far more"
+    ):
+        read_image(tmp_path / "a.png", 32, 24)
+
+
+@pytest.mark.parametrize("text", ['{"a": ' + "9" * 5000 + "}", "[" * 100_000])
+def test_json_that_is_too_long_or_too_deep(tmp_path, text):
+    (tmp_path / "a.json").write_text(text)
+    with pytest.raises(DataError, match=r"a.json: expected a JSON file, found bad JSON") as refused:
+        read_json(tmp_path / "a.json")
+    assert len(str(refused.value)) < 1000
+
+
+@pytest.mark.parametrize("value", [[[1, 2], [3]], "x", None, [["a", "b", "c"]] * 3, [1, 2], 10**400])
+def test_numbers_of_another_shape(tmp_path, value):
+    with pytest.raises(DataError, match=r"a.json: expected K as 3x3 numbers, found"):
+        as_numbers(tmp_path / "a.json", "K", value, (3, 3))

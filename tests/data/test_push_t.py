@@ -224,3 +224,20 @@ def test_a_folder_without_models_is_enough(recording, shared_data, tmp_path):
     sequence = read_push_t(tmp_path)
     assert sequence.models == ()
     np.testing.assert_array_equal(sequence.image(3, 1), recording.image(3, 1))
+
+
+@pytest.mark.parametrize(
+    ("changes", "says"),
+    [
+        ({"K": [[40.0, 0.0], [0.0]]}, "expected K as 3x3 numbers"),
+        ({"timestamps": [0.0, [1.0]]}, "expected timestamps as N numbers"),
+        ({"resolution": [64]}, "expected resolution as 2 numbers"),
+        ({"resolution": [64, 0]}, "expected a width and a height above 0"),
+        ({"K": [[40.0, 0.0, 31.5], [0.0, 40.0, 23.5], [0.0, 0.0, 9.0]]}, "K of camera 1 in frame 0"),
+    ],
+)
+def test_records_with_other_numbers(folder, changes, says):
+    folder.write_record("b", np.delete(np.arange(20) * 0.02, 1), **changes)
+    with pytest.raises(ValueError, match=says) as refused:
+        read_push_t(folder.root)
+    assert str(folder.root) in str(refused.value)

@@ -117,6 +117,7 @@ def test_an_spz_with_a_flipped_bit_is_found_by_its_checksum(tmp_path):
         (lambda m: m["means"].update(files=["../../etc/passwd", "b"]), "names of files without a folder"),
         (lambda m: m["means"].update(files=["/etc/passwd", "b"]), "names of files without a folder"),
         (lambda m: m["means"].update(files=["..\\a", "b"]), "names of files without a folder"),
+        (lambda m: m["means"].update(files=["a" * 20000, "b"]), "names of files as means.files"),
         (lambda m: m["means"].update(files=["no.webp", "b"]), "expected no.webp in it, found means_l.webp"),
         (lambda m: m["means"].update(files=["meta.json", "means_u.webp"]), "picture as meta.json"),
         (lambda m: m["means"].update(mins=[0, None, 0]), "3 finite numbers as means.mins"),

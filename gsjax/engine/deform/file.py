@@ -1,6 +1,5 @@
 """deformation.npz: a scene that deforms, apart from the recording that it was learned from."""
 
-import json
 import os
 from pathlib import Path
 
@@ -9,8 +8,10 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
+from gsjax.data.files import as_numbers
 from gsjax.engine.messages import Notes
 from gsjax.io.checkpoints import CheckpointError, load_checkpoint, load_metadata, save_checkpoint
+from gsjax.io.parsed import parse_json
 from gsjax.methods.deform import DeformResult, Moving
 from gsjax.scene.deformation import Nodes
 
@@ -32,9 +33,14 @@ def write_deformation(
 
 
 def origin_of(path: str | os.PathLike) -> Float[np.ndarray, "3"] | None:
-    """What the scene that `write_deformation` wrote is relative to; None where that is 0."""
+    """What the scene that `write_deformation` wrote is relative to; None where that is 0.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: it is damaged.
+    """
     origin = load_metadata(path).get("origin")
-    return None if origin is None else np.array(origin, np.float64)
+    return None if origin is None else as_numbers(Path(path), "origin", origin, (3,))
 
 
 def read_deformation(path: str | os.PathLike) -> DeformResult:
@@ -56,7 +62,11 @@ def read_deformation(path: str | os.PathLike) -> DeformResult:
         raise ValueError(
             f"{path}: expected what `gsjax deform` writes, found a checkpoint of something else; {_AGAIN}"
         )
-    if (wrong := _misfit(result)) is not None:
+    try:
+        wrong = _misfit(result)
+    except (TypeError, ValueError, AttributeError, IndexError) as error:  # parts of other kinds
+        wrong = f"expected the parts of a deforming scene, found others ({error})"
+    if wrong is not None:
         raise ValueError(f"{path}: {wrong}; {_AGAIN}")
     return result
 
@@ -64,7 +74,7 @@ def read_deformation(path: str | os.PathLike) -> DeformResult:
 def warn_of_partial(path: Path, notes: Notes) -> None:
     """Warns where the run in a folder was stopped before its end."""
     try:
-        found = json.loads((path / "metrics.json").read_text(encoding="utf-8"))
+        found = parse_json((path / "metrics.json").read_text(encoding="utf-8"))
         steps = found["steps"] if not found["complete"] else None
     except (OSError, ValueError, KeyError, TypeError):
         return

@@ -1,6 +1,5 @@
 """field.npz: a feature field in a file of its own, beside its scene; see `DistillResult.write`."""
 
-import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -12,6 +11,8 @@ from equinox import nn, tree_at
 
 from gsjax.engine.files import check_arrays, read_arrays
 from gsjax.engine.teaching.source import Source
+from gsjax.io.brief import brief
+from gsjax.io.parsed import parse_json
 from gsjax.methods.distill import DistillResult, FeatureField
 from gsjax.methods.distill.result import FORMAT
 from gsjax.scene.feature_grid import FeatureGrid, FeatureGridConfig
@@ -33,14 +34,14 @@ def read_field(path: Path) -> DistillResult:
         raise FileNotFoundError(f"{path}: expected a field that `gsjax distill` wrote, found no file")
     arrays = read_arrays(path, ("about", "lift"), _AGAIN)
     try:
-        about = json.loads(str(arrays["about"]))
+        about = parse_json(str(arrays["about"]))
         source, scene = Source.of(about["source"]), dict(about["scene"])
         config = FeatureGridConfig(**about["grid"]) if "grid" in about else None
         if about["format"] != FORMAT:
             raise ValueError(f"format {about['format']}")
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise ValueError(
-            f"{path}: about: expected what `gsjax distill` writes, found {error}; {_AGAIN}"
+            f"{path}: about: expected what `gsjax distill` writes, found {brief(error)}; {_AGAIN}"
         ) from error
     if config is None:
         _check(path, arrays, {"lift": ("d", "c"), "vectors": ("n", "c")})
@@ -72,7 +73,9 @@ def read_field(path: Path) -> DistillResult:
 def _check(path: Path, arrays: Mapping[str, np.ndarray], shapes: Mapping[str, tuple[str | int, ...]]) -> None:
     missing = [name for name in shapes if name not in arrays]
     if missing:
-        raise ValueError(f"{path}: expected an array {missing[0]}, found {', '.join(arrays)}; {_AGAIN}")
+        raise ValueError(
+            f"{path}: expected an array {missing[0]}, found {brief(', '.join(arrays))}; {_AGAIN}"
+        )
     check_arrays(path, arrays, shapes, _AGAIN)
 
 

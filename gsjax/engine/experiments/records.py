@@ -1,10 +1,10 @@
 """Records of cells: a file each in runs/, and the rows of results.json, which are committed."""
 
-import json
 from pathlib import Path
 from typing import Any
 
 from gsjax.engine.experiments.config import expect
+from gsjax.io.parsed import parse_json
 
 RESULTS = "results.json"
 RECORD = ("options", "seed", "script", "result", "error", "seconds", "finished", "machine", "gsjax")
@@ -38,7 +38,7 @@ def committed_rows(path: Path) -> list[dict[str, Any]]:
 
 def _json(path: Path) -> Any:
     try:
-        return json.loads(path.read_text(encoding="utf-8"))
+        return parse_json(path.read_text(encoding="utf-8"))
     except ValueError as error:
         raise ValueError(f"{path}: expected JSON, found {error}; {_ADVICE}") from error
 

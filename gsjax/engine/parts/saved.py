@@ -1,6 +1,5 @@
 """A run of `gsjax parts` read back: the scene, the motion of its parts, and its recording."""
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,12 +8,13 @@ from typing import Any
 import jax.numpy as jnp
 import jaxlie
 import numpy as np
-import yaml
 from jaxtyping import Float
 
 from gsjax.engine.files import about_scene, check_arrays, chosen_camera, read_arrays, read_scene, reopen
 from gsjax.engine.folder import expect_run
 from gsjax.engine.recording import Recording
+from gsjax.io.brief import brief
+from gsjax.io.parsed import parse_json, parse_yaml
 from gsjax.methods.parts import PartScene, order_of_frames, trajectory_of
 from gsjax.methods.parts.film import Layer
 from gsjax.methods.parts.timeline import Names
@@ -77,8 +77,8 @@ def open_parts_run(path: Path) -> PartsRun:
 def blend_of(path: Path) -> Blend:
     """How a run blends rotations, without opening its recording; the default if it does not say."""
     try:
-        return _blend(yaml.safe_load((path / "config.yml").read_text(encoding="utf-8")))
-    except (OSError, yaml.YAMLError, KeyError, TypeError):
+        return _blend(parse_yaml((path / "config.yml").read_text(encoding="utf-8")))
+    except (OSError, ValueError, KeyError, TypeError):
         return "quaternion"
 
 
@@ -145,7 +145,7 @@ def _read(path: Path) -> tuple[Layer, dict[str, int], bool, Float[np.ndarray, "3
 def _kind(file: Path) -> str | None:
     """The command that made a run; None if its scores do not say."""
     try:
-        return json.loads(file.read_text(encoding="utf-8")).get("kind")
+        return parse_json(file.read_text(encoding="utf-8")).get("kind")
     except (OSError, ValueError, AttributeError):
         return None
 
@@ -164,7 +164,7 @@ def _arrays(file: Path) -> dict[str, np.ndarray]:
 def _of_metrics(file: Path, frames: int) -> tuple[dict[str, int], int]:
     """Parts by name, and the number of tracked frames."""
     try:
-        metrics = json.loads(file.read_text(encoding="utf-8"))
+        metrics = parse_json(file.read_text(encoding="utf-8"))
         rows, followed = metrics["parts"], metrics["frames"]["followed"]
         called = [(row["part"], row["name"], row.get("true_name")) for row in rows]
     except (ValueError, KeyError, TypeError, AttributeError) as error:
@@ -172,10 +172,11 @@ def _of_metrics(file: Path, frames: int) -> tuple[dict[str, int], int]:
     for part, name, true in called:
         if type(part) is not int or part < 0 or not isinstance(name, str) or not isinstance(true, str | None):
             expected = "part, name and true_name to be a number, a text and a text or null"
-            raise ValueError(f"{file}: expected {expected}, found {part!r}, {name!r} and {true!r}; {_AGAIN}")
+            found = brief(f"{part!r}, {name!r} and {true!r}")
+            raise ValueError(f"{file}: expected {expected}, found {found}; {_AGAIN}")
     if type(followed) is not int or not 1 <= followed <= frames:
         expected = f"1 to {frames} tracked frames, as parts.npz has {frames}"
-        raise ValueError(f"{file}: expected {expected}, found {followed!r}; {_AGAIN}")
+        raise ValueError(f"{file}: expected {expected}, found {brief(repr(followed))}; {_AGAIN}")
     # True names come last: of two names, messages use the last.
     names = {name: part for part, name, _ in called}
     return names | {true.lower().replace(" ", "_"): part for part, _, true in called if true}, followed

@@ -2,18 +2,16 @@
 
 import hashlib
 import json
-import zipfile
-import zlib
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import numpy as np
 
+from gsjax.io.arrays import ArraysError, load_arrays
 from gsjax.io.atomic import write_npz
 from gsjax.io.cache import user_cache
 
 Arrays = Mapping[str, np.ndarray]
-_READ_ERRORS = (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error)
 
 
 def cache_folder() -> Path | None:
@@ -50,11 +48,10 @@ class FeatureCache:
             return dict(compute())
         path = self._folder / f"{content_digest(key, inputs)}.npz"
         try:
-            with np.load(path, allow_pickle=False) as stored:
-                output = dict(stored)
+            output = load_arrays(path)
             self.found += 1
             return output
-        except _READ_ERRORS:
+        except (OSError, ArraysError):
             pass
         output = dict(compute())
         self.asked += 1

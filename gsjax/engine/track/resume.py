@@ -7,6 +7,7 @@ import numpy as np
 
 from gsjax.engine import saving
 from gsjax.engine.drive import Tick
+from gsjax.engine.files import read_arrays
 from gsjax.engine.track.loop import Tracking
 from gsjax.io.atomic import write_npz
 from gsjax.io.checkpoints import CheckpointError, load_checkpoint, save_checkpoint
@@ -87,9 +88,9 @@ def _saved_poses(folder: Path, frames: int, like: Pose) -> list[Pose]:
     poses = []
     for path in _parts(folder):
         if _frames_of(path) <= frames:
-            with np.load(path, allow_pickle=False) as part:
-                rows = zip(part["means"], part["quats"], strict=True)  # on the host, as `follow` keeps them
-                poses.extend(jax.tree.unflatten(jax.tree.structure(like), row) for row in rows)
+            part = read_arrays(path, ("means", "quats"), "start again without --resume")
+            rows = zip(part["means"], part["quats"], strict=True)  # on the host, as `follow` keeps them
+            poses.extend(jax.tree.unflatten(jax.tree.structure(like), row) for row in rows)
     if len(poses) != frames - 1:
         raise CheckpointError(
             f"{folder}: expected the poses of {frames - 1} updates, found {len(poses)}; parts are missing. "

@@ -1,6 +1,5 @@
 """A run of `gsjax track` read back: the scene, its motion, and the recording that it was tracked in."""
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,6 +12,7 @@ from gsjax.engine.files import about_scene, chosen_camera, read_arrays, read_sce
 from gsjax.engine.folder import expect_run
 from gsjax.engine.recording import Recording
 from gsjax.engine.track.loop import Tracking
+from gsjax.io.parsed import parse_json
 from gsjax.methods.track import Pose, TrackedScene
 from gsjax.scene.origin import relative_to
 
@@ -102,7 +102,7 @@ def _read_metrics(file: Path, scene: TrackedScene) -> tuple[int | None, dict[int
     """The camera whose mask named the objects, and the name of each group; labels of the segmenter have no
     name in the recording."""
     try:
-        metrics = json.loads(file.read_text(encoding="utf-8"))
+        metrics = parse_json(file.read_text(encoding="utf-8"))
         camera, source = metrics["mask"]["camera"], metrics["mask"]["source"]
         known = {found["label"]: name for name, found in metrics["objects"].items()}
     except (ValueError, KeyError, TypeError, AttributeError) as error:

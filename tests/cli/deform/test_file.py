@@ -149,3 +149,10 @@ def _bare(gaussians):
 
 def _with(given, **changes):
     return replace(given, timeline=given.timeline._replace(**changes))
+
+
+@pytest.mark.parametrize("change", [{"timeline": 3}, {"meaning": 3}, {"moving": "x"}])
+def test_parts_of_other_kinds(change, tmp_path):
+    save_checkpoint(tmp_path / "deformation.npz", replace(result(), **change))
+    with pytest.raises(ValueError, match=r"deformation.npz: expected the parts of a deforming scene, found"):
+        read_deformation(tmp_path / "deformation.npz")

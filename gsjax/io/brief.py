@@ -1,0 +1,21 @@
+"""What a message quotes of a file or of a library, in bounds: damaged files hold words of any length."""
+
+_MOST = 400
+_LEFT_OUT = " ... "
+
+
+def brief(text: object, most: int = _MOST) -> str:
+    """A text as one paragraph, without its middle if it is long.
+
+    Args:
+        text: what to quote, or an error of another library.
+        most: characters that are kept.
+    """
+    words = str(text)
+    if len(words) > 4 * most:  # before splitting it
+        words = words[: 2 * most] + _LEFT_OUT + words[-2 * most :]
+    words = " ".join(words.split())
+    if len(words) <= most:
+        return words
+    half = (most - len(_LEFT_OUT)) // 2
+    return words[:half] + _LEFT_OUT + words[-half:]
