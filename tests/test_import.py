@@ -13,6 +13,7 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 # Those of extras, which need not be there, and those that only some commands need.
 OPTIONAL = {"viser", "torch", "transformers", "mujoco", "pycolmap", "tensorboardX", "distributed", "dask"}
+OPTIONAL |= {"OpenEXR", "rosbags", "pyrealsense2"}
 LATE = {"matplotlib", "skimage", "jaxopt", "imageio_ffmpeg", "rich", "tyro", "PIL"}
 
 
@@ -108,7 +109,9 @@ def test_what_is_told_to_install_is_there():
         for node in ast.walk(ast.parse(file.read_text()))
         if isinstance(node, ast.Call) and ast.unparse(node.func) == "extras.load"
     ]
-    assert {extra for _, extra in calls} == {"cluster", "foundation", "poses", "tensorboard", "viewer"}
+    sensors = {"realsense", "record3d", "rosbag"}
+    others = {"cluster", "foundation", "poses", "tensorboard", "viewer"}
+    assert {extra for _, extra in calls} == sensors | others
     for module, extra in calls:
         if isinstance(module, ast.Constant):
             package = module.value.partition(".")[0].replace("_", "-")

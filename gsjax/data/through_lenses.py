@@ -7,7 +7,7 @@ from typing import Literal
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Integer, UInt8
 
 from gsjax.data.errors import DataError, DataWarning
 from gsjax.data.lens import Lens, undistort
@@ -41,11 +41,15 @@ class ThroughLenses:
         """Whether some photograph has pixels that its lens does not show."""
         return any(reached is not None for reached in self.reaches)
 
-    def image(self, i: int, picture: np.ndarray) -> np.ndarray:
+    def image(
+        self, i: int, picture: UInt8[np.ndarray, "height width 3"]
+    ) -> UInt8[np.ndarray, "height width 3"]:
         """Colours of photograph `i`."""
         return self.views[i](picture, cv2.INTER_LINEAR)
 
-    def mask(self, i: int, shades: np.ndarray | None) -> Bool[np.ndarray, "height width"] | None:
+    def mask(
+        self, i: int, shades: Integer[np.ndarray, "height width"] | None
+    ) -> Bool[np.ndarray, "height width"] | None:
         """Which pixels count: those whose shade is not 0 and that the lens shows; None if all."""
         reached = self.reaches[i]
         if shades is None:
