@@ -10,7 +10,7 @@ from urllib.parse import parse_qsl
 
 import numpy as np
 
-from gsjax.data import clip, colmap, poses_bounds, realsense, transforms
+from gsjax.data import clip, colmap, poses_bounds, transforms
 from gsjax.data.bop import read_bop
 from gsjax.data.duplicates import without_duplicates
 from gsjax.data.endonerf import is_endonerf, is_unambiguous_endonerf, read_endonerf
@@ -22,6 +22,7 @@ from gsjax.data.paris import Split, read_paris
 from gsjax.data.photographs import Photographs, photographs_of
 from gsjax.data.pictures import is_picture, refuse_unread
 from gsjax.data.push_t import read_push_t
+from gsjax.data.realsense import read_realsense
 from gsjax.data.record3d import EXPORT_THIS, is_record3d, read_record3d
 from gsjax.data.sequence import Sequence
 from gsjax.data.seven_scenes import read_seven_scenes
@@ -139,8 +140,8 @@ def _sequence(path: str | Path, options: ReadOptions) -> Sequence:
     root = Path(path)
     if root.is_file() and clip.is_clip(root):
         return _read("video", clip.read_clip, root, options, unused={"images"})
-    if root.is_file() and root.suffix.lower() == realsense.SUFFIX:
-        return _read("RealSense", realsense.read_realsense, root, options)
+    if root.is_file() and _is_bag(root):
+        return _read("RealSense", read_realsense, root, options)
     root = _folder(path)
     for mark, (layout, read) in _LAYOUTS.items():
         if next(root.glob(mark), None):
@@ -217,6 +218,8 @@ def _photographs(path: str | Path, options: ReadOptions) -> Photographs:
         return photographs_of(open_sequence(text, options))
     if text.endswith(".json") and Path(path).is_file():
         return without_duplicates(_read("nerfstudio", transforms.read_transforms, Path(path), options))
+    if _is_bag(Path(path)):
+        return photographs_of(open_sequence(path, options))
     root = _folder(path)
     if (layout := _photograph_layout(root)) is not None:
         settled = {"axes": _axes(root, options)} if layout.read is poses_bounds.read_llff else {}
@@ -229,9 +232,13 @@ def _photographs(path: str | Path, options: ReadOptions) -> Photographs:
 def is_recording(path: str | Path) -> bool:
     """Whether a path holds a recording over time, judged by its files."""
     root = Path(path)
-    known = any(next(root.glob(mark), None) for mark in _LAYOUTS)
+    known = _is_bag(root) or any(next(root.glob(mark), None) for mark in _LAYOUTS)
     known = known or any(layout(root) for layout in (is_open3d, is_record3d, is_endonerf, is_endovis))
     return str(path).startswith(SIMULATED_PREFIX) or known or next(root.glob("cam*.mp4"), None) is not None
+
+
+def _is_bag(path: Path) -> bool:
+    return path.suffix.lower() == ".bag"
 
 
 def is_photographs(path: str | Path) -> bool:

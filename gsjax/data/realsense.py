@@ -1,208 +1,249 @@
-"""Recordings of RealSense cameras (.bag, ROS 1) by Intel's viewer or SDK: one camera with depth, no poses.
+"""Recordings of RealSense cameras, as librealsense and its viewer write them: a rosbag with these topics.
 
-/device_0/sensor_N/Color_0/image/data           sensor_msgs/Image, rgb8 or bgr8
-/device_0/sensor_N/Depth_0/image/data           sensor_msgs/Image, 16 bits, in steps of Depth_Units
-.../Color_0 and Depth_0/info/camera_info        sensor_msgs/CameraInfo: K, pixel centres at integers
-.../Color_0 and Depth_0/tf/0                    geometry_msgs/Transform: from the group's reference to the
-                                                stream, as `rs2_extrinsics` have it
-/device_0/sensor_N/option/Depth_Units/value     std_msgs/Float32: metres per step
+/device_0/sensor_0/Depth_0/image/data         sensor_msgs/Image: mono16, in steps of a depth unit, 0 = invalid
+/device_0/sensor_1/Color_0/image/data         the same: rgb8, bgr8, rgba8, bgra8, YUYV or UYVY
+.../Depth_0/info/camera_info                  sensor_msgs/CameraInfo: K, pixel centres at integers, and D
+.../Color_0/tf/0                              geometry_msgs/Transform: to it from stream 0, which is depth
+/device_0/sensor_0/option/Depth_Units/value   std_msgs/Float32: metres per step
 
-Names and conventions are those of librealsense (src/media/ros), which writes these files.
+Newer versions mark images by a header whose frame_id is "1". These end with four bytes that the type of the
+message does not have: the depth unit, float32; 0 for colour.
 """
 
 import re
 import struct
 import warnings
-from collections.abc import Collection
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
+import cv2
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 from scipy.spatial.transform import Rotation
 
-from gsjax import extras
 from gsjax.data.association import associate
 from gsjax.data.errors import DataError, DataWarning, shortened
 from gsjax.data.files import SATURATED_DEPTH
-from gsjax.data.lens import intrinsics_matrix
+from gsjax.data.lens import Lens, intrinsics_matrix, undistort
 from gsjax.data.registration import registered
+from gsjax.data.rosbag import Bag, Message
 from gsjax.data.sequence import Sequence
-from gsjax.data.validation import check_intrinsics
 
-SUFFIX = ".bag"
 MAX_SKEW_S = 0.02
-"""Largest time between colour and depth of a frame: more than half of one at 30 Hz."""
+"""Largest time between colour and depth of a frame: at 30 Hz, the nearest is at most 0.017 s away."""
 
 DEPTH_UNIT_M = 0.001
-"""Metres per depth step where the file has none."""
+"""Metres per depth step of D4xx cameras, unless they are set otherwise."""
 
-_TOPIC = re.compile(r"/device_\d+/sensor_\d+/(Color|Depth)_0/(image/data|info/camera_info|tf/0)")
-_UNITS = re.compile(r"/device_\d+/sensor_\d+/option/Depth[_ ]Units/value")
-_COLORS = {"rgb8": (3, slice(None)), "bgr8": (3, slice(None, None, -1))}
-_COLORS |= {"rgba8": (4, slice(0, 3)), "bgra8": (4, slice(2, None, -1))}
-_DEPTHS = ("mono16", "16UC1")
-_KIND = "a recording of a RealSense camera, a ROS 1 bag"
-_DAMAGED = (
-    struct.error,
-    ValueError,
-    LookupError,
-    AssertionError,
-    EOFError,
-    OSError,
-    RuntimeError,
-    MemoryError,
-)
+_RECORD = "Record depth and colour by the RealSense viewer or librealsense."
+_IMAGES = re.compile(r"(?P<stream>/device_\d+/sensor_\d+/(?P<kind>Depth|Color)_\d+)/image/data")
+_IMAGE, _INFO = "sensor_msgs/msg/Image", "sensor_msgs/msg/CameraInfo"
+_TRANSFORM, _FLOAT = "geometry_msgs/msg/Transform", "std_msgs/msg/Float32"
+_STAMP_AT, _FRAME_ID_AT = 4, 12  # bytes into a message with a header
+_ENDS_WITH_UNIT = struct.pack("<I", 1) + b"1"  # the frame_id
+_DISTORTIONS = ("brown conrady", "inverse brown conrady", "modified brown conrady")
+_COEFFICIENTS = 5  # k1 k2 p1 p2 k3, as OpenCV's
+_UNIT_TOLERANCE = 0.01  # on a quaternion's length
+
+# Encoding in lower case -> bytes per pixel, and OpenCV's conversion to RGB.
+_DEPTHS: dict[str, tuple[int, int | None]] = dict.fromkeys(("mono16", "16uc1", "z16"), (2, None))
+_COLORS: dict[str, tuple[int, int | None]] = {
+    "rgb8": (3, None),
+    "bgr8": (3, cv2.COLOR_BGR2RGB),
+    "rgba8": (4, cv2.COLOR_RGBA2RGB),
+    "bgra8": (4, cv2.COLOR_BGRA2RGB),
+    "yuyv": (2, cv2.COLOR_YUV2RGB_YUY2),
+    "uyvy": (2, cv2.COLOR_YUV2RGB_UYVY),
+    "yuv422": (2, cv2.COLOR_YUV2RGB_UYVY),
+}
 
 
-def read_realsense(path: str | Path, *, depth_unit_m: float | None = None) -> Sequence:
-    """The colour images of a recording with the depth nearest in time, moved to the colour camera: one
-    camera, 0, which stands still. Frames without depth within 20 ms are left out, with a DataWarning that
-    counts them; lens distortion is not corrected, and one that is recorded gives a DataWarning.
+def read_realsense(
+    path: str | Path, *, depth_unit_m: float | None = None, max_skew: float = MAX_SKEW_S
+) -> Sequence:
+    """The colour camera of a recording, 0, which stands still at the origin, with depth moved to it.
+
+    Frames are its pictures, each with the depth nearest in time; those with none within `max_skew` are left
+    out, with a DataWarning that counts them, as are images that repeat a time. Times are the camera's. If a
+    lens has distortion, the pictures are resampled to a pinhole camera whose view lies within them.
 
     Args:
-        path: the .bag file.
-        depth_unit_m: metres per depth step; default: the file's, else 0.001.
+        path: the file.
+        depth_unit_m: metres per depth step; None: as recorded, else 0.001 with a DataWarning.
+        max_skew: largest time between colour and depth of a frame, seconds.
 
     Raises:
-        DataError: the file is damaged, or lacks colour, depth, their intrinsics or their places.
-        MissingExtra: the package rosbags is not installed.
+        DataError: the file is no such recording or is damaged, it lacks depth or colour, or an encoding or a
+            lens is not one that is read.
+        MissingExtra: rosbags is not installed.
     """
-    bag = _Bag(Path(path))
-    (color_K, size), (depth_K, depth_size) = bag.intrinsics("Color"), bag.intrinsics("Depth")
-    width, height = size
-    check_intrinsics(depth_K[None, None], lambda *_: f"Depth in {bag.path}")
-    to_color = bag.place("Color") @ np.linalg.inv(bag.place("Depth"))
-    clocks = {stream: bag.stamps(stream, "image/data") for stream in ("Color", "Depth")}
-    seconds = {"colour": clocks["Color"] / 1e9, "depth": clocks["Depth"] / 1e9}
-    matched = associate(bag.path, seconds, MAX_SKEW_S)
-    unit = depth_unit_m or bag.depth_unit() or DEPTH_UNIT_M
-    frames = len(matched)
-    bag.color(int(clocks["Color"][matched[0, 0]]), size)  # a size that the file has the pixels of
+    bag = Bag(Path(path))
+    color, depth = _streams(bag)
+    pairs = associate(bag.path, {"colour": color.stamps, "depth": depth.stamps}, max_skew)
+    numbers, of_depth = pairs.T.tolist()
+    K, as_pinhole = undistort(color.lens, color.width, color.height)
+    depth_K, depth_as_pinhole = undistort(depth.lens, depth.width, depth.height)
+    to_color = _from_reference(bag, color) @ np.linalg.inv(_from_reference(bag, depth))
+    for stream, encodings in ((color, _COLORS), (depth, _DEPTHS)):
+        _pixels(bag, stream, 0, encodings)  # before anything of the size that is stated is made
+    unit = _recorded_unit(bag, depth) if depth_unit_m is None else depth_unit_m
+
+    def load_image(t: int, c: int) -> UInt8[np.ndarray, "height width 3"]:
+        return as_pinhole(_read_color(bag, color, numbers[t]), cv2.INTER_LINEAR)
 
     def load_depth(t: int, c: int) -> Float[np.ndarray, "height width"]:
-        raw = bag.depth(int(clocks["Depth"][matched[t, 1]]), depth_size)
-        depth = np.where(raw == SATURATED_DEPTH, 0, raw * unit).astype(np.float32)
-        return registered(depth, depth_K, color_K, to_color, width, height)
+        measured = depth_as_pinhole(_read_depth(bag, depth, of_depth[t], unit), cv2.INTER_NEAREST)
+        return registered(measured, depth_K, K, to_color, color.width, color.height)
 
+    def locate(kind: str, t: int, c: int) -> str:
+        return _where(bag, *((depth, of_depth[t]) if kind == "depth" else (color, numbers[t])))
+
+    frames = len(numbers)
     return Sequence(
         name=bag.path.stem,
         camera_ids=(0,),
-        width=width,
-        height=height,
-        times=seconds["colour"][matched[:, 0]],
-        frame_ids=tuple(matched[:, 0].tolist()),
-        Ks=np.broadcast_to(color_K, (frames, 1, 3, 3)),
+        width=color.width,
+        height=color.height,
+        times=color.stamps[numbers],
+        frame_ids=tuple(numbers),
+        Ks=np.broadcast_to(K, (frames, 1, 3, 3)),
         viewmats=np.broadcast_to(np.eye(4), (frames, 1, 4, 4)),
-        load_image=lambda t, c: bag.color(int(clocks["Color"][matched[t, 0]]), size),
+        load_image=load_image,
         load_depth=load_depth,
-        locate=lambda kind, t, c: f"{bag.path} at {seconds['colour'][matched[t, 0]]:.3f} s",
+        locate=locate,
     )
 
 
-class _Bag:
-    """The messages of a file, read when they are needed: recordings are larger than memory."""
+class _Stream(NamedTuple):
+    """The images of one camera in order of their stamps, seconds; `recorded` finds them in the file."""
 
-    def __init__(self, path: Path):
-        self.path = path
-        self.reader = extras.load("rosbags.rosbag1", "rosbag", "a .bag file")
-        typesys = extras.load("rosbags.typesys", "rosbag", "a .bag file")
-        self.types = typesys.get_typestore(typesys.Stores.ROS1_NOETIC)
-        self.topics: dict[tuple[str, str], str] = {}
-        self.times: dict[str, np.ndarray] = {}
-        self.units: str | None = None
-        try:
-            with self.reader.Reader(path) as reader:
-                for connection in reader.connections:
-                    self.times[connection.topic] = np.unique([i.time for i in reader.indexes[connection.id]])
-        except (self.reader.ReaderError, *_DAMAGED) as error:
-            raise self._damaged(error) from None
-        for topic in self.times:
-            if match := _TOPIC.fullmatch(topic):
-                self.topics.setdefault((match[1], match[2]), topic)
-            elif _UNITS.fullmatch(topic):
-                self.units = topic
+    name: str
+    stamps: Float[np.ndarray, "n"]
+    recorded: list[int]
+    width: int
+    height: int
+    lens: Lens
 
-    def stamps(self, stream: str, part: str) -> np.ndarray:
-        """Times of a stream's messages, nanoseconds, increasing."""
-        return self.times[self._topic(stream, part)]
+    @property
+    def topic(self) -> str:
+        return f"{self.name}/image/data"
 
-    def intrinsics(self, stream: str) -> tuple[Float[np.ndarray, "3 3"], tuple[int, int]]:
-        """K with pixel centres at +0.5, and width and height, of a stream."""
-        info = self._message(self._topic(stream, "info/camera_info"), "sensor_msgs/msg/CameraInfo")
-        if np.any(info.D):
-            message = (
-                f"{self.path}: the lens distortion of {stream} ({info.distortion_model}) is not corrected"
-            )
-            advice = "straight lines stay bent; give undistorted pictures where that matters"
-            warnings.warn(f"{message}; {advice}", DataWarning, stacklevel=3)
-        fx, fy, cx, cy = np.asarray(info.K, np.float64)[[0, 4, 2, 5]]
-        return intrinsics_matrix((fx, fy, cx + 0.5, cy + 0.5)), (info.width, info.height)
 
-    def place(self, stream: str) -> Float[np.ndarray, "4 4"]:
-        """From coordinates of the camera's reference to those of a stream."""
-        tf = self._message(self._topic(stream, "tf/0"), "geometry_msgs/msg/Transform")
-        q, t, matrix = tf.rotation, tf.translation, np.eye(4)
-        quat = np.array([q.x, q.y, q.z, q.w])
-        if not abs(np.linalg.norm(quat) - 1) < 0.01:
-            found = f"the quaternion {quat.tolist()} for {stream}"
-            raise DataError(self.path, "rotations between its cameras", found, "Record it again.")
-        matrix[:3, :3], matrix[:3, 3] = Rotation.from_quat(quat).as_matrix(), (t.x, t.y, t.z)
-        return matrix
+def _streams(bag: Bag) -> tuple[_Stream, _Stream]:
+    """The first stream of colour and that of depth."""
+    found = [match for topic in bag.topics if (match := _IMAGES.fullmatch(topic))]
+    names = [next((m["stream"] for m in found if m["kind"] == kind), None) for kind in ("Color", "Depth")]
+    if None in names:
+        lacking = "depth" if names[0] else "colour"
+        expected = f"{lacking} of a RealSense camera, /device_0/sensor_N/{lacking.capitalize()}_0/image/data"
+        raise DataError(bag.path, expected, shortened(bag.topics) or "no topic", _RECORD)
+    stamps: dict[str, dict[int, float]] = {f"{name}/image/data": {} for name in names}
+    for message in bag.messages([*stamps], _IMAGE):
+        seconds, nanoseconds = _unpacked(bag, "<II", message.content, _STAMP_AT)
+        stamps[message.topic].setdefault(message.recorded, seconds + 1e-9 * nanoseconds)
+    color, depth = (_stream(bag, name, stamps[f"{name}/image/data"]) for name in names)
+    return color, depth
 
-    def depth_unit(self) -> float | None:
-        """Metres per depth step, if the file has them."""
-        return None if self.units is None else self._message(self.units, "std_msgs/msg/Float32").data
 
-    def color(self, stamp: int, size: tuple[int, int]) -> np.ndarray:
-        """The colour image of a time, RGB; `size` is its expected width and height."""
-        image = self._image("Color", stamp, size, _COLORS)
-        channels, order = _COLORS[image.encoding]
-        pixels = self._pixels(image, channels).reshape(image.height, image.width, channels)
-        return np.ascontiguousarray(pixels[..., order])
+def _stream(bag: Bag, name: str, stamped: dict[int, float]) -> _Stream:
+    """A stream, from the stamp of each image by the time when it was recorded."""
+    if not stamped:
+        raise DataError(bag.path, "images", f"none in {name}/image/data", _RECORD)
+    stamps, first = np.unique([*stamped.values()], return_index=True)
+    if repeated := len(stamped) - len(stamps):
+        message = f"{bag.path}: {repeated} of {len(stamped)} images of {name} repeat a time and are left out"
+        warnings.warn(message, DataWarning, stacklevel=5)
+    info = bag.first(f"{name}/info/camera_info", _INFO)
+    if info is None:
+        raise DataError(bag.path, f"intrinsics in {name}/info/camera_info", "none", _RECORD)
+    K, D = np.reshape(info.K, (3, 3)), tuple(map(float, info.D))
+    if not (np.isfinite(K).all() and K[0, 0] > 0 and K[1, 1] > 0):
+        expected = f"focal lengths above 0 in {name}/info/camera_info"
+        raise DataError(bag.path, expected, f"K {K.ravel().tolist()}", _RECORD)
+    distorted = any(D)
+    if distorted and not (info.distortion_model.lower() in _DISTORTIONS and len(D) == _COEFFICIENTS):
+        expected = f"a lens of {shortened(_DISTORTIONS)} in {name}/info/camera_info"
+        found = f"{info.distortion_model}, {len(D)} coefficients"
+        raise DataError(bag.path, expected, found, "Record rectified pictures.")
+    lens = Lens(intrinsics_matrix((K[0, 0], K[1, 1], K[0, 2] + 0.5, K[1, 2] + 0.5)), D if distorted else ())
+    recorded = [*stamped]
+    return _Stream(name, stamps, [recorded[i] for i in first], info.width, info.height, lens)
 
-    def depth(self, stamp: int, size: tuple[int, int]) -> np.ndarray:
-        """The depth image of a time, in steps; `size` is its expected width and height."""
-        image = self._image("Depth", stamp, size, _DEPTHS)
-        pixels = np.ascontiguousarray(self._pixels(image, 2))
-        return pixels.view(">u2" if image.is_bigendian else "<u2")
 
-    def _image(self, stream: str, stamp: int, size: tuple[int, int], encodings: Collection[str]) -> Any:
-        image = self._message(self._topic(stream, "image/data"), "sensor_msgs/msg/Image", stamp)
-        if image.encoding not in encodings:
-            advice = "Record colour as RGB8 or BGR8, and depth as Z16."
-            expected = f"images of {stream} encoded as {', '.join(encodings)}"
-            raise DataError(self.path, expected, repr(image.encoding), advice)
-        if (image.width, image.height) != size:
-            expected = f"images of {stream} of {size[0]}x{size[1]} pixels, as its camera_info says"
-            raise DataError(self.path, expected, f"{image.width}x{image.height}", "Record it again.")
-        return image
+def _from_reference(bag: Bag, stream: _Stream) -> Float[np.ndarray, "4 4"]:
+    """From coordinates of the stream that others refer to, to those of a stream."""
+    topic = f"{stream.name}/tf/0"
+    if (found := bag.first(topic, _TRANSFORM)) is None:
+        raise DataError(bag.path, f"the place of a camera in {topic}", "none", _RECORD)
+    q, t = found.rotation, found.translation
+    quat, transform = np.array([q.x, q.y, q.z, q.w]), np.eye(4)
+    transform[:3, 3] = t.x, t.y, t.z
+    if not (np.isfinite(transform).all() and abs(np.linalg.norm(quat) - 1) < _UNIT_TOLERANCE):
+        raise DataError(bag.path, f"a rigid motion in {topic}", f"{quat.tolist()}", _RECORD)
+    transform[:3, :3] = Rotation.from_quat(quat).as_matrix()
+    return transform
 
-    def _pixels(self, image: Any, size: int) -> np.ndarray:
-        """The bytes of an image, [height, width * size], without the ends of lines that only fill them."""
-        line, data = image.width * size, np.asarray(image.data, np.uint8)
-        if image.step < line or len(data) < image.height * image.step:
-            found = f"{len(data)} bytes in lines of {image.step}"
-            expected = f"an image of {image.width}x{image.height} pixels of {size} bytes"
-            raise DataError(self.path, expected, found, "Record it again.")
-        return data[: image.height * image.step].reshape(image.height, image.step)[:, :line]
 
-    def _topic(self, stream: str, part: str) -> str:
-        if (topic := self.topics.get((stream, part))) is None:
-            found = f"none; it has {shortened(sorted(self.times), 4)}" if self.times else "an empty file"
-            expected = f"the messages {stream}_0/{part} of a RealSense camera"
-            raise DataError(self.path, expected, found, "Record colour and depth with Intel's viewer or SDK.")
-        return topic
+def _recorded_unit(bag: Bag, depth: _Stream) -> float:
+    """Metres per depth step."""
+    stated = _stated_unit(bag, _message(bag, depth, 0)) or 0.0
+    option = bag.first(f"{depth.name.rpartition('/')[0]}/option/Depth_Units/value", _FLOAT)
+    for unit in (stated, 0.0 if option is None else float(option.data)):
+        if 0 < unit < np.inf:
+            return unit
+    message = f"{bag.path}: no depth unit; assuming {DEPTH_UNIT_M} m; give depth_unit_m (--read.depth-unit-m)"
+    warnings.warn(message, DataWarning, stacklevel=4)
+    return DEPTH_UNIT_M
 
-    def _message(self, topic: str, kind: str, stamp: int | None = None) -> Any:
-        """The first message of a topic, or that of a time."""
-        try:
-            with self.reader.Reader(self.path) as reader:
-                sources = [c for c in reader.connections if c.topic == topic and c.msgtype == kind]
-                _, _, raw = next(reader.messages(sources, start=stamp)) if sources else (None, 0, b"")
-                return self.types.deserialize_ros1(raw, kind)
-        except (self.reader.ReaderError, StopIteration, *_DAMAGED) as error:
-            raise self._damaged(error) from None
 
-    def _damaged(self, error: BaseException) -> DataError:
-        return DataError(self.path, _KIND, f"bad data ({error})", "Fetch the file again.")
+def _message(bag: Bag, stream: _Stream, number: int) -> Message:
+    """An image of a stream as it is stored."""
+    at = stream.recorded[number]
+    return next(bag.messages([stream.topic], _IMAGE, at, at + 1))
+
+
+def _stated_unit(bag: Bag, message: Message) -> float | None:
+    """What stands behind an image, metres; None if nothing does."""
+    marked = message.content[_FRAME_ID_AT : _FRAME_ID_AT + len(_ENDS_WITH_UNIT)] == _ENDS_WITH_UNIT
+    return _unpacked(bag, "<f", message.content[-4:], 0)[0] if marked else None
+
+
+def _unpacked(bag: Bag, form: str, content: bytes, at: int) -> tuple[Any, ...]:
+    try:
+        return struct.unpack_from(form, content, at)
+    except struct.error:
+        raise DataError(bag.path, "images", f"a message of {len(content)} bytes", _RECORD) from None
+
+
+def _read_color(bag: Bag, stream: _Stream, number: int) -> UInt8[np.ndarray, "height width 3"]:
+    pixels, encoding, _ = _pixels(bag, stream, number, _COLORS)
+    conversion = _COLORS[encoding][1]
+    return np.ascontiguousarray(pixels) if conversion is None else cv2.cvtColor(pixels, conversion)
+
+
+def _read_depth(bag: Bag, stream: _Stream, number: int, unit: float) -> Float[np.ndarray, "height width"]:
+    """Metres, 0 = invalid."""
+    pixels, _, big_endian = _pixels(bag, stream, number, _DEPTHS)
+    steps = np.ascontiguousarray(pixels).view(">u2" if big_endian else "<u2")[..., 0]
+    return np.where(steps == SATURATED_DEPTH, 0, steps * unit).astype(np.float32)
+
+
+def _pixels(
+    bag: Bag, stream: _Stream, number: int, encodings: dict[str, tuple[int, int | None]]
+) -> tuple[UInt8[np.ndarray, "height width bytes"], str, bool]:
+    """The bytes of each pixel, the encoding in lower case, and whether numbers begin with their high byte."""
+    message, where = _message(bag, stream, number), _where(bag, stream, number)
+    end = None if _stated_unit(bag, message) is None else -4
+    image = bag.decoded(message.content[:end], _IMAGE)
+    if (encoding := image.encoding.lower()) not in encodings:
+        raise DataError(where, f"one of {', '.join(encodings)}", image.encoding, _RECORD)
+    row, size = image.width * encodings[encoding][0], (image.width, image.height)
+    if size != (stream.width, stream.height) or image.step < row or len(image.data) != image.step * size[1]:
+        found = f"{size[0]}x{size[1]} in {len(image.data)} bytes"
+        raise DataError(where, f"{stream.width}x{stream.height} pixels of {encoding}", found, _RECORD)
+    rows = image.data.reshape(size[1], image.step)[:, :row]
+    return rows.reshape(size[1], size[0], -1), encoding, bool(image.is_bigendian)
+
+
+def _where(bag: Bag, stream: _Stream, number: int) -> str:
+    return f"{bag.path}, image {number} of {stream.name}"

@@ -3,6 +3,8 @@
 import numpy as np
 from jaxtyping import Float
 
+_FINEST = 16  # parts of a pixel a side: what memory allows, and more than cameras beside each other need
+
 
 def registered(
     depth: Float[np.ndarray, "rows columns"],
@@ -25,7 +27,8 @@ def registered(
         to_other: from coordinates of the first camera to those of the other one, OpenCV axes, metres.
         width, height: size of the other camera's pictures, pixels.
     """
-    finer = [max(1, int(np.ceil(other_K[i, i] / K[i, i] - 1e-9))) for i in (0, 1)]
+    ratios = (other_K[i, i] / K[i, i] for i in (0, 1))
+    finer = [int(np.clip(np.ceil(ratio - 1e-9), 1, _FINEST)) for ratio in ratios]
     fine = depth.repeat(finer[1], axis=0).repeat(finer[0], axis=1)
     rows, columns = np.nonzero(fine)
     z = fine[rows, columns]

@@ -290,7 +290,6 @@ REALSENSE = (
     Fault("size that the images do not have", recorded(info_size=(64, 48)), (BAG,)),
     Fault("quaternion not normalised", recorded(turn=0), (BAG,)),
     Fault("depth that is late", recorded(lates=(0.0, 0.025)), (BAG,)),
-    Fault("distorting lens", recorded(distortion=[0.1, 0, 0, 0, 0]), (BAG,)),
 )
 
 

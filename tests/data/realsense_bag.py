@@ -47,18 +47,20 @@ def write(path, drop=(), **changes):
         lates=(0.001, 0.001, 0.025),
     )
     given.__dict__.update(changes)
-    header = of["Header"](0, of["Time"](0, 0), "0")
+
+    def header(seconds):
+        return of["Header"](0, of["Time"](int(seconds), round(seconds % 1 * 1e9)), "0")
 
     def info(size, K, distortion):
         matrix = np.array([K[0], 0, K[2], 0, K[1], K[3], 0, 0, 1.0])
         roi = of["RegionOfInterest"](0, 0, 0, 0, False)
         D, R, P = np.array(distortion), np.zeros(9), np.zeros(12)
-        return of["CameraInfo"](header, size[1], size[0], "Brown Conrady", D, matrix, R, P, 0, 0, roi)
+        return of["CameraInfo"](header(0), size[1], size[0], "Brown Conrady", D, matrix, R, P, 0, 0, roi)
 
-    def picture(pixels, encoding, step):
+    def picture(seconds, pixels, encoding, step):
         rows, columns = pixels.shape[:2]
         data = np.frombuffer(pixels.tobytes(), np.uint8)
-        return of["Image"](header, rows, columns, encoding, 0, step, data)
+        return of["Image"](header(seconds), rows, columns, encoding, 0, step, data)
 
     def place(x, angle):
         quat = of["Quaternion"](0.0, 0.0, np.sin(angle / 2), np.cos(angle / 2) * given.turn)
@@ -73,9 +75,11 @@ def write(path, drop=(), **changes):
         (root(1) + "Color_0/tf/0", 0, place(BASELINE_M, ANGLE)),
     ]
     for n, late in enumerate(given.lates):
-        colors = picture(image(n), given.encoding, given.step)
-        messages.append((root(1) + "Color_0/image/data", 1 + n / 30, colors))
-        messages.append((root(0) + "Depth_0/image/data", 1 + n / 30 + late, picture(depth(), "mono16", 80)))
+        seconds = 1 + n / 30
+        colors = picture(seconds, image(n), given.encoding, given.step)
+        messages.append((root(1) + "Color_0/image/data", seconds, colors))
+        steps = picture(seconds + late, depth(), "mono16", 80)
+        messages.append((root(0) + "Depth_0/image/data", seconds + late, steps))
     path.unlink(missing_ok=True)
     bag = Writer(path)
     bag.set_compression(Writer.CompressionFormat.LZ4)

@@ -1,7 +1,9 @@
 """Live streams of frames: the newest frame is delivered, and all others are counted."""
 
 import itertools
+import sys
 import threading
+from types import ModuleType, SimpleNamespace
 
 import cv2
 import equinox as eqx
@@ -11,7 +13,9 @@ import pytest
 
 from gsjax.data import DataError
 from gsjax.data.opencv_cameras import calibrated_camera, open_camera, snapshots
+from gsjax.data.realsense_camera import open_realsense
 from gsjax.data.stream import NewestSnapshots, Snapshot, StreamStalled, back_and_forth, replay
+from gsjax.extras import MissingExtra
 from gsjax.geometry.cameras import Camera
 from gsjax.scene.frame import Frame
 
@@ -169,3 +173,71 @@ def test_unsuitable_cameras_are_refused_with_the_reason(cameras, says):
 def test_a_missing_camera_is_an_error_with_advice():
     with pytest.raises(DataError, match="replay a folder"):
         open_camera(97)
+
+
+class FakeRealSense(ModuleType):
+    """The part of pyrealsense2 that is used, with one camera that delivers `frames` frames."""
+
+    def __init__(self, frames=2, starts=True, depth=True):
+        super().__init__("pyrealsense2")
+        self.left, self.starts, self.depth = frames, starts, depth
+        self.stream = SimpleNamespace(depth="depth", color="color")
+        self.format = SimpleNamespace(z16="z16", bgr8="bgr8")
+        self.camera_info = SimpleNamespace(serial_number="serial number")
+        self.wanted = []
+        self.config = lambda: SimpleNamespace(
+            enable_device=self.wanted.append, enable_stream=lambda *stream: self.wanted.append(stream)
+        )
+        device = SimpleNamespace(get_info=lambda what: f"the {what}")
+        self.context = lambda: SimpleNamespace(query_devices=lambda: [device])
+        wait = self.try_wait_for_frames
+        self.pipeline = lambda: SimpleNamespace(start=self.start, try_wait_for_frames=wait)
+        self.align = lambda to: SimpleNamespace(process=self.aligned)
+
+    def start(self, config):
+        if not self.starts:
+            raise RuntimeError("Device or resource busy")
+        sensor = SimpleNamespace(get_depth_scale=lambda: 0.0001)
+        intrinsics = SimpleNamespace(fx=300.0, fy=310.0, ppx=2.5, ppy=1.5, width=6, height=4)
+        profile = SimpleNamespace(get_intrinsics=lambda: intrinsics)
+        return SimpleNamespace(
+            get_device=lambda: SimpleNamespace(first_depth_sensor=lambda: sensor),
+            get_stream=lambda stream: SimpleNamespace(as_video_stream_profile=lambda: profile),
+        )
+
+    def try_wait_for_frames(self, milliseconds):
+        self.left -= 1
+        return self.left >= 0, {}
+
+    def aligned(self, frames):
+        color = SimpleNamespace(get_data=lambda: np.full((4, 6, 3), (255, 0, 0), np.uint8))
+        depth = SimpleNamespace(get_data=lambda: np.full((4, 6), 15000, np.uint16)) if self.depth else None
+        return SimpleNamespace(get_color_frame=lambda: color, get_depth_frame=lambda: depth)
+
+
+def test_a_realsense_camera_gives_metres_and_red_green_blue(monkeypatch):
+    fake = FakeRealSense()
+    monkeypatch.setitem(sys.modules, "pyrealsense2", fake)
+    camera = open_realsense(0)
+    assert fake.wanted == ["the serial number", ("depth", "z16"), ("color", "bgr8")]
+    np.testing.assert_allclose(camera.K, [[300, 0, 3], [0, 310, 2], [0, 0, 1]])
+    shots = list(snapshots([camera]))
+    assert len(shots) == 2
+    np.testing.assert_allclose(shots[0].frame.depths, np.full((1, 4, 6), 1.5), rtol=1e-6)
+    np.testing.assert_allclose(shots[0].frame.images[0, 0, 0], [0, 0, 1])
+
+
+@pytest.mark.parametrize(
+    ("fake", "index", "says"),
+    [
+        (FakeRealSense(), 1, "realsense:1: expected a RealSense camera, found 1 that are connected"),
+        (FakeRealSense(starts=False), 0, r"one that does not start \(Device or resource busy\)"),
+        (FakeRealSense(depth=False), 0, "a frame without depth"),
+        (None, 0, r"realsense:0 needs pyrealsense2.*gsjax\[realsense\]"),
+    ],
+    ids=["not connected", "busy", "no depth", "not installed"],
+)
+def test_realsense_cameras_that_cannot_be_used(monkeypatch, fake, index, says):
+    monkeypatch.setitem(sys.modules, "pyrealsense2", fake)
+    with pytest.raises((DataError, MissingExtra), match=says):
+        list(snapshots([open_realsense(index)]))

@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from gsjax.data.consistency import check_recording
 from gsjax.data.opencv_cameras import open_camera, snapshots
+from gsjax.data.realsense_camera import open_realsense
 from gsjax.data.stream import Arrival, NewestSnapshots, Snapshot, replay
 from gsjax.engine.drive import Tick
 from gsjax.engine.ending import ended, exit_code
@@ -42,7 +43,7 @@ from gsjax.methods.track import PLAN, PRESETS, TrackedScene, start_scene
 from gsjax.perception.segmenters import PlaneOrRegionSegmenter
 from gsjax.scene.frame import Frame
 
-CAMERA_PREFIX = "camera:"
+_CAMERAS = {"camera": open_camera, "realsense": open_realsense}
 _MEMORY_EVERY_S = 1.0
 _SHOWN_EVERY = 15  # updates
 CONFIG = PRESETS["fast"]  # how a scene starts; what follows is chosen for the budget
@@ -53,7 +54,8 @@ class SourceAndOut:
     """The source to follow, and the folder of the run."""
 
     source: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE")]
-    """camera:0 for an RGB-D camera (OpenCV, OpenNI 2), or a recording, replayed back and forth."""
+    """camera:0 for an RGB-D camera (OpenCV, OpenNI 2), realsense:0 for a RealSense camera, or a recording,
+    replayed back and forth."""
     out: Path
     """Folder for the run: a new one, or that of an earlier run with --overwrite."""
 
@@ -124,7 +126,7 @@ def run(options: Options) -> int:
 
 def _check(options: Options) -> None:
     expect_positive(options, "hz", "patience", "budget_ms")
-    if options.source.startswith(CAMERA_PREFIX):
+    if _camera(options.source):
         default = Options(options.source, options.out)
         for name in ("cameras", "mask_camera", "frames", "masks", "scale", "read"):
             if getattr(options, name) != getattr(default, name):
@@ -134,14 +136,18 @@ def _check(options: Options) -> None:
                 )
 
 
+def _camera(source: str) -> str | None:
+    """The kind of a source that is a camera; None if it is a recording."""
+    kind = source.partition(":")[0]
+    return kind if source.startswith(f"{kind}:") and kind in _CAMERAS else None
+
+
 def _open(options: Options, console: Console) -> Source:
-    if options.source.startswith(CAMERA_PREFIX):
-        number = options.source.removeprefix(CAMERA_PREFIX)
+    if kind := _camera(options.source):
+        number = options.source.removeprefix(f"{kind}:")
         if not number.isdecimal():
-            raise ValueError(
-                f"SOURCE: expected {CAMERA_PREFIX}NUMBER, as in camera:0, found {options.source}"
-            )
-        camera = open_camera(int(number))
+            raise ValueError(f"SOURCE: expected {kind}:NUMBER, as in {kind}:0, found {options.source}")
+        camera = _CAMERAS[kind](int(number))
         arriving = snapshots([camera])
         first, drawing, stream = next(arriving).frame, nullcontext(), lambda: arriving
         image, depth = np.asarray(first.images[0]), np.asarray(first.depths)[0]
