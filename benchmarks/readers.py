@@ -71,7 +71,7 @@ def _trajectory(root: Path) -> None:
 
 
 def _tracking(root: Path) -> Arrays:
-    tracking = read_tracking(root)
+    tracking, _ = read_tracking(root)
     return [tracking.scene.gaussians.means, tracking.scene.normals]
 
 
@@ -92,7 +92,7 @@ def _parts_run(root: Path) -> None:
 
 
 def _parts(root: Path) -> Arrays:
-    layer, _ = read_parts(root)
+    layer, *_ = read_parts(root)
     return [layer.scene.gaussians.means, layer.scene.weights, *jax.tree.leaves(layer.trajectory)]
 
 

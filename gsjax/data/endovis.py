@@ -313,7 +313,7 @@ def _read_classes(path: Path) -> tuple[dict[int, int], dict[int, str]]:
             (int(each.get("classid", i)), int(np.dot(each["color"][:3], _CODE)), str(each["name"]))
             for i, each in enumerate(classes)
         ]
-    except (TypeError, KeyError, ValueError, AttributeError) as error:
+    except (TypeError, KeyError, ValueError, AttributeError, OverflowError) as error:
         expected = "a list of classes, each with name, color and classid"
         raise DataError(path, expected, f"something else ({error})", "Fetch the file again.") from None
     return {code: number for number, code, _ in listed}, {

@@ -135,7 +135,7 @@ def test_a_camera_count_that_differs_names_the_frame(folder):
         (lambda m: m.pop("w2c"), "no w2c"),
         (lambda m: m["k"].pop(), "3 frames in k"),
         (lambda m: m["cam_id"][1].reverse(), r"found \[1, 0\] in frame 1"),
-        (lambda m: m["w2c"][1][1].pop(), r"found shape \(3, 4\) in frame 1, camera position 1"),
+        (lambda m: m["w2c"][1][1].pop(), r"w2c in frame 1, camera position 1, as 4x4 numbers, found 3x4"),
         (lambda m: m.update(time=[0.0, 1.0]), "time to be 3 numbers"),
         (lambda m: m.update(fn=[]), "at least one frame"),
         (lambda m: m.update(fn=[[1, 2]] * 3), "the lists and numbers of this layout, found something else"),
