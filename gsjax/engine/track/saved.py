@@ -77,6 +77,10 @@ def read_tracking(path: Path) -> tuple[Tracking, Float[np.ndarray, "3"] | None]:
     """
     wanted = ("means", "quats", "normals", "labels", "label_ids", "lost", "turn_known")
     arrays = read_arrays(path / "trajectory.npz", wanted, _AGAIN)
+    for name in ("means", "quats", "normals"):
+        if lost := int((~np.isfinite(arrays[name])).sum()):
+            found = f"{lost} of {arrays[name].size} that are not"
+            raise ValueError(f"{path / 'trajectory.npz'}: expected finite {name}, found {found}; {_AGAIN}")
     means, quats, labels = arrays["means"], arrays["quats"], arrays["labels"]
     count, moving = means.shape[1], quats.shape[1]
     gaussians, origin = read_scene(path, count, "trajectory.npz", _AGAIN)

@@ -151,6 +151,7 @@ def _with(given, **changes):
     return replace(given, timeline=given.timeline._replace(**changes))
 
 
+@pytest.mark.usefixtures("as_users_run")
 @pytest.mark.parametrize("change", [{"timeline": 3}, {"meaning": 3}, {"moving": "x"}])
 def test_parts_of_other_kinds(change, tmp_path):
     save_checkpoint(tmp_path / "deformation.npz", replace(result(), **change))
