@@ -134,8 +134,8 @@ def _streams(bag: Bag) -> tuple[_Stream, _Stream]:
     found = [match for topic in bag.topics if (match := _IMAGES.fullmatch(topic))]
     names = [next((m["stream"] for m in found if m["kind"] == kind), None) for kind in ("Color", "Depth")]
     if None in names:
-        lacking = "depth" if names[0] else "colour"
-        expected = f"{lacking} of a RealSense camera, /device_0/sensor_N/{lacking.capitalize()}_0/image/data"
+        lacking, stream = ("depth", "Depth") if names[0] else ("colour", "Color")
+        expected = f"{lacking} of a RealSense camera, /device_0/sensor_N/{stream}_0/image/data"
         raise DataError(bag.path, expected, shortened(bag.topics) or "no topic", _RECORD)
     stamps: dict[str, dict[int, float]] = {f"{name}/image/data": {} for name in names}
     for message in bag.messages([*stamps], _IMAGE):

@@ -145,7 +145,10 @@ def encoded(name, encoding, pixel=(1, 2)):
 @pytest.mark.parametrize(
     ("damage", "says"),
     [
-        (without(f"{COLOR}/image/data"), "expected colour of a RealSense camera, .* found /device_0"),
+        (
+            without(f"{COLOR}/image/data"),
+            "expected colour of a RealSense camera, .*N/Color_0/image/data, found /device_0",
+        ),
         (without(f"{DEPTH}/image/data"), "expected depth of a RealSense camera, .* found /device_0"),
         (
             without(f"{DEPTH}/info/camera_info"),
