@@ -275,12 +275,15 @@ def decode(path: Path, kind: str) -> np.ndarray:
 
 
 def _is_bomb(content: bytes) -> bool:
-    """Whether a picture, by its header, has more pixels than Pillow would decode; OpenCV would."""
+    """Whether a picture, by its header, has more pixels than Pillow would decode; OpenCV would.
+
+    Every picture passes here, in several threads, so filters of warnings, which threads share, stay as they
+    are.
+    """
     from PIL import Image
 
     try:
-        with pillow_errors(), warnings.catch_warnings():
-            warnings.simplefilter("ignore")
+        with pillow_errors():
             Image.open(io.BytesIO(content)).close()
     except PictureError as error:
         return isinstance(error.__cause__, Image.DecompressionBombError)

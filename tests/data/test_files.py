@@ -2,6 +2,7 @@
 
 import io
 import struct
+import warnings
 import zlib
 
 import cv2
@@ -261,3 +262,13 @@ def test_json_that_is_too_long_or_too_deep(tmp_path, text):
 def test_numbers_of_another_shape(tmp_path, value):
     with pytest.raises(DataError, match=r"a.json: expected K as 3x3 numbers, found"):
         as_numbers(tmp_path / "a.json", "K", value, (3, 3))
+
+
+def test_pictures_are_decoded_without_touching_filters_of_warnings(tmp_path, monkeypatch):
+    """Threads share the filters: one that restores another's silences every later warning."""
+    changes, catch = [], warnings.catch_warnings
+    path = tmp_path / "a.png"
+    cv2.imwrite(str(path), np.zeros((4, 5, 3), np.uint8))
+    monkeypatch.setattr(warnings, "catch_warnings", lambda: changes.append(1) or catch())
+    assert read_image(path, 5, 4).shape == (4, 5, 3)
+    assert not changes
