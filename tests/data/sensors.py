@@ -1,51 +1,13 @@
-"""Recordings as depth sensors write them, of the built-in tabletop, for tests of their readers."""
-
-import json
+"""Recordings of the built-in tabletop as librealsense writes them."""
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from gsjax.data.simulated import tabletop
-from tests.data import dots
-
-OPENGL = np.diag([1.0, -1, -1, 1])
 
 
 def scene(width, height, frames=3):
     """One camera's view of the tabletop."""
     return tabletop(frames=frames, width=width, height=height, cameras=1)
-
-
-def metadata(sequence):
-    """Record3D's: poses qx qy qz qw tx ty tz, camera to world, OpenGL axes."""
-    poses = np.linalg.inv(sequence.viewmats[:, 0]) @ OPENGL
-    quats = Rotation.from_matrix(poses[:, :3, :3]).as_quat()
-    return {
-        "w": sequence.width,
-        "h": sequence.height,
-        "fps": 60,
-        "K": sequence.Ks[0, 0].T.ravel().tolist(),
-        "poses": np.concatenate([quats, poses[:, :3, 3]], axis=1).tolist(),
-        "initPose": [0, 0, 0, 1, 0, 0, 0],
-    }
-
-
-def write_exr(path, depth, channel="R", dtype=np.float32):
-    import OpenEXR
-
-    path.parent.mkdir(parents=True, exist_ok=True)
-    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
-    with OpenEXR.File(header, {channel: np.ascontiguousarray(depth, dtype)}) as file:
-        file.write(str(path))
-
-
-def write_record3d(root, width=32, height=24, frames=3):
-    """EXR_RGBD: pictures, and depth of half their size."""
-    colors, depths = scene(width, height, frames), scene(width // 2, height // 2, frames)
-    for t in range(frames):
-        dots.save(root / f"rgb/{t}.png", colors.image(t, 0))
-        write_exr(root / f"depth/{t}.exr", depths.depth(t, 0))
-    (root / "metadata.json").write_text(json.dumps(metadata(colors)))
 
 
 COLOR, DEPTH = "/device_0/sensor_1/Color_0", "/device_0/sensor_0/Depth_0"
