@@ -44,7 +44,8 @@ def read_arrays(file: Path, wanted: Sequence[str], again: str) -> dict[str, np.n
         ) from error
     missing = [name for name in wanted if name not in arrays]
     if missing:
-        raise ValueError(f"{file}: expected an array {missing[0]}, found {brief(', '.join(arrays))}; {again}")
+        found = brief(", ".join(arrays)) or "an array without a name"  # which is what an .npy file holds
+        raise ValueError(f"{file}: expected an array {missing[0]}, found {found}; {again}")
     return arrays
 
 

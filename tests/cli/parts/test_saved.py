@@ -59,6 +59,12 @@ def test_arrays_that_do_not_fit(run, name, change, says):
 def test_a_file_of_one_array(run):
     with open(run / "parts.npz", "wb") as stream:
         np.save(stream, np.zeros(3))
+    assert said_of(run) == "parts.npz: expected an array anchor, found an array without a name"
+
+
+def test_a_file_cut_off(run):
+    sound = (run / "parts.npz").read_bytes()
+    (run / "parts.npz").write_bytes(sound[: len(sound) // 2])
     assert said_of(run) == "parts.npz: expected plain arrays, found a file that cannot be read"
 
 
