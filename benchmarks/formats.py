@@ -1,10 +1,12 @@
-"""What each format makes of a scene: `python -m benchmarks.formats SCENE [UP]`, a table in Markdown.
+"""What each format makes of a scene: `python -m benchmarks.formats SCENE [--up UP] [--out TABLE.json]`.
 
-Eight views on a circle around the scene, 320 x 240 pixels: the least PSNR of a render of the file read back,
-against one of the scene itself. UP is that of the scene: -y (default), y, z.
+Eight views on a circle around the scene, 320 x 240 pixels: the least PSNR of a render of the file read back, by
+us and by other programs where they are installed (tests/io/converters.py), against one of the scene itself; and
+of the files that those programs write of the scene, read by us.
 """
 
-import sys
+import argparse
+import json
 import tempfile
 from pathlib import Path
 from time import perf_counter
@@ -12,11 +14,13 @@ from time import perf_counter
 import jax.numpy as jnp
 import numpy as np
 
+from gsjax.engine import machine
 from gsjax.geometry.cameras import Camera, intrinsics
 from gsjax.io.scenes import FORMATS, read_gaussians, write_gaussians
 from gsjax.metrics.image import psnr
 from gsjax.scene.gaussians import Gaussians
 from gsjax.scene.render import render
+from tests.io.converters import CONVERTERS, Converter
 
 WIDTH, HEIGHT, VIEWS = 320, 240, 8
 UPS = {"-y": (0.0, -1.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
@@ -45,36 +49,102 @@ def cameras_around(gaussians: Gaussians, up: np.ndarray) -> Camera:
     return Camera(jnp.asarray(viewmats, jnp.float32), jnp.asarray(Ks, jnp.float32), WIDTH, HEIGHT)
 
 
-def main(scene: str, up: str = "-y") -> None:
-    """Print the table.
+class Judge:
+    """The least PSNR of a scene in its views, in dB, to a tenth; "exact" where nothing differs."""
+
+    def __init__(self, gaussians: Gaussians, up: np.ndarray):
+        """
+        Args:
+            gaussians: the scene itself.
+            up: unit vector, [3].
+        """
+        self._cameras = cameras_around(gaussians, up)
+        self._wanted = np.asarray(render(gaussians, self._cameras).colors)
+
+    def __call__(self, gaussians: Gaussians) -> float | str:
+        """Judge another scene.
+
+        Args:
+            gaussians: it.
+        """
+        found = np.asarray(render(gaussians, self._cameras).colors)
+        worst = min(psnr(a, b) for a, b in zip(found, self._wanted, strict=True))
+        return "exact" if np.isinf(worst) else round(worst, 1)
+
+
+def measure(scene: Gaussians, judge: Judge, folder: Path) -> dict[str, dict]:
+    """The row of each format: sizes, seconds, and dB by who wrote and who read.
 
     Args:
-        scene: a file of Gaussians.
-        up: its up direction.
+        scene: the scene.
+        judge: of it.
+        folder: an empty folder.
     """
-    gaussians, _ = read_gaussians(scene)
-    cameras = cameras_around(gaussians, np.array(UPS[up]))
-    wanted = np.asarray(render(gaussians, cameras).colors)
-    print(
-        "| format | MB | bytes a Gaussian | PSNR, dB | written, s | read, s |", "| --- " * 6 + "|", sep="\n"
-    )
-    with tempfile.TemporaryDirectory() as folder:
-        for ending in FORMATS:
-            file, begun = Path(folder) / f"scene{ending}", perf_counter()
-            write_gaussians(file, gaussians)
-            size, written = file.stat().st_size, perf_counter() - begun
-            row = f"| {ending} | {size / 1e6:.2f} | {size / gaussians.num:.1f}"
-            if ending in (".glb", ".html"):
-                print(f"{row} | – | {written:.2f} | – |")
-                continue
+    programs = [program for program in CONVERTERS.values() if program.installed]
+    plain = folder / "scene.ply"
+    rows = {}
+    for ending in FORMATS:
+        file, begun = folder / f"scene{ending}", perf_counter()
+        write_gaussians(file, scene)
+        row = {"bytes": file.stat().st_size, "written_s": round(perf_counter() - begun, 2)}
+        if ending not in (".glb", ".html"):
             begun = perf_counter()
             back, _ = read_gaussians(file)
-            seconds, found = perf_counter() - begun, np.asarray(render(back, cameras).colors)
-            worst = min(psnr(a, b) for a, b in zip(found, wanted, strict=True))
-            print(
-                f"{row} | {'exact' if np.isinf(worst) else f'{worst:.1f}'} | {written:.2f} | {seconds:.2f} |"
-            )
+            row |= {"read_s": round(perf_counter() - begun, 2), "ours": judge(back)}
+        for program in programs:
+            if ending in program.reads:
+                theirs = folder / "read_by_them.ply"
+                program(file, theirs)
+                row[f"read by {program.name}"] = _judged(theirs, ending, program, judge)
+            if ending in program.writes:
+                theirs = folder / f"written_by_them{ending}"
+                program(plain, theirs)
+                row[f"written by {program.name}"] = _judged(theirs, ending, program, judge)
+        rows[ending] = row
+    return rows
+
+
+def _judged(file: Path, ending: str, program: Converter, judge: Judge) -> float | str:
+    back, _ = read_gaussians(file)
+    return judge(program.axes(back, ending))
+
+
+def table(rows: dict[str, dict], count: int) -> str:
+    """The rows in Markdown.
+
+    Args:
+        rows: as `measure` makes them.
+        count: of Gaussians.
+    """
+    said = [key for row in rows.values() for key in row if key.startswith(("read by", "written by"))]
+    others = list(dict.fromkeys(said))
+    lines = [
+        " | ".join(["format", "MB", "bytes a Gaussian", "written, s", "read, s", "dB", *others]),
+        " | ".join(["---"] * (6 + len(others))),
+    ]
+    for ending, row in rows.items():
+        cells = [f"`{ending}`", f"{row['bytes'] / 1e6:.2f}", f"{row['bytes'] / count:.1f}", row["written_s"]]
+        cells += [row.get(key, "–") for key in ("read_s", "ours", *others)]
+        lines.append(" | ".join(map(str, cells)))
+    return "\n".join(lines)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description="what each format makes of a scene")
+    parser.add_argument("scene", help="a file of Gaussians")
+    parser.add_argument("--up", choices=UPS, default="-y", help="its up direction")
+    parser.add_argument("--out", type=Path, help="a .json for the table")
+    arguments = parser.parse_args()
+    scene, _ = read_gaussians(arguments.scene)
+    judge = Judge(scene, np.array(UPS[arguments.up]))
+    with tempfile.TemporaryDirectory() as folder:
+        rows = measure(scene, judge, Path(folder))
+    print(table(rows, scene.num))
+    if arguments.out:
+        record = {"machine": machine.describe(), "scene": Path(arguments.scene).name}
+        record |= {"gaussians": scene.num, "sh_degree": scene.sh_degree, "formats": rows}
+        arguments.out.write_text(json.dumps(record, indent=1, ensure_ascii=False) + "\n")
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:])
+    main()
