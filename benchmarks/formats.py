@@ -1,7 +1,7 @@
 """What each format makes of a scene: `python -m benchmarks.formats SCENE [--up UP] [--out TABLE.json]`.
 
-Eight views on a circle around the scene, 320 x 240 pixels: the least PSNR of a render of the file read back, by
-us and by other programs where they are installed (tests/io/converters.py), against one of the scene itself; and
+Eight views on a circle around the scene, 320 x 240 pixels: the least PSNR of a render of the file read back,
+by us and by other programs where they are installed (tests/io/converters.py), against one of the scene; and
 of the files that those programs write of the scene, read by us.
 """
 

@@ -40,8 +40,13 @@ _ANEW = "restore it, or replace the run with --overwrite"
 SIGNATURE = "# gsjax run"  # the first line of config.yml: other programs write files of that name too
 
 
-def _stored(file: Path, parse: Callable[[str], Any]) -> dict[str, Any]:
-    """What a run stored by name; raises a ValueError if the file holds something else."""
+def read_values(file: Path, parse: Callable[[str], Any]) -> dict[str, Any]:
+    """What a run stored by name; raises a ValueError if the file holds something else.
+
+    Args:
+        file: the file.
+        parse: its text, `parse_json` or `parse_yaml`.
+    """
     try:
         found = parse(file.read_text(encoding="utf-8"))
     except ValueError as error:
@@ -206,7 +211,7 @@ class RunFolder:
         """Whether a run that was not stopped has written everything: its report comes last."""
         if not self.metrics.is_file():
             return False
-        found = _stored(self.metrics, parse_json)
+        found = read_values(self.metrics, parse_json)
         return found.get("complete", True) and (self.report.is_file() or not found.get("report", True))
 
     def forget_resume(self) -> None:
@@ -250,11 +255,11 @@ class RunFolder:
 
     def setting(self, name: str) -> Any:
         """A setting of config.yml."""
-        return _flat(_stored(self.config, parse_yaml)).get(name)
+        return _flat(read_values(self.config, parse_yaml)).get(name)
 
     def check_config(self, config: Any, *, but: tuple[str, ...]) -> None:
         """Raises ValueError if config.yml differs from `config` in settings other than `but`."""
-        stored = _flat(_stored(self.config, parse_yaml))
+        stored = _flat(read_values(self.config, parse_yaml))
         given = _flat(plain(dataclasses.asdict(config)))
         names = [n for n in dict.fromkeys([*given, *stored]) if n.split(".")[0] not in but]
         others = [name for name in names if stored.get(name) != given.get(name)]

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-from gsjax.engine.folder import expect_run, is_run
+from gsjax.engine.folder import expect_run, is_run, read_values
 from gsjax.io.brief import brief
 from gsjax.io.parsed import parse_json, parse_yaml
 
@@ -99,13 +99,7 @@ def read_config(file: Path) -> dict[str, Any]:
     Raises:
         ValueError: the file holds something else.
     """
-    try:
-        config = parse_yaml(file.read_text(encoding="utf-8"))
-    except ValueError as error:
-        raise ValueError(f"{file}: expected the settings of a run, found invalid YAML ({error})") from error
-    if not isinstance(config, dict):
-        raise ValueError(f"{file}: expected the settings of a run, found none")
-    return config
+    return read_values(file, parse_yaml)
 
 
 def _kind(path: Path, config: Mapping[str, Any]) -> Kind:
@@ -130,10 +124,7 @@ def _object(file: Path, wanted: tuple[str, ...]) -> dict[str, Any] | None:
     """The contents of a JSON file with these entries, if it exists."""
     if not file.is_file():
         return None
-    try:
-        found = parse_json(file.read_text(encoding="utf-8"))
-    except ValueError as error:
-        raise ValueError(f"{file}: expected the scores of a run, found invalid JSON ({error})") from error
+    found = read_values(file, parse_json)
     _expect(file, found, wanted)
     return found
 

@@ -199,7 +199,7 @@ def test_what_cannot_be_scored_is_said(gsjax_eval, run, tmp_path, weights):
     config.write_text("# gsjax run\nsource: camera:0\n")
     assert "settings of another command or version (source)" in gsjax_eval()[1]
     config.write_text("# gsjax run\n}{")
-    assert "config.yml: expected the settings of a run, found invalid YAML" in gsjax_eval()[1]
+    assert "config.yml: expected what a run wrote, found other text" in gsjax_eval()[1]
     config.write_text(whole)
     (run / "scene.ply").unlink()
     code, said, _ = gsjax_eval()
