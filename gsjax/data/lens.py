@@ -10,6 +10,7 @@ from jaxtyping import Float
 
 from gsjax.data.errors import DataError
 from gsjax.geometry.cameras import intrinsics
+from gsjax.geometry.sight import bent
 
 _SAME_SHAPE = 0.02  # largest relative difference of aspect ratios that rounding a size explains
 _WIDEST = np.deg2rad(70)  # off axis: a wider pinhole view consists mostly of stretched edges
@@ -118,12 +119,11 @@ def _pinhole_of_fisheye(
 ) -> Float[np.ndarray, "3 3"]:
     """Like `_pinhole_K`, but keeps the principal point: OpenCV's own estimate follows the mean of the edge
     midpoints, which diverges for a lens that sees almost 90 degrees off its axis."""
-    angles = np.linspace(1e-3, _WIDEST, 1000)
-    distorted = np.maximum.accumulate(angles * np.polyval([*coeffs[::-1], 1.0], angles**2))
+    angles, distances = bent(coeffs, _WIDEST)
     cx, cy = lens_K[0, 2], lens_K[1, 2]
     sides = np.array([cx, width - 1 - cx, cy, height - 1 - cy])  # from the principal point to the edges
     focals = np.array([lens_K[0, 0], lens_K[0, 0], lens_K[1, 1], lens_K[1, 1]])
-    edge_angles = np.interp(sides / focals, distorted, angles)
+    edge_angles = np.interp(sides / focals, distances, angles).clip(1e-3)
     K = np.eye(3)
     K[0, 0] = K[1, 1] = np.max(sides / np.tan(edge_angles))
     K[:2, 2] = cx, cy

@@ -11,6 +11,8 @@ import jaxlie
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from gsjax.geometry.sight import pixels_at
+
 # nerfstudio, Blender and OpenGL look along -z with +y up; one sign flip of two axes leads to OpenCV.
 OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 
@@ -151,11 +153,8 @@ def pixels_of(
         viewmat, K: pose and intrinsics of the camera.
         width, height: size of the image, pixels.
     """
-    local = points @ viewmat[:3, :3].T + viewmat[:3, 3]
-    depths = local[:, 2]
-    ahead = np.where(depths > 0, depths, np.inf)
-    xy = (local @ K.T)[:, :2] / ahead[:, None]
-    inside = np.isfinite(ahead) & (xy >= 0).all(axis=1) & (xy < (width, height)).all(axis=1)
+    xy, depths = pixels_at(points @ viewmat[:3, :3].T + viewmat[:3, 3], K)
+    inside = (xy >= 0).all(axis=1) & (xy < (width, height)).all(axis=1)  # NaN is not
     columns, rows = np.where(inside[:, None], xy, 0).astype(int).T
     return PointPixels(columns, rows, depths, inside)
 
