@@ -141,7 +141,7 @@ def _chosen(frames: str | None, count: int) -> range:
 
 
 def _at(scene: Viewable, row: int) -> Gaussians:
-    return scene.gaussians if row == 0 else scene.at(row)
+    return scene.gaussians if scene.motion is None else scene.at(row)
 
 
 def _film_of(scene: Viewable, rows: range) -> Film:

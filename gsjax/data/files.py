@@ -3,7 +3,6 @@
 import io
 import json
 import re
-import warnings
 from pathlib import Path
 from typing import Any
 
@@ -267,6 +266,7 @@ def decode(path: Path, kind: str) -> np.ndarray:
     if _is_bomb(content):
         found = f"{len(content)} bytes that say they are far more pixels than any camera takes"
         raise DataError(path, kind, found, "Fetch the file again, or save it smaller.")
+    # Pictures are decoded in several threads, which share the filters of warnings: none may change them.
     image = None if _has_transparent_grey(content) else _decoded_by_opencv(content)
     image = _decoded_by_pillow(content) if image is None else image
     if image is None:
@@ -275,11 +275,7 @@ def decode(path: Path, kind: str) -> np.ndarray:
 
 
 def _is_bomb(content: bytes) -> bool:
-    """Whether a picture, by its header, has more pixels than Pillow would decode; OpenCV would.
-
-    Every picture passes here, in several threads, so filters of warnings, which threads share, stay as they
-    are.
-    """
+    """Whether a picture, by its header, has more pixels than Pillow would decode; OpenCV would."""
     from PIL import Image
 
     try:
@@ -308,8 +304,7 @@ def _decoded_by_pillow(content: bytes) -> np.ndarray | None:
     from PIL import Image
 
     try:
-        with pillow_errors(), warnings.catch_warnings(), Image.open(io.BytesIO(content)) as image:
-            warnings.simplefilter("ignore")  # of damaged files, which become errors
+        with pillow_errors(), Image.open(io.BytesIO(content)) as image:
             channels = "RGBA" if image.has_transparency_data else "RGB"
             pixels = np.asarray(image.convert(channels))
     except PictureError:

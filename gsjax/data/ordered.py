@@ -34,8 +34,15 @@ def sequence_of(photographs: Photographs) -> Sequence:
     Pixels that masks exclude are labelled as tool. Lengths stay in the photographs' unit.
 
     Raises:
-        DataError: the photographs differ in size.
+        DataError: the photographs differ in size, or are kept as fisheyes took them.
     """
+    if photographs.fisheye is not None:
+        raise DataError(
+            photographs.name,
+            "photographs of pinholes, as recordings have them",
+            "fisheyes that are kept as they are",
+            "Leave out --read.fisheye, and they are undistorted.",
+        )
     times, names = photographs.times, photographs.names
     if times is None:
         order = sorted(range(len(names)), key=lambda i: _by_numbers(names[i]))

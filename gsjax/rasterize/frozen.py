@@ -54,20 +54,24 @@ def freeze_views(
     Ks: Float[Array, "c 3 3"],
     width: int,
     height: int,
+    *,
+    fisheye: Float[Array, "c 4"] | None = None,
     **options: Any,
 ) -> tuple[FrozenView, Plan]:
     """The views [C, ...] of C cameras, and the plan that they are painted with. On the host.
 
-    Arguments as for `gsjax.rasterization`, including its options; gradients stop here. Gaussians that cannot
-    be drawn are in no list.
+    Arguments as for `gsjax.rasterization`, including the options of its plan; gradients stop here. Gaussians
+    that cannot be drawn are in no list.
 
     Raises:
         ValueError: as `gsjax.plan`.
     """
     scene = (means, quats, scales, opacities)
-    plan = _plan(*scene, viewmats, Ks, width, height, headroom=1.0, **options)
-    cameras = zip(np.asarray(viewmats), np.asarray(Ks), strict=True)
-    frozen = [_freeze(*scene, *camera, plan) for camera in cameras]
+    plan = _plan(*scene, viewmats, Ks, width, height, headroom=1.0, fisheye=fisheye, **options)
+    cameras = zip(
+        *map(np.asarray, (viewmats, Ks) if fisheye is None else (viewmats, Ks, fisheye)), strict=True
+    )
+    frozen = [_freeze(*scene, *camera, plan=plan) for camera in cameras]
     if any(bool(overflow) for _, overflow in frozen):
         raise RuntimeError("the plan made for these views is too small for them; please report this as a bug")
     shown = [_shown(jax.device_get(view)) for view, _ in frozen]
@@ -163,9 +167,11 @@ def _shown(view: FrozenView) -> FrozenView:
 
 
 @partial(jax.jit, static_argnames="plan")
-def _freeze(means, quats, scales, opacities, viewmat, K, plan: Plan) -> tuple[FrozenView, Bool[Array, ""]]:
+def _freeze(
+    means, quats, scales, opacities, viewmat, K, fisheye=None, *, plan: Plan
+) -> tuple[FrozenView, Bool[Array, ""]]:
     usable = jnp.ones(len(means), bool)
-    projected = project_gaussians(means, quats, scales, opacities, usable, viewmat, K, plan)
+    projected = project_gaussians(means, quats, scales, opacities, usable, viewmat, K, plan, None, fisheye)
     binned = bin_gaussians(projected, None, plan)
     splats = Splats(projected.means2d, projected.conics, projected.opacities, jnp.ones((len(means), 1)))
     *_, reads = composite(splats, Lists(binned.ids, binned.starts, binned.counts), None, plan)

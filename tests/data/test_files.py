@@ -264,11 +264,15 @@ def test_numbers_of_another_shape(tmp_path, value):
         as_numbers(tmp_path / "a.json", "K", value, (3, 3))
 
 
-def test_pictures_are_decoded_without_touching_filters_of_warnings(tmp_path, monkeypatch):
+@pytest.mark.parametrize(
+    ("name", "options"), [("a.png", {}), ("grey.png", {"transparency": 3}), ("a.gif", {})]
+)
+def test_pictures_are_decoded_without_touching_filters_of_warnings(tmp_path, monkeypatch, name, options):
     """Threads share the filters: one that restores another's silences every later warning."""
     changes, catch = [], warnings.catch_warnings
-    path = tmp_path / "a.png"
-    cv2.imwrite(str(path), np.zeros((4, 5, 3), np.uint8))
+    path = tmp_path / name
+    shape = (4, 5) if options else (4, 5, 3)
+    Image.fromarray(np.zeros(shape, np.uint8)).save(path, **options)
     monkeypatch.setattr(warnings, "catch_warnings", lambda: changes.append(1) or catch())
     assert read_image(path, 5, 4).shape == (4, 5, 3)
     assert not changes

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from gsjax.data import DataError, DataWarning, ReadOptions, open_photographs
+from gsjax.data.ordered import sequence_of
 from gsjax.geometry.sight import pixels_at, rays
 from gsjax.methods.fit.config import StartConfig
 from gsjax.methods.fit.start import start_points
@@ -90,6 +91,12 @@ def test_points_appear_where_they_were_seen_and_where_the_rasterizer_draws_them(
     )
     np.testing.assert_allclose(drawn[2].means2d[0], pixels, atol=2e-3)
     np.testing.assert_allclose(drawn[2].depths[0], distances, rtol=1e-5)
+
+
+def test_a_recording_of_kept_fisheyes_is_refused(folder):
+    """Whose cameras would otherwise be taken for pinholes."""
+    with pytest.raises(DataError, match=r"expected photographs of pinholes.*Leave out --read.fisheye"):
+        sequence_of(open_photographs(folder(), KEPT))
 
 
 def test_undistorting_says_how_much_it_loses(folder):

@@ -46,6 +46,18 @@ def test_what_is_painted_is_what_the_rasterizer_draws(frozen, channels):
         np.testing.assert_allclose(opacity, alphas[c], atol=2e-5)
 
 
+def test_fisheyes_are_painted_as_the_rasterizer_draws_them(small, geometry):
+    _, scene = small(3)
+    lens = jnp.tile(jnp.array([0.3, -0.05, 0.01, 0.0]), (len(scene["viewmats"]), 1))
+    views, plan = freeze_views(*geometry(scene), 33, 17, fisheye=lens)
+    values = values_of(scene, 0, 3)
+    colors, _ = drawn(scene, jnp.asarray(values), fisheye=lens)
+    pinholes, _ = drawn(scene, jnp.asarray(values))
+    assert np.abs(colors - pinholes).max() > 0.05
+    for c in range(len(colors)):
+        np.testing.assert_allclose(painted(view_of(views, c), values, plan)[0], colors[c], atol=2e-5)
+
+
 def test_the_padding_of_a_view_is_not_seen(frozen):
     scene, views, plan = frozen
     view = view_of(views, 0)

@@ -19,7 +19,6 @@ from gsjax.methods.parts.film import Film, Layer
 from gsjax.methods.parts.operations import OPERATIONS, describe_operation, example_line
 from gsjax.methods.parts.timeline import Names, Script, parse_op
 from gsjax.methods.parts.trajectory import BACKGROUND
-from gsjax.scene.gaussians import concatenate, take
 from gsjax.scene.handles import Blend
 from gsjax.viz.viewer import Editing, Motion, Preview, Shots, Viewable
 
@@ -48,13 +47,13 @@ class Filmed:
         moves = np.concatenate([_moves(layer) for layer in film])
         order = np.argsort(~moves, kind="stable")
         labels, names = _labels(film, self.names)
-        scenes = tuple(layer.scene for layer in film)
+        at = frames_of(film, self.blend, order)
         return Viewable(
             self.title,
-            take(concatenate([scene.gaussians for scene in scenes]), order),
+            at(0),
             labels[order],
             names,
-            motion=Motion(len(times), int(moves.sum()), frames_of(film, self.blend, order)),
+            motion=Motion(len(times), int(moves.sum()), at),
             times=times,
             shots=None if self.shots is None else _at_times(self.shots, self.times, times - times[0]),
             unit="m",

@@ -136,14 +136,17 @@ def frozen_views(
         cameras: cameras of the views.
         rasterize_mode: "classic" or "antialiased", as the scene was fitted.
     """
-    sizes = sorted({(camera.width, camera.height, camera.near) for camera in cameras})
+    kinds = [(camera.width, camera.height, camera.near, camera.fisheye is not None) for camera in cameras]
     found: dict[int, tuple[FrozenView, Plan]] = {}
-    for width, height, near in sizes:
-        which = [v for v, c in enumerate(cameras) if (c.width, c.height, c.near) == (width, height, near)]
+    for kind in sorted(set(kinds)):
+        which, (width, height, near, bends) = [v for v, each in enumerate(kinds) if each == kind], kind
         scene = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities)
-        viewmats, Ks = (np.stack([getattr(cameras[v], n) for v in which]) for n in ("viewmat", "K"))
-        seen_from = (*jax.device_put((viewmats, Ks)), width, height)
-        views, plan = freeze_views(*scene, *seen_from, near_plane=near, rasterize_mode=rasterize_mode)
+        viewmats, Ks, fisheye = (
+            jax.device_put(np.stack([getattr(cameras[v], name) for v in which])) if name else None
+            for name in ("viewmat", "K", "fisheye" if bends else None)
+        )
+        options = {"fisheye": fisheye, "near_plane": near, "rasterize_mode": rasterize_mode}
+        views, plan = freeze_views(*scene, viewmats, Ks, width, height, **options)
         views = jax.device_get(views)
         for place, v in enumerate(which):
             found[v] = (jax.device_put(jax.tree.map(lambda a, place=place: a[place], views)), plan)

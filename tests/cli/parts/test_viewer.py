@@ -3,6 +3,7 @@
 import json
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from rich.console import Console
@@ -10,14 +11,17 @@ from scipy.spatial import cKDTree
 
 from gsjax.engine.messages import Notes
 from gsjax.engine.parts.films import new_folder
+from gsjax.engine.parts.outputs import write_parts
 from gsjax.engine.parts.saved import open_parts_run
 from gsjax.engine.parts.viewer import script_of
 from gsjax.engine.viewables import open_viewable
 from gsjax.io.video import read_video_frames
+from gsjax.methods.parts import trajectory_of
 from gsjax.methods.parts.film import film_gaussians
 from gsjax.methods.parts.operations import OPERATIONS
 from gsjax.methods.parts.timeline import apply, parse_op
-from tests.cli.parts.test_edit import write_run
+from gsjax.scene.handles import HandlePose
+from tests.cli.parts.test_edit import STEP, scene_and_trajectory, write_run
 
 pytest.importorskip("viser", reason="viser is not installed")
 
@@ -44,6 +48,22 @@ def assert_the_same_in_any_order(ours, theirs):
     assert one.shape == other.shape
     for some, all_others in ((one, other), (other, one)):
         assert cKDTree(all_others).query(some)[0].max() < 1e-4
+
+
+def test_the_first_frame_is_not_that_of_the_anchor(run):
+    """Parts are stored as they stand in the anchor's frame, which is seldom the first."""
+    scene, _ = scene_and_trajectory()
+    quats, shifts = np.zeros((4, 3, 4)), np.zeros((4, 3, 3))
+    quats[..., 0], shifts[:, 1, 0] = 1, [-0.2, -0.1, 0.0, 0.1]
+    poses = HandlePose(jnp.asarray(quats, float), jnp.asarray(shifts, float))
+    trajectory = trajectory_of(jnp.asarray(STEP * np.arange(4), float), poses)
+    write_parts(run / "parts.npz", scene, trajectory, 2)
+    shown = opened(run)
+    drawer = shown.labels == 1
+    x, y, z = np.asarray(scene.gaussians.means)[np.asarray(scene.labels) == 1].mean(axis=0)
+    for gaussians, by in ((shown.gaussians, -0.2), (shown.at(0), -0.2), (shown.at(2), 0.0)):
+        found = np.asarray(gaussians.means)[drawer].mean(axis=0)
+        np.testing.assert_allclose(found, [x + by, y, z], atol=1e-5)
 
 
 def test_what_is_offered(run):
