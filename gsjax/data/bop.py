@@ -61,8 +61,8 @@ def read_bop(path: str | Path, *, world: str | None = None, depth_unit_m: float 
 
     Masks have labels 1, 2, ..., in order of object numbers; an instance keeps its label from frame to frame,
     and `names_of_labels` names it by its model's file. The truth has the poses of those instances that are
-    annotated in all frames; the others keep their masks, and a DataWarning counts them. Frames without an
-    image, depth, annotations or a pose of the camera are left out, with a DataWarning that counts them.
+    annotated in all frames; the others keep their masks, and a DataWarning counts them. Frames without a
+    camera, its pose, an image, depth or annotations are left out, with a DataWarning that counts them.
 
     Args:
         path: the folder.
@@ -83,8 +83,9 @@ def read_bop(path: str | Path, *, world: str | None = None, depth_unit_m: float 
     instances = _by_frame(root / POSES, _instances) if annotated else {}
     _check(root / POSES, {n: [i.pose for i in some] for n, some in instances.items()}, "Correct that entry.")
     viewmats = _viewmats(root, views, instances, world)
-    complete = {"an image": images, "depth": depths or None, "annotations": instances if annotated else None}
-    numbers = _complete_frames(root, views, complete | {"a pose of the camera": viewmats})
+    parts = {"a camera": views, "an image": images, "depth": depths or None}
+    parts |= {"annotations": instances if annotated else None, "a pose of the camera": viewmats}
+    numbers = _complete_frames(root, sorted(views.keys() | images.keys()), parts)
     followed = _Followed.over([instances.get(n, []) for n in numbers], [viewmats[n] for n in numbers])
     Ks = np.stack([views[n].K for n in numbers])[:, None]
     check_intrinsics(Ks, lambda t, _: f"frame {numbers[t]} in {root / CAMERAS}")
@@ -153,6 +154,8 @@ def _by_frame(path: Path, parse: Callable[[Any], Any]) -> dict[int, Any]:
     try:
         frames = {}
         for key in described:
+            if int(key) in frames:
+                raise ValueError(f"a second entry of frame {int(key)}")
             frames[int(key)] = parse(described[key])
     except (AttributeError, TypeError, KeyError, IndexError, ValueError, OverflowError) as error:
         expected = "entries of this layout, by frame number"
@@ -219,20 +222,20 @@ def _viewmats(
     return known
 
 
-def _complete_frames(root: Path, views: dict[int, _View], parts: dict[str, dict | None]) -> list[int]:
+def _complete_frames(root: Path, frames: list[int], parts: dict[str, dict | None]) -> list[int]:
     """Numbers of the frames that have all parts, of those that the data has at all."""
-    numbers, left_out = sorted(views), []
+    numbers, left_out = frames, []
     for what, known in parts.items():
         lacking = [] if known is None else [n for n in numbers if n not in known]
         numbers = [n for n in numbers if n not in set(lacking)]
         if lacking:
             left_out.append(f"{len(lacking)} without {what} ({shortened(f'{n:06d}' for n in lacking)})")
     if not numbers:
-        found = f"none of {len(views)}: {', '.join(left_out)}" if left_out else "none"
+        found = f"none of {len(frames)}: {', '.join(left_out)}" if left_out else "none"
         raise DataError(root, "frames with image, depth, annotations and camera", found, _COMPLETE)
     if left_out:
-        count = len(views) - len(numbers)
-        message = f"{root}: {count} of {len(views)} frames are left out: {', '.join(left_out)}"
+        count = len(frames) - len(numbers)
+        message = f"{root}: {count} of {len(frames)} frames are left out: {', '.join(left_out)}"
         warnings.warn(message, DataWarning, stacklevel=3)
     return numbers
 

@@ -5,8 +5,10 @@ or one intensity (laser scanners). Integers are relative to the largest value of
 where some are larger, to 255; alpha and all else is ignored.
 """
 
+import re
 import warnings
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +16,7 @@ from jaxtyping import Float, Shaped
 
 from gsjax.data.errors import DataError, DataWarning
 from gsjax.data.photographs import Cloud
+from gsjax.data.text import decoded, fields
 from gsjax.geometry.spherical_harmonics import SH_C0
 from gsjax.io.arrays import load_arrays
 
@@ -33,6 +36,7 @@ _COLORS = (
 )
 _OVERSHOOT = 1.5  # floats from 0 to 1 may end a little above 1
 _TEXT = (".xyz", ".txt", ".pts", ".csv", ".asc", ".xyzrgb")
+_UNITS = re.compile(r"\(.*?\)|\[.*?\]")
 _COMPRESSED = "binary_compressed"
 
 Columns = Mapping[str, Shaped[np.ndarray, "points"]]
@@ -112,17 +116,46 @@ def _read_npy(path: Path) -> Columns:
 
 
 def _read_text(path: Path) -> Columns:
-    """Columns of numbers; lines that do not begin with a number, and one that counts the points, are
-    skipped."""
-    lines = path.read_text(encoding="utf-8-sig", errors="replace").replace(",", " ").replace(";", " ")
-    rows = [row for line in lines.splitlines() if (row := line.split()) and _is_number(row[0])]
-    return _of_table(np.array(rows[1:] if rows and len(rows[0]) == 1 else rows, np.float64))
+    """Columns of numbers, by the names in the line above them if it names x, y and z, else by their order.
+    Other lines that do not begin with a number, and one that counts the points, are skipped."""
+    lines = decoded(path.read_bytes()).split("\n")
+    first = next((i for i, line in enumerate(lines) if _is_row(fields(line))), len(lines))
+    header = next((line for line in reversed(lines[:first]) if line.strip()), "")
+    if first < len(lines) and len(fields(lines[first])) == 1:
+        first += 1
+    table, names = _numbers(lines[first:]), _names(header)
+    if not {*"xyz"} <= set(names):
+        return _of_table(table)
+    if len(names) != table.shape[1]:
+        raise ValueError(f"a header of {len(names)} names above rows of {table.shape[1]} numbers")
+    return dict(zip(names, table.T, strict=True))
 
 
-def _is_number(word: str) -> bool:
+def _names(header: str) -> list[str]:
+    """The columns' names in lower case, without the mark of a comment and without units in brackets."""
+    return fields(_UNITS.sub("", header).lstrip("#/% \t").lower())
+
+
+def _numbers(lines: list[str]) -> Float[np.ndarray, "points columns"]:
+    """Raises ValueError if there is no row, or rows have words or are of several lengths."""
+    top = next((line for line in lines if line.strip()), "")
+    if top:
+        with suppress(ValueError):  # plain rows, as `fields` would read them, but much faster
+            return np.loadtxt(lines, delimiter="," if "," in top else None, comments=None, ndmin=2)
+    rows = [row for line in lines if _is_row(row := fields(line))]
+    if not rows:
+        raise ValueError("no row of numbers")
+    odd = next((row for row in rows if len(row) != len(rows[0])), None)
+    if odd is not None:
+        raise ValueError(f"rows of {len(rows[0])} numbers, and of {len(odd)}: {' '.join(odd)}")
+    return np.array(rows, np.float64)
+
+
+def _is_row(words: list[str]) -> bool:
+    """Whether a line begins with a number."""
     try:
-        float(word)
-    except ValueError:
+        float(words[0])
+    except (ValueError, IndexError):
         return False
     return True
 
@@ -131,7 +164,7 @@ def _of_table(table: Shaped[np.ndarray, "points columns"]) -> Columns:
     """Columns without names: x y z, then an intensity if one or four follow, then r g b; normals, which have
     negative values, are no colours."""
     if table.ndim != 2 or table.shape[1] < 3 or table.dtype.kind not in "fiu":
-        raise ValueError(f"shape {table.shape} of {table.dtype}")
+        raise ValueError(f"an array of shape {table.shape} and type {table.dtype}")
     columns = dict(zip("xyz", table.T, strict=False))
     rest = table[:, 3:]
     if rest.shape[1] in (1, 4):

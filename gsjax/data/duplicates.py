@@ -47,6 +47,8 @@ def _chosen(group: np.ndarray, photographs: Photographs) -> int:
 
 def _pairs(photographs: Photographs) -> Iterator[tuple[int, int]]:
     """Pairs of photographs (the first one first) that are one."""
+    centers = np.linalg.inv(photographs.viewmats)[:, :3, 3]
+    far = _NEAR * np.median(np.linalg.norm(centers - np.median(centers, axis=0), axis=1))
     files: dict[tuple[int, int], int] = {}
     by_size: dict[int, list[int]] = {}
     paths = [Path(photographs.where("image", i)) for i in range(photographs.num)]
@@ -59,23 +61,25 @@ def _pairs(photographs: Photographs) -> Iterator[tuple[int, int]]:
             yield first, i
         else:
             by_size.setdefault(found.st_size, []).append(i)
-    for group in by_size.values():
-        alike = _from_one_place(photographs, np.array(group)) if len(group) > 1 else np.zeros((1, 1), bool)
-        digests = {
-            k: blake2b(paths[group[k]].read_bytes()).digest()
-            for k in np.flatnonzero((alike | alike.T).any(0))
-        }
-        yield from ((group[i], group[j]) for i, j in np.argwhere(alike) if digests[i] == digests[j])
+    for alike in (group for group in by_size.values() if len(group) > 1):
+        by_content: dict[bytes, list[int]] = {}
+        for i in alike:
+            by_content.setdefault(blake2b(paths[i].read_bytes()).digest(), []).append(i)
+        for group in by_content.values():
+            for k, first in enumerate(group[:-1]):
+                rest = np.array(group[k + 1 :])
+                yield from ((first, int(i)) for i in rest[_near(photographs, first, rest, far)])
 
 
-def _from_one_place(photographs: Photographs, group: Int[np.ndarray, "n"]) -> Bool[np.ndarray, "n n"]:
-    """Which photographs of a group were taken at almost the same place, in almost the same direction and at
-    the same time as a later one."""
-    everywhere = np.linalg.inv(photographs.viewmats)[:, :3, 3]
-    spread = np.median(np.linalg.norm(everywhere - np.median(everywhere, axis=0), axis=1))
-    centers, turns = everywhere[group], photographs.viewmats[group, :3, :3]
-    near = np.linalg.norm(centers[:, None] - centers, axis=-1) <= _NEAR * spread
-    near &= np.einsum("aij,bij->ab", turns, turns) >= 1 + 2 * np.cos(_NEAR_ANGLE)  # the trace of a rotation
+def _near(
+    photographs: Photographs, first: int, rest: Int[np.ndarray, "n"], far: float
+) -> Bool[np.ndarray, "n"]:
+    """Which of the rest were taken within a distance of the first one, in almost the same direction and at
+    the same time."""
+    poses = np.linalg.inv(photographs.viewmats[[first, *rest]])
+    near = np.linalg.norm(poses[1:, :3, 3] - poses[0, :3, 3], axis=1) <= far
+    turns = np.einsum("nij,ij->n", poses[1:, :3, :3], poses[0, :3, :3])
+    near &= turns >= 1 + 2 * np.cos(_NEAR_ANGLE)  # the trace of a rotation
     if photographs.times is not None:
-        near &= photographs.times[group][:, None] == photographs.times[group]
-    return np.triu(near, 1)
+        near &= photographs.times[rest] == photographs.times[first]
+    return near

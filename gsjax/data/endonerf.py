@@ -88,9 +88,7 @@ def read_endonerf(
     _expect_options(depth_unit_m, pose_unit_m, baseline_m, depth_percentiles)
     root = Path(path)
     # Relative to no origin until the unit is known.
-    rows = inspect.unwrap(poses_bounds.read_llff)(
-        root, axes, images
-    )  # with no origin until the unit is known
+    rows = inspect.unwrap(poses_bounds.read_llff)(root, axes, images)
     frames = pictures(root / images)
     width, height = check_one_size(frames)
     meta = _read_meta(root)

@@ -53,9 +53,18 @@ def numbered(folder: Path, suffixes: tuple[str, ...] = SUFFIXES) -> dict[int, Pa
     Args:
         folder: the folder.
         suffixes: extensions, in lower case.
+
+    Raises:
+        DataError: two pictures have one number.
     """
-    files = folder.iterdir() if folder.is_dir() else ()
-    return {int(f.stem): f for f in files if f.suffix.lower() in suffixes and f.stem.isdecimal()}
+    found: dict[int, Path] = {}
+    for path in sorted(folder.iterdir()) if folder.is_dir() else ():
+        if path.suffix.lower() in suffixes and path.stem.isdecimal():
+            first = found.setdefault(int(path.stem), path)
+            if first != path:
+                names = f"{first.name} and {path.name}"
+                raise DataError(folder, "one picture of each number", names, "Remove one of them.")
+    return found
 
 
 def frame_numbers(frames: list[Path]) -> tuple[int, ...]:

@@ -3,7 +3,8 @@
 import numpy as np
 from jaxtyping import Float
 
-_FINEST = 16  # parts of a pixel a side: what memory allows, and more than cameras beside each other need
+_FINEST = 16  # parts of a pixel a side: more than cameras beside each other need
+_AT_ONCE = 2**20  # points: about 100 MB
 
 
 def registered(
@@ -29,16 +30,21 @@ def registered(
     """
     ratios = (other_K[i, i] / K[i, i] for i in (0, 1))
     finer = [int(np.clip(np.ceil(ratio - 1e-9), 1, _FINEST)) for ratio in ratios]
-    fine = depth.repeat(finer[1], axis=0).repeat(finer[0], axis=1)
-    rows, columns = np.nonzero(fine)
-    z = fine[rows, columns]
-    rays = [((np.arange(n) + 0.5) / finer[i] - K[i, 2]) / K[i, i] for i, n in enumerate(fine.shape[::-1])]
-    local = np.stack([rays[0][columns] * z, rays[1][rows] * z, z])
-    there = to_other[:3, :3] @ local + to_other[:3, 3:]
-    there = there[:, there[2] > 0]
-    column, row = (np.floor(other_K[i, i] * there[i] / there[2] + other_K[i, 2]) for i in (0, 1))
-    inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
-    pixels = (row[inside] * width + column[inside]).astype(int)
     nearest = np.full(height * width, np.inf, np.float32)
-    np.minimum.at(nearest, pixels, there[2, inside].astype(np.float32))
+    across = (np.arange(depth.shape[1] * finer[0]) + 0.5) / finer[0]
+    down = (np.arange(depth.shape[0] * finer[1]) + 0.5) / finer[1]
+    band = max(1, _AT_ONCE // max(1, len(across)))
+    for start in range(0, len(down), band):  # of rows, for their points take far more memory than they do
+        y = down[start : start + band]
+        fine = depth[y.astype(int)].repeat(finer[0], axis=1)
+        rows, columns = np.nonzero(fine)
+        z = fine[rows, columns]
+        rays = [(places - K[i, 2]) / K[i, i] for i, places in enumerate((across, y))]
+        local = np.stack([rays[0][columns] * z, rays[1][rows] * z, z])
+        there = to_other[:3, :3] @ local + to_other[:3, 3:]
+        there = there[:, there[2] > 0]
+        column, row = (np.floor(other_K[i, i] * there[i] / there[2] + other_K[i, 2]) for i in (0, 1))
+        inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+        pixels = (row[inside] * width + column[inside]).astype(int)
+        np.minimum.at(nearest, pixels, there[2, inside].astype(np.float32))
     return np.where(np.isfinite(nearest), nearest, np.float32(0)).reshape(height, width)

@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from gsjax.data.errors import DataError, DataWarning
+from gsjax.data.errors import DataError, DataWarning, shortened
 from gsjax.data.files import image_size, read_depth, read_image, read_text
 from gsjax.data.lens import intrinsics_matrix
 from gsjax.data.names import find_file
@@ -134,8 +134,8 @@ def _read_frames(root: Path) -> tuple[list[int], Float[np.ndarray, "t 4 4"], lis
             images.append(image)
             depths.append(depth)
     left_out = [
-        f"{len(stems)} {what} ({', '.join(stems[:3])}{', ...' if len(stems) > 3 else ''})"
-        for stems, what in ((lost, "without a finite pose"), (missing, "without an image"))
+        f"{len(stems)} {what} ({shortened(stems)})"
+        for stems, what in ((lost, "without a finite pose"), (missing, "without colour or depth"))
         if stems
     ]
     if not numbers:

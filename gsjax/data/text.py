@@ -14,6 +14,10 @@ _MARKS = {
 }
 _LINE_ENDS = re.compile(r"\r+\n|\r")
 _SEPARATORS = re.compile(r"[\s,;]+")
+_QUOTED = re.compile(r'"[^"]*"')
+_DECIMAL_COMMA = re.compile(r"(?<=\d),(?=\d)")
+_NUMBER = r"[-+]?\d+(?:,\d+)?(?:[eE][-+]?\d+)?"
+_DECIMAL_LINE = re.compile(rf"\s*{_NUMBER}(?:\s+{_NUMBER})+\s*")
 
 
 def decoded(content: bytes) -> str:
@@ -27,7 +31,7 @@ def decoded(content: bytes) -> str:
     text = content.decode(marked) if marked else _guessed(content)
     if "\0" in text:
         raise ValueError("zero bytes")
-    return _LINE_ENDS.sub("\n", text)
+    return _LINE_ENDS.sub("\n", text) if "\r" in text else text  # most have none, and the search is slow
 
 
 def _guessed(content: bytes) -> str:
@@ -45,8 +49,16 @@ def _unmarked(content: bytes) -> list[str]:
 
 
 def fields(line: str) -> list[str]:
-    """The fields of a line, separated by spaces, tabs, commas or semicolons, without quotes. In a line with
-    semicolons, commas are decimal marks."""
-    if ";" in line:
+    """The fields of a line, separated by spaces, tabs, commas or semicolons, without quotes.
+
+    Commas are decimal marks in a line with semicolons, within quotes, and between numbers separated by spaces
+    or tabs of which none has two.
+
+    Args:
+        line: a line of text.
+    """
+    if ";" in line or ("," in line and _DECIMAL_LINE.fullmatch(line)):
         line = line.replace(",", ".")
+    elif '"' in line:
+        line = _QUOTED.sub(lambda match: _DECIMAL_COMMA.sub(".", match[0]), line)
     return [field.strip("\"'") for field in _SEPARATORS.split(line.strip()) if field]

@@ -132,6 +132,28 @@ def test_frames_that_lack_something_are_counted(folder):
         read_bop(folder.root)
 
 
+def test_pictures_without_a_camera_are_counted(folder):
+    folder.change("scene_camera.json", lambda cameras: cameras.pop("1"))
+    with pytest.warns(DataWarning, match=r"1 of 3 frames are left out: 1 without a camera \(000001\)"):
+        assert read_bop(folder.root).frame_ids == (0, 2)
+    folder.change("scene_camera.json", lambda cameras: cameras.clear())
+    with pytest.raises(DataError, match=r"found none of 3: 3 without a camera"):
+        read_bop(folder.root)
+
+
+@pytest.mark.parametrize("name", ["scene_camera.json", "scene_gt.json"])
+def test_frames_that_a_file_has_twice_are_refused(folder, name):
+    folder.change(name, lambda entries: entries.update({"01": entries["1"]}))
+    with pytest.raises(DataError, match=rf"{name}: .* a second entry of frame 1\) in '01'"):
+        read_bop(folder.root)
+
+
+def test_pictures_of_one_number_are_refused(folder):
+    (folder.root / "rgb/1.png").write_bytes((folder.root / "rgb/000001.png").read_bytes())
+    with pytest.raises(DataError, match=r"rgb: expected one picture of each number, found 000001.png and 1"):
+        read_bop(folder.root)
+
+
 def test_masks_that_do_not_exist_are_counted(folder):
     (folder.root / "mask_visib/000001_000003.png").unlink()
     for i in range(4):

@@ -135,6 +135,43 @@ def test_points_in_other_files(tmp_path, name, content):
     np.testing.assert_allclose(cloud.colors, BYTES / 255, atol=1e-6)
 
 
+def with_commas(text):
+    return text.replace(".", ",")
+
+
+DECIMAL = np.array([[1.5, 2.5, 3.5], [4.5, 5.5, 6.0]])
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        with_commas(lines_of(DECIMAL, ";")),
+        with_commas(lines_of(DECIMAL, " ")),
+        with_commas(lines_of(DECIMAL, "\t")),
+        "x;y;z\n" + with_commas(lines_of(DECIMAL, "; ")),
+        '"1,5","2,5","3,5"\n"4,5","5,5","6"\n',
+        '"x","y","z"\n"1.5","2.5","3.5"\n"4.5","5.5","6"\n',
+        "id,x,y,z\n1,1.5,2.5,3.5\n2,4.5,5.5,6\n",
+        "// z y x\n3.5 2.5 1.5\n6 5.5 4.5\n",
+        "X [m], Y [m], Z [m], Error (px)\n1.5, 2.5, 3.5, 9\n4.5, 5.5, 6, 9\n",
+        lines_of(DECIMAL).encode("utf-16"),
+        "# a scan of the house\n1.5 2.5 3.5\n# a comment\n4.5 5.5 6\n",
+        lines_of(DECIMAL).replace("\n", "\r\n"),
+    ],
+)
+def test_text_of_any_system(tmp_path, content):
+    (tmp_path / "a.csv").write_bytes(content if isinstance(content, bytes) else content.encode())
+    cloud = read_cloud(tmp_path / "a.csv")
+    np.testing.assert_allclose(cloud.points, DECIMAL)
+    assert (cloud.colors == 0.5).all()
+
+
+def test_colours_by_the_names_in_a_header(tmp_path):
+    rows = np.concatenate([POINTS, NORMALS, BYTES[:, ::-1]], axis=1)
+    (tmp_path / "a.txt").write_text("X;Y;Z;NX;NY;NZ;B;G;R\n" + lines_of(rows, ";"))
+    np.testing.assert_allclose(read_cloud(tmp_path / "a.txt").colors, BYTES / 255)
+
+
 def test_files_without_colours_are_grey(tmp_path):
     (tmp_path / "a.xyz").write_text(lines_of(np.concatenate([POINTS, NORMALS], axis=1)))
     np.save(tmp_path / "a.npy", POINTS)
@@ -147,7 +184,11 @@ def test_files_without_colours_are_grey(tmp_path):
     [
         ("a.xyz", "", "lines of text with x, y, z"),
         ("a.xyz", "1 2\n", "lines of text with x, y, z"),
-        ("a.xyz", "1 2 3\n4 5\n", "lines of text with x, y, z"),
+        ("a.xyz", "1 2 3\n4 5\n", r"something else \(rows of 3 numbers, and of 2: 4 5\)"),
+        ("a.xyz", "9\n  \n", "no row of numbers"),
+        ("a.xyz", "1 2 3 tree\n", "could not convert string to float: 'tree'"),
+        ("a.csv", "id,x,y,z,label\n1,1,2,3,\n", "a header of 5 names above rows of 4 numbers"),
+        ("a.xyz", b"\0\0\0", "zero bytes"),
         ("a.npy", "no array", "an array with x, y, z"),
         ("a.npy", npy(np.array([{}])), "an array with x, y, z"),
         ("a.npy", npy(np.zeros(3)), "an array with x, y, z"),

@@ -3,12 +3,14 @@
 import json
 import os
 import shutil
+import tracemalloc
 import warnings
 
 import numpy as np
 import pytest
 
-from gsjax.data import DataWarning, open_photographs
+from gsjax.data import DataWarning, Photographs, open_photographs
+from gsjax.data.duplicates import without_duplicates
 from tests.data import dots
 from tests.data.faulty import moved, picture
 
@@ -82,6 +84,27 @@ def test_equal_pictures_from_other_places_or_times_are_kept(folder):
             frame |= {"time": i / COUNT, "transform_matrix": np.eye(4).tolist()}
         (folder / "transforms.json").write_text(json.dumps(frames))
         assert open_photographs(folder).num == COUNT
+
+
+def test_memory_grows_with_the_number_of_photographs(tmp_path):
+    """Files of one size, as cameras without compression write them."""
+    num = 1500
+    for i in range(num):
+        (tmp_path / f"{i}").write_bytes(i.to_bytes(4, "little"))
+    scene = Photographs(
+        name="many",
+        names=tuple(map(str, range(num))),
+        sizes=np.full((num, 2), 8),
+        Ks=np.tile(np.eye(3), (num, 1, 1)),
+        viewmats=np.tile(np.eye(4), (num, 1, 1)),
+        load_image=lambda i: picture(i),
+        locate=lambda kind, i: str(tmp_path / f"{i}"),
+    )
+    tracemalloc.start()
+    assert without_duplicates(scene) is scene
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 8 * num**2
 
 
 def test_other_layouts(folder):

@@ -109,7 +109,7 @@ def test_frames_without_a_pose_are_counted_and_left_out(folder, number):
 def test_frames_without_an_image_are_counted_and_left_out(folder):
     (folder / "frame-000000.depth.png").unlink()
     (folder / "frame-000005.color.png").unlink()
-    with pytest.warns(DataWarning, match="2 of 4 frames are left out: 2 without an image"):
+    with pytest.warns(DataWarning, match="2 of 4 frames are left out: 2 without colour or depth"):
         sequence = read_seven_scenes(folder)
     assert sequence.frame_ids == (1, 2)
     for file in folder.glob("*.depth.png"):
