@@ -81,8 +81,8 @@ def measure(scene: Gaussians, judge: Judge, folder: Path) -> dict[str, dict]:
         folder: an empty folder.
     """
     programs = [program for program in CONVERTERS.values() if program.installed]
-    plain = folder / "scene.ply"
-    rows = {}
+    plain, rows = folder / "plain.ply", {}
+    write_gaussians(plain, scene)
     for ending in FORMATS:
         file, begun = folder / f"scene{ending}", perf_counter()
         write_gaussians(file, scene)

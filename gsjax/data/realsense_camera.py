@@ -79,14 +79,14 @@ def open_realsense(index: int, viewmat: Float[np.ndarray, "4 4"] | None = None) 
         MissingExtra: pyrealsense2 is not installed.
     """
     rs = extras.load("pyrealsense2", "realsense", f"realsense:{index}")
-    devices = list(rs.context().query_devices())
     what, advice = (
         f"realsense:{index}",
         "Connect it, close other programs that use it, or replay a recording.",
     )
-    if index >= len(devices):
-        raise DataError(what, "a RealSense camera", f"{len(devices)} that are connected", advice)
     try:
+        devices = list(rs.context().query_devices())
+        if index >= len(devices):
+            raise DataError(what, "a RealSense camera", f"{len(devices)} that are connected", advice)
         capture = RealSenseCapture(rs, devices[index].get_info(rs.camera_info.serial_number))
     except RuntimeError as error:
         raise DataError(what, "a RealSense camera", f"one that does not start ({error})", advice) from None

@@ -171,10 +171,12 @@ def reopen(
     try:
         wanted = also(settings)
         read = read_options(settings.get("read") or {})
-        scale = float(settings.get("scale", 1.0))
+        scale = settings.get("scale", 1.0)
+        if not isinstance(scale, int | float):
+            raise TypeError(f"scale: {scale!r}")
         dataset, cameras, frames = (settings[name] for name in _SETTINGS)
         held_out = settings.get("eval_cameras") or ()  # which not all commands have
-        return open_recording(dataset, cameras, held_out, frames, read, scale, opened), wanted
+        return open_recording(dataset, cameras, held_out, frames, read, float(scale), opened), wanted
     except (KeyError, TypeError, AttributeError) as error:
         listed = ", ".join(_SETTINGS)
         raise ValueError(f"{config}: expected a run's settings ({listed}), found others; {again}") from error

@@ -22,6 +22,8 @@ from contextvars import ContextVar
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
+from gsjax.io.parsed import parse_json
+
 try:
     import fcntl
 except ImportError:  # Windows: the list of writers decides
@@ -61,7 +63,7 @@ class Writer:
             return True
         try:
             os.kill(self.pid, 0)
-        except ProcessLookupError:
+        except (ProcessLookupError, OverflowError):
             return False
         except OSError:  # it is another user's
             pass
@@ -126,7 +128,11 @@ def locked(folder: Path, part: str = "", *, shared: bool = False) -> Iterator[No
         held = _taken(folder, path, shared)
     elif held.writer.shared and not shared:
         alone = replace(held.writer, shared=False)
-        _acquire(held.file, folder, path, alone)
+        try:
+            _acquire(held.file, folder, path, alone)
+        except BlockingIOError:
+            _flock(held.file, shared=True)  # a refused exchange has given up the shared lock
+            raise
         _list_writers(held.file, [alone])
         held.writer = alone
     if held is not None:
@@ -226,12 +232,13 @@ def _is_at(file: int, path: Path) -> bool:
 def _others(file: int, writer: Writer) -> list[Writer]:
     """The other writers that an open file lists and that may live; what cannot be read is left out."""
     os.lseek(file, 0, os.SEEK_SET)
-    found = []
+    own, found = (writer.pid, writer.host), []
     for line in os.read(file, _MOST_BYTES).splitlines():
         with suppress(ValueError, TypeError):
-            found.append(Writer(**json.loads(line)))
-    own = (writer.pid, writer.host)
-    return [other for other in found if (other.pid, other.host) != own and other.may_live]
+            other = Writer(**parse_json(line))
+            if type(other.pid) is int and (other.pid, other.host) != own and other.may_live:
+                found.append(other)
+    return found
 
 
 def _list_writers(file: int, writers: list[Writer]) -> None:

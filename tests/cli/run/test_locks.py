@@ -1,5 +1,6 @@
 """One writer at a time in a folder, whatever becomes of it."""
 
+import fcntl
 import json
 import os
 import signal
@@ -45,7 +46,12 @@ def test_what_a_dead_writer_left_is_taken_over(tmp_path, written, number):
 
 @pytest.mark.parametrize(
     "left",
-    ["", "{", "[1]\n", '{"pid": "x"}', json.dumps({"pid": 1, "host": socket.gethostname()}), "\0" * 99],
+    [
+        *("", "{", "[1]\n", '{"pid": "x"}', '{"pid": 1.5}', '{"pid": 1' + "0" * 22 + "}", "[" * 50_000),
+        json.dumps({"pid": 1, "host": socket.gethostname()}),
+        "\0" * 99,
+    ],
+    ids=range(9),
 )
 def test_what_the_file_says_locks_nothing(tmp_path, left):
     """Another process may have the number by now: the first one of the machine is always there."""
@@ -65,6 +71,17 @@ def test_some_share_what_another_must_not_replace(tmp_path, written):
     assert f"process {alone.pid}" in refusal(tmp_path, shared=True)
     alone.communicate("")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_who_is_refused_a_folder_alone_still_shares_it(tmp_path, written):
+    other = written(tmp_path, shared=True)
+    with locked(tmp_path, shared=True):
+        assert f"process {other.pid}" in refusal(tmp_path)
+        other.communicate("")
+        third = os.open(tmp_path / LOCK, os.O_RDWR)
+        with pytest.raises(BlockingIOError):
+            fcntl.flock(third, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        os.close(third)
 
 
 def test_parts_of_a_folder_are_locked_apart(tmp_path, written):
