@@ -16,6 +16,7 @@ from gsjax.engine.messages import Notes, reason, stage
 from gsjax.engine.options import Common
 from gsjax.engine.recording import parse_frames
 from gsjax.engine.viewables import UP, Up, open_viewable
+from gsjax.io.labels import labels_beside
 from gsjax.io.page import Film
 from gsjax.io.scene_file import spatial_order
 from gsjax.io.scenes import FORMATS, Format, format_of, write_gaussians
@@ -72,6 +73,7 @@ def run(options: Options) -> int:
             scene, _ = open_viewable(options.path, notes)
         rows = _chosen(options.frames, scene.num_frames)
         look: dict[str, Any] = {"antialiased": scene.antialiased, "origin": scene.origin}
+        look["labels"] = None if scene.labels is None else np.asarray(scene.labels)
         if "up" in written.options:
             known = UP["-y"] if _read(options.path) else scene_up(scene)
             look["up"] = (known if options.up == "auto" else UP[options.up]).tolist()
@@ -160,8 +162,11 @@ def _check(options: Options, out: Path) -> None:
         )
     if out.exists() and out.resolve() in _read(options.path):
         raise FileExistsError(f"{out}: expected another file than the one that is read; name another OUT")
-    if out.exists() and not options.overwrite:
-        raise FileExistsError(f"{out}: is there already; name another OUT, or replace it with --overwrite")
+    for file in (out, labels_beside(out)) if "labels" in format_of(out).options else (out,):
+        if file.exists() and not options.overwrite:
+            raise FileExistsError(
+                f"{file}: is there already; name another OUT, or replace it with --overwrite"
+            )
 
 
 def _read(path: Path) -> set[Path]:

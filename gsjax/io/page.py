@@ -2,7 +2,8 @@
 
 It holds the scene as a .splat, so without view-dependent colour, and a viewer (page.html) of a few kB: WebGL
 2, sorted in a worker. Of a scene that moves it also holds, for each frame, what moves: 16 bits for each
-coordinate of places, rotations and, where they change, scales, and for opacities.
+coordinate of places (of logarithms of distances, as in SOG), rotations and, where they change, scales, and
+for opacities.
 """
 
 import base64
@@ -15,7 +16,7 @@ from string import Template
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Float, UInt16
+from jaxtyping import Float, Int, UInt16
 
 from gsjax.io.atomic import atomic_write
 from gsjax.io.scene_file import columns_of
@@ -24,7 +25,9 @@ from gsjax.scene.gaussians import Gaussians, take
 
 _FOCAL = 1.2  # of the height: 45 degrees from top to bottom
 _MOST = 65535
+_MOST_DEFLATED = 400_000_000  # bytes: in base64, the 2^29 characters of Chromium's longest text
 _LEAST_STEP = 1e-3  # seconds that the last frame is shown
+_LEAST_UNIT = 1e-6  # of the distance of the farthest place
 _TEMPLATE = Path(__file__).with_name("page.html")
 
 
@@ -91,39 +94,92 @@ def write_page(
 
 def _packed(film: Film) -> tuple[np.ndarray, dict[str, Any] | None, bytes]:
     """The order in which those of the first Gaussians that move come before those that do not, what the page
-    is told of them, and their values.
+    is told of them, and their values. Frames are asked for one at a time, twice: for ranges, for values.
 
     Raises:
-        ValueError: some frame holds values that are not finite.
+        ValueError: some frame holds values that are not finite, or there are more than a page can hold.
     """
-    rows = np.arange(film.num_moving)
-    values = np.stack([_values(take(film.at(frame), rows)) for frame in range(len(film.times))])
-    if not np.isfinite(values).all():
+    rows, frames = np.arange(film.num_moving), range(len(film.times))
+    low = high = _values(take(film.at(0), rows))
+    for frame in frames[1:]:
+        values = _values(take(film.at(frame), rows))
+        low, high = np.minimum(low, values), np.maximum(high, values)
+    if not (np.isfinite(low).all() and np.isfinite(high).all()):
         raise ValueError("film: expected finite places, rotations and scales in each frame, found others")
-    moves = (values != values[0]).any(axis=(0, 2))
+    moves = (low != high).any(axis=1)
     order = np.argsort(~moves, kind="stable")
-    values = values[:, order[: moves.sum()]]
     if not moves.any():
         return order, None, b""
-    low, high = values[..., :3].min(axis=(0, 1)), values[..., :3].max(axis=(0, 1))
-    span = np.maximum(high - low, np.finfo(np.float32).tiny)
-    scales = values[..., 8:]
-    least, most = float(scales.min()), float(scales.max())
-    fractions = [(values[..., :3] - low) / span, values[..., 3:4], (values[..., 4:8] + 1) / 2]
-    if (scales != scales[0]).any():
-        fractions += [(scales - least) / max(most - least, 1e-6), np.zeros_like(scales[..., :1])]
-    steps = np.round(np.concatenate(fractions, axis=2) * _MOST).astype(np.uint16)
+    rows = order[: moves.sum()]
+    ranges = _ranges(low[rows], high[rows])
+    grows = bool((low[rows, 8:] != high[rows, 8:]).any())
     times = np.asarray(film.times, np.float64) - film.times[0]
     motion = {
         "times": np.round(times, 6).tolist(),
         "step": float(max(np.median(np.diff(times)), _LEAST_STEP)),
-        "moving": int(moves.sum()),
-        "texels": steps.shape[2] // 4,
-        "low": low.tolist(),
-        "span": span.tolist(),
-        "sizes": [least, max(most - least, 1e-6)],
+        "moving": len(rows),
+        "texels": 2 + grows,
+        **{name: value.tolist() for name, value in ranges._asdict().items()},
     }
-    return order, motion, zlib.compress(_differences(steps), 6)
+    return order, motion, _deflated(film, rows, ranges, grows)
+
+
+class _Ranges(NamedTuple):
+    """What steps of 16 bits mean: places x are steps of sign(u) log(1 + |u|), u = (x - middle) / unit, so
+    that a few Gaussians far away do not coarsen the others; steps of the logarithms of scales."""
+
+    middle: Float[np.ndarray, "3"]
+    unit: Float[np.ndarray, ""]
+    low: Float[np.ndarray, "3"]
+    span: Float[np.ndarray, "3"]
+    sizes: Float[np.ndarray, "2"]
+
+
+def _ranges(low: Float[np.ndarray, "M 11"], high: Float[np.ndarray, "M 11"]) -> _Ranges:
+    """Of what moves, from the least and largest values of each Gaussian."""
+    first, last = low[:, :3].astype(np.float64), high[:, :3].astype(np.float64)
+    middle = np.median((first + last) / 2, axis=0)
+    reach = np.linalg.norm(np.maximum(middle - first, last - middle), axis=1)
+    unit = np.asarray(max(np.median(reach), _LEAST_UNIT * reach.max(), np.finfo(np.float32).tiny))
+    least, most = (_logarithms((each - middle) / unit) for each in (first.min(axis=0), last.max(axis=0)))
+    smallest, largest = low[:, 8:].min(), high[:, 8:].max()
+    return _Ranges(
+        middle=middle,
+        unit=unit,
+        low=least,
+        span=np.maximum(most - least, np.finfo(np.float32).tiny),
+        sizes=np.array([smallest, max(largest - smallest, 1e-6)], np.float64),
+    )
+
+
+def _logarithms(values: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
+    return np.sign(values) * np.log1p(np.abs(values))
+
+
+def _deflated(film: Film, rows: Int[np.ndarray, "M"], ranges: _Ranges, grows: bool) -> bytes:
+    """The values of all frames.
+
+    Raises:
+        ValueError: they are more than a page can hold.
+    """
+    packer, packed, size = zlib.compressobj(6), [], 0
+    before = np.zeros((len(rows), 12 if grows else 8), np.uint16)
+    for frame in range(len(film.times)):
+        values = _values(take(film.at(frame), rows)).astype(np.float64)
+        logs = _logarithms((values[:, :3] - ranges.middle) / ranges.unit)
+        fractions = [(logs - ranges.low) / ranges.span, values[:, 3:4], (values[:, 4:8] + 1) / 2]
+        if grows:
+            fractions += [(values[:, 8:] - ranges.sizes[0]) / ranges.sizes[1], np.zeros((len(rows), 1))]
+        steps = np.round(np.concatenate(fractions, axis=1) * _MOST).astype(np.uint16)
+        packed.append(packer.compress(_differences(steps, before)))
+        before, size = steps, size + len(packed[-1])
+        if size > _MOST_DEFLATED:
+            raise ValueError(
+                f"film: expected motion of at most {_MOST_DEFLATED / 1e6:.0f} MB, since browsers hold no "
+                f"longer text, found more in the first {frame + 1} of {len(film.times)} frames; take fewer "
+                "frames (--frames)"
+            )
+    return b"".join([*packed, packer.flush()])
 
 
 def _values(gaussians: Gaussians) -> Float[np.ndarray, "M 11"]:
@@ -132,9 +188,9 @@ def _values(gaussians: Gaussians) -> Float[np.ndarray, "M 11"]:
     return np.column_stack([found.means, found.opacities, found.quats, found.log_scales]).astype(np.float32)
 
 
-def _differences(steps: UInt16[np.ndarray, "T M values"]) -> bytes:
-    """Differences between frames, the first to 0, which deflate shrinks further than the values: their signs
-    in the lowest bit, and for each frame and value the low bytes of all before the high ones."""
-    change = np.diff(steps, axis=0, prepend=np.zeros_like(steps[:1])).astype(np.int16)
-    zigzag = ((change << 1) ^ (change >> 15)).astype(np.uint16).transpose(0, 2, 1)
-    return np.stack([zigzag & 0xFF, zigzag >> 8], axis=2).astype(np.uint8).tobytes()
+def _differences(steps: UInt16[np.ndarray, "M values"], before: UInt16[np.ndarray, "M values"]) -> bytes:
+    """Differences from the frame before, which deflate shrinks further than the values: their signs in the
+    lowest bit, and for each value the low bytes of all before the high ones."""
+    change = (steps - before).astype(np.int16)
+    zigzag = ((change << 1) ^ (change >> 15)).astype(np.uint16).T
+    return np.stack([zigzag & 0xFF, zigzag >> 8], axis=1).astype(np.uint8).tobytes()

@@ -60,8 +60,8 @@ def write_ply(
     Args:
         path: the file.
         gaussians: the Gaussians, on the host or a device.
-        labels: integers [N], written to a file beside it: NAME_labels.npz of NAME.ply. Without labels, such a
-            file of an earlier scene is removed.
+        labels: integers [N], written to a file beside it: NAME_labels.npz of NAME.ply. Without labels, the
+            labels of a PLY that is replaced are removed.
         origin: what means are relative to (`SceneReport.origin`, `Photographs.origin`); it is put back. Where
             float32 would then lose places, x y z are of type double.
         antialiased: say in a comment that the scene is to be drawn antialiased.
@@ -83,11 +83,13 @@ def write_ply(
     for name, column in columns.items():
         vertices[name] = column
     comments, element = [_ANTIALIASED] if antialiased else [], PlyElement.describe(vertices, "vertex")
-    labels_beside(path).unlink(missing_ok=True)  # before the scene, with which they would not fit
+    replaced = Path(path).exists()
     with atomic_write(path) as temporary:
         PlyData([element], byte_order="<", comments=comments).write(str(temporary))
     if labels is not None:
         write_labels(path, labels)
+    elif replaced:
+        labels_beside(path).unlink(missing_ok=True)
 
 
 def _is_lost(columns: dict[str, np.ndarray], origin: Float[np.ndarray, "3"] | None) -> bool:

@@ -16,7 +16,7 @@ from jaxtyping import Float, Int
 from gsjax.io import glb, ksplat, page, ply, sog, splat, spz
 from gsjax.io.compressed_ply import write_compressed_ply
 from gsjax.io.scene_file import SceneError, SceneReport
-from gsjax.scene.gaussians import Gaussians, cull_invalid
+from gsjax.scene.gaussians import Gaussians, take, valid_rows
 from gsjax.scene.origin import in_numbers
 
 Reader = Callable[[Path], tuple[Gaussians, SceneReport]]
@@ -41,7 +41,7 @@ class Format:
 
 FORMATS = {
     ".compressed.ply": Format("PlayCanvas's compressed PLY", write_compressed_ply, options=("order",)),
-    ".ply": Format("PLY of 3DGS", ply.write_ply, options=("antialiased", "origin")),
+    ".ply": Format("PLY of 3DGS", ply.write_ply, options=("labels", "antialiased", "origin")),
     ".splat": Format(".splat", splat.write_splat, degree=0),
     ".spz": Format("SPZ", spz.write_spz, options=("antialiased",)),
     ".sog": Format("SOG", sog.write_sog, options=("antialiased", "order")),
@@ -109,6 +109,7 @@ def write_gaussians(
     path: str | os.PathLike,
     gaussians: Gaussians,
     *,
+    labels: Int[np.ndarray, "labels"] | None = None,
     antialiased: bool = False,
     origin: Float[np.ndarray, "3"] | None = None,
     order: Int[np.ndarray, "N"] | None = None,
@@ -123,6 +124,8 @@ def write_gaussians(
     Args:
         path: a .ply, .compressed.ply, .splat, .spz, .sog, .glb, or .html, a page that shows the scene.
         gaussians: the scene, on the host or a device.
+        labels: one for each Gaussian, [N]. A .ply has them in a file beside it (`write_ply`); others leave
+            them out, which is said unless all are the same.
         antialiased: whether it is to be drawn antialiased, which .ply, .spz, .sog and a page say.
         origin: what means are relative to (`SceneReport.origin`, `Photographs.origin`). A .ply and a .glb
             have room for it, and it is put back; others would round places, which stay relative to it.
@@ -137,10 +140,13 @@ def write_gaussians(
 
     Raises:
         ValueError: no format has that ending, none of the Gaussians can be drawn, the format has no room for
-            them, an option is given that it does not take, or not all Gaussians of a film can be drawn.
+            them, an option is given that it does not take, `labels` are not one for each Gaussian,
+            or not all Gaussians of a film can be drawn.
     """
     written = format_of(path)
-    drawn, culled = cull_invalid(gaussians)
+    valid = valid_rows(gaussians)
+    culled = int(np.sum(~valid))
+    drawn = take(gaussians, np.flatnonzero(valid)) if culled else gaussians
     if drawn.num == 0:
         raise ValueError(f"{path}: expected Gaussians that can be drawn, found none of {gaussians.num}")
     if order is not None and len(order) != drawn.num:
@@ -154,11 +160,20 @@ def write_gaussians(
     if drawn.features is not None:
         left_out.append("features")
         drawn = _without(drawn, "features")
-    asked = {"antialiased": antialiased or None, "origin": origin}
+    if labels is not None:
+        if labels.shape != (gaussians.num,):
+            raise ValueError(
+                f"labels: expected one for each of {gaussians.num} Gaussians, found an array of shape "
+                f"{labels.shape}"
+            )
+        labels = labels[valid]
+        if "labels" not in written.options and len(np.unique(labels)) == 1:
+            labels = None
+    asked = {"labels": labels, "antialiased": antialiased or None, "origin": origin}
     asked |= {"up": up, "background": background, "film": film}
     asked |= {"order": order} if "order" in written.options else {}
     options = {name: value for name, value in asked.items() if value is not None}
-    no_room = {"antialiased": "that the scene is antialiased"}
+    no_room = {"labels": "labels", "antialiased": "that the scene is antialiased"}
     if origin is not None:
         no_room["origin"] = f"the origin {in_numbers(origin)}, to which its places are relative"
     for name in [name for name in options if name not in written.options]:

@@ -72,22 +72,33 @@ def film_of(scene, *, scales: bool) -> Film:
     return Film(at, np.array([5.0, 5.5, 1005.0]), scene.num - 10)
 
 
+def motion_in(page):
+    """What a page is told of its motion, and its steps, [T,M,values]."""
+    text = page.read_text()
+    motion = json.loads(re.search(r"const about = (\{.*\});", text)[1])["motion"]
+    packed = zlib.decompress(base64.b64decode(re.search(r'id="motion" type="text/plain">([^<]*)<', text)[1]))
+    frames, moving = len(motion["times"]), motion["moving"]
+    planes = np.frombuffer(packed, np.uint8).reshape(frames, -1, 2, moving).astype(np.int64)
+    zigzag = planes[:, :, 0] + 256 * planes[:, :, 1]
+    steps = np.cumsum(np.where(zigzag % 2, -(zigzag + 1) // 2, zigzag // 2), axis=0) % 65536
+    return motion, steps.transpose(0, 2, 1)
+
+
+def places_of(motion, steps):
+    logs = motion["low"] + motion["span"] * (steps[:, :3] / 65535)
+    return motion["middle"] + motion["unit"] * np.sign(logs) * np.expm1(np.abs(logs))
+
+
 @pytest.mark.parametrize("scales", [False, True])
 def test_it_holds_what_moves_to_16_bits(tmp_path, scales):
     scene = flat(make_scene(50))
     film = film_of(scene, scales=scales)
     assert write_gaussians(tmp_path / "scene.html", scene, film=film) == ()
-    text = (tmp_path / "scene.html").read_text()
-    motion = json.loads(re.search(r"const about = (\{.*\});", text)[1])["motion"]
+    motion, steps = motion_in(tmp_path / "scene.html")
     assert (motion["times"], motion["moving"], motion["texels"]) == ([0, 0.5, 1000], 30, 2 + scales)
-    packed = zlib.decompress(base64.b64decode(re.search(r'id="motion" type="text/plain">([^<]*)<', text)[1]))
-    planes = np.frombuffer(packed, np.uint8).reshape(3, -1, 2, 30).astype(np.int64)
-    zigzag = planes[:, :, 0] + 256 * planes[:, :, 1]
-    steps = np.cumsum(np.where(zigzag % 2, -(zigzag + 1) // 2, zigzag // 2), axis=0) % 65536
     for frame in range(3):
-        wanted, found = columns_of(film.at(frame)), steps[frame].T / 65535
-        means = motion["low"] + motion["span"] * found[:, :3]
-        np.testing.assert_allclose(means, wanted.means[:30], atol=np.max(motion["span"]) / 65535)
+        wanted, found = columns_of(film.at(frame)), steps[frame] / 65535
+        np.testing.assert_allclose(places_of(motion, steps[frame]), wanted.means[:30], atol=2e-4)
         np.testing.assert_allclose(found[:, 3], wanted.opacities[:30], atol=1e-5)
         np.testing.assert_allclose(2 * found[:, 4:8] - 1, wanted.quats[:30], atol=2e-5)
         if scales:
@@ -95,12 +106,46 @@ def test_it_holds_what_moves_to_16_bits(tmp_path, scales):
             np.testing.assert_allclose(sizes, wanted.log_scales[:30], atol=2e-4)
 
 
-def test_what_cannot_be_played_is_refused(tmp_path):
+@pytest.mark.parametrize("size", [1e-3, 1.0, 1e3])
+def test_one_gaussian_far_away_does_not_coarsen_the_others(tmp_path, size):
+    """Steps of places are small beside Gaussians of 0.7 % of the scene, whatever its unit."""
+    scene = flat(make_scene(50))
+    scene = eqx.tree_at(lambda g: g.means, scene, size * scene.means.at[0].set(jnp.array([2000.0, 0, 0])))
+    shift = size * jnp.array([0.01, 0, 0])
+    film = Film(
+        lambda t: eqx.tree_at(lambda g: g.means, scene, scene.means + t * shift), np.arange(3.0), scene.num
+    )
+    write_gaussians(tmp_path / "scene.html", scene, film=film)
+    motion, steps = motion_in(tmp_path / "scene.html")
+    for frame in range(3):
+        wanted = np.asarray(film.at(frame).means)
+        found = places_of(motion, steps[frame])
+        np.testing.assert_allclose(found[1:], wanted[1:], rtol=0, atol=7e-4 * size)
+        np.testing.assert_allclose(found[0], wanted[0], rtol=3e-4, atol=7e-4 * size)
+
+
+def test_one_gaussian_that_moves(tmp_path):
+    scene = flat(make_scene(5))
+    film = Film(
+        lambda t: eqx.tree_at(lambda g: g.means, scene, scene.means.at[0, 0].add(t)), np.arange(3.0), 1
+    )
+    write_gaussians(tmp_path / "scene.html", scene, film=film)
+    motion, steps = motion_in(tmp_path / "scene.html")
+    for frame in range(3):
+        np.testing.assert_allclose(places_of(motion, steps[frame]), film.at(frame).means[:1], atol=1e-4)
+
+
+def test_what_cannot_be_played_is_refused(tmp_path, monkeypatch):
     scene = make_scene(50)
     film = film_of(scene, scales=False)
     lost = film._replace(at=lambda frame: eqx.tree_at(lambda g: g.means, scene, scene.means / (1 - frame)))
     with pytest.raises(ValueError, match="film: expected finite places, rotations and scales in each frame"):
         write_gaussians(tmp_path / "scene.html", scene, film=lost)
+    monkeypatch.setattr("gsjax.io.page._MOST_DEFLATED", 1)
+    with pytest.raises(
+        ValueError, match=r"film: .* found more in the first \d of 3 frames; take fewer frames"
+    ):
+        write_gaussians(tmp_path / "scene.html", scene, film=film)
     bad = eqx.tree_at(lambda g: g.means, scene, scene.means.at[0].set(jnp.nan))
     with pytest.raises(
         ValueError, match="film: expected Gaussians that can all be drawn, found 1 that cannot"
@@ -130,6 +175,7 @@ def test_a_browser_plays_it(tmp_path):
 @pytest.mark.parametrize(("antialiased", "frame"), [(False, None), (True, None), (False, 2)])
 def test_a_browser_shows_what_the_rasterizer_does(tmp_path, antialiased, frame):
     scene = flat(make_scene(200))
+    scene = eqx.tree_at(lambda g: g.means, scene, scene.means.at[0].set(jnp.array([0, 0, 2000.0])))
     page, picture = tmp_path / "scene.html", tmp_path / "page.png"
     film = None if frame is None else film_of(scene, scales=True)
     write_gaussians(page, scene, antialiased=antialiased, film=film)

@@ -254,6 +254,26 @@ def test_labels_of_an_earlier_scene_go_with_it(tmp_path):
     assert [file.name for file in tmp_path.iterdir()] == ["scene.ply"]
 
 
+def test_labels_beside_no_ply_are_kept(tmp_path):
+    """They belong to nobody whose PLY is replaced."""
+    (tmp_path / "scene_labels.npz").write_bytes(b"mine")
+    write_ply(tmp_path / "scene.ply", random_gaussians(3))
+    assert (tmp_path / "scene_labels.npz").read_bytes() == b"mine"
+
+
+def test_a_write_that_fails_leaves_the_scene_before_with_its_labels(tmp_path, monkeypatch):
+    path = tmp_path / "scene.ply"
+    write_ply(path, random_gaussians(3), labels=np.arange(3))
+
+    def full(*_):
+        raise OSError("no space left")
+
+    monkeypatch.setattr("gsjax.io.atomic.os.replace", full)
+    with pytest.raises(OSError, match="no space left"):
+        write_ply(path, random_gaussians(3, seed=1))
+    np.testing.assert_array_equal(read_ply(path)[1].labels, [0, 1, 2])
+
+
 @pytest.mark.parametrize("content", ["other length", "floats", "not an archive", "pickled"])
 def test_labels_that_do_not_fit_are_left_out_with_a_warning(tmp_path, content):
     path, beside = tmp_path / "scene.ply", tmp_path / "scene_labels.npz"

@@ -75,6 +75,22 @@ def test_antialiasing_is_said(tmp_path, ending):
     assert said == ("that the scene is antialiased",)
 
 
+@pytest.mark.parametrize("ending", READ_BACK)
+def test_labels_are_written_beside_a_ply_and_named_elsewhere(tmp_path, ending):
+    scene, labels = make_scene(5), np.array([3, 1, 0, 0, 2])
+    scene = eqx.tree_at(lambda g: g.means, scene, scene.means.at[2, 1].set(np.nan))
+    left_out = write_gaussians(tmp_path / f"scene{ending}", scene, labels=labels)
+    _, report = read_gaussians(tmp_path / f"scene{ending}")
+    if ending == ".ply":
+        assert left_out == ("what cannot be drawn, 1 of 5 Gaussians",)
+        np.testing.assert_array_equal(report.labels, [3, 1, 0, 2])
+    else:
+        assert left_out == ("what cannot be drawn, 1 of 5 Gaussians", "labels")
+        assert write_gaussians(tmp_path / f"one{ending}", make_scene(5), labels=np.ones(5, int)) == ()
+    with pytest.raises(ValueError, match=r"labels: expected one for each of 5 Gaussians, .* shape \(4,\)"):
+        write_gaussians(tmp_path / f"scene{ending}", scene, labels=np.arange(4))
+
+
 UTM = np.array([500_000.0, 5_000_000.0, 300.0])
 
 

@@ -29,7 +29,9 @@ def test_a_file_in_every_format(export, ply, ending):
     assert f"scene {out}: 30 Gaussians, {FORMATS[ending].name}, " in said
     if ending in ROUNDING:
         assert_alike(some(), read_gaussians(out)[0], ROUNDING[ending])
-    assert [file.name for file in out.parent.iterdir()] == [out.name]
+    names = {out.name, "scene_labels.npz"} if ending == ".ply" else {out.name}
+    assert {file.name for file in out.parent.iterdir()} == names
+    assert ("leaves out labels" in said) == (ending != ".ply")
 
 
 def test_a_fit_keeps_its_antialiasing(export, fitted, tmp_path):
@@ -52,7 +54,7 @@ def test_a_tracked_scene_is_its_first_frame(export, tracked, tmp_path):
 def test_a_page_of_a_tracked_scene_plays_at_the_rate_of_its_recording(export, tracked, recording, tmp_path):
     code, said = export(tracked, tmp_path / "scene.html", "--frames=1:")
     assert code == 0
-    assert "warning" not in said
+    assert said.count("warning") == said.count("a page leaves out labels") == 1
     assert "30 Gaussians, a page of 3 frames, " in said
     about = json.loads(re.search(r"const about = (\{.*\});", (tmp_path / "scene.html").read_text())[1])
     assert about["motion"]["moving"] == 12
@@ -68,14 +70,14 @@ def test_a_file_for_each_frame(export, tracked, tmp_path, ending):
     assert "moves" not in said
     assert f"scene {out}: 2 files of 30 Gaussians, " in said
     names = [f"frame_0001{ending}", f"frame_0003{ending}"]
-    assert sorted(file.name for file in out.parent.iterdir()) == names
+    assert sorted(file.name for file in out.parent.glob(f"*{ending}")) == names
     moved = jnp.where(jnp.arange(30)[:, None] < 12, some().means + 0.03, some().means)
     wanted = eqx.tree_at(lambda g: g.means, some(), moved)
     assert_alike(wanted, read_gaussians(out.parent / names[1])[0], ROUNDING[ending])
     code, said = export(tracked, out)
     assert code == 2
     assert f"frame_0001{ending}: is there already" in said
-    assert len(list(out.parent.iterdir())) == 2
+    assert len(list(out.parent.glob(f"*{ending}"))) == 2
 
 
 def test_ctrl_c_leaves_whole_files_only(export, tracked, tmp_path, monkeypatch):
@@ -166,6 +168,18 @@ def test_what_is_refused(export, ply, tmp_path):
     code, said = export(ply, tmp_path / "folder.spz")
     assert code == 2
     assert "expected a file, found a folder" in said
+
+
+def test_labels_go_with_a_ply(export, ply, tmp_path):
+    """Those that stand beside its name are somebody's, and are not replaced unasked."""
+    out, beside = tmp_path / "made" / "out.ply", tmp_path / "made" / "out_labels.npz"
+    beside.parent.mkdir()
+    beside.write_bytes(b"mine")
+    code, said = export(ply, out)
+    assert (code, "out_labels.npz: is there already; name another OUT" in said) == (2, True), said
+    assert (beside.read_bytes(), out.exists()) == (b"mine", False)
+    assert export(ply, out, "--overwrite")[0] == 0
+    np.testing.assert_array_equal(read_gaussians(out)[1].labels, np.arange(30) % 2)
 
 
 def test_nothing_is_replaced_unasked(export, ply, tmp_path):

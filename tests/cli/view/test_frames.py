@@ -26,7 +26,7 @@ def test_frames_as_numbered_files(export, tracked, tmp_path, notes, ending):
     code, said = export(tracked, folder / f"####{ending}", "--frames=1:")
     assert code == 0
     assert f"3 files of 30 Gaussians, {FORMATS[ending].name}" in said
-    assert sorted(file.name for file in folder.iterdir()) == [f"000{t}{ending}" for t in (1, 2, 3)]
+    assert sorted(file.name for file in folder.glob(f"*{ending}")) == [f"000{t}{ending}" for t in (1, 2, 3)]
     scene, _ = open_viewable(folder, notes)
     assert (scene.num_frames, notes.all) == (3, [])
     rows = np.argmin(np.linalg.norm(later(1)[:, None] - np.asarray(scene.at(0).means), axis=2), axis=1)
