@@ -98,10 +98,10 @@ def test_a_video(say, tmp_path):
         for viewmat in room.viewmats(18):
             video.write(room.picture(viewmat))
     code, said = say(
-        tmp_path / "walk.mp4", "--out", tmp_path / "out", "--frames", "9", "--compare", "nothing"
+        tmp_path / "walk.mp4", "--out", tmp_path / "out", "--stills", "9", "--compare", "nothing"
     )
     assert code == 2, said
-    code, said = say(tmp_path / "walk.mp4", "--out", tmp_path / "out", "--frames", "9")
+    code, said = say(tmp_path / "walk.mp4", "--out", tmp_path / "out", "--stills", "9")
     assert code == 0, said
     assert "matching neighbours" in said
     scene = open_photographs(tmp_path / "out")
