@@ -1,7 +1,7 @@
 """glTF with KHR_gaussian_splatting, as one .glb: written, not read. Nothing is rounded.
 
-Attributes of one primitive of points: POSITION, rotations x y z w, logarithms of scales, opacities 0 to 1 and
-an accessor for each coefficient of the harmonics, all float32; and COLOR_0, by which programs without the
+Attributes of one primitive of points: POSITION, rotations x y z w, scales, opacities 0 to 1 and an
+accessor for each coefficient of the harmonics, all float32; and COLOR_0, by which programs without the
 extension show points. Y of glTF points up and that of a 3DGS PLY down, so the node is turned half around X.
 It is also shifted to the origin of a scene far from 0, for JSON has the digits that float32 lacks.
 Source: extensions/2.0/Khronos/KHR_gaussian_splatting in github.com/KhronosGroup/glTF.
@@ -76,7 +76,7 @@ def _attributes(gaussians: Gaussians) -> dict[str, np.ndarray]:
         "POSITION": columns.means,
         "COLOR_0": np.column_stack([to_bytes(columns.colors), to_bytes(columns.opacities)]),
         f"{_EXTENSION}:ROTATION": columns.quats[:, [1, 2, 3, 0]],
-        f"{_EXTENSION}:SCALE": columns.log_scales,
+        f"{_EXTENSION}:SCALE": np.exp(columns.log_scales),  # drafts had their logarithms
         f"{_EXTENSION}:OPACITY": columns.opacities[:, None],
         f"{_EXTENSION}:SH_DEGREE_0_COEF_0": (columns.colors - 0.5) / SH_C0,
     }

@@ -1,8 +1,11 @@
 """Every format as other programs have it: they read what we write, and we read what they write. Skipped
 without them (tests/io/converters.py)."""
 
+import json
+import struct
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from gsjax.io.ply import read_ply
@@ -57,3 +60,38 @@ def test_both_read_the_same_ksplat(tmp_path, program, level):
     program(tmp_path / "a.ksplat", tmp_path / "theirs.ply")
     theirs, _ = read_ply(tmp_path / "theirs.ply")
     assert_alike(read_gaussians(tmp_path / "a.ksplat")[0], theirs, ROUNDING[".ply"], times=10)
+
+
+@pytest.mark.parametrize("name", ["splat-transform"])
+def test_glb_is_written_alike(tmp_path, program):
+    """Up to the axes, which we turn by the node: what does not depend on them."""
+    write_gaussians(tmp_path / "ours.ply", make_scene(50, 2))
+    write_gaussians(tmp_path / "ours.glb", make_scene(50, 2))
+    program(tmp_path / "ours.ply", tmp_path / "theirs.glb")
+    (ours, extension), (theirs, their_extension) = (
+        glb_of(tmp_path / f"{who}.glb") for who in ("ours", "theirs")
+    )
+    assert ours.keys() == theirs.keys()
+    assert extension.items() <= their_extension.items()
+    for end in ("SCALE", "OPACITY", "SH_DEGREE_0_COEF_0", "SH_DEGREE_2_COEF_2"):
+        name = f"KHR_gaussian_splatting:{end}"
+        np.testing.assert_allclose(ours[name], theirs[name], rtol=1e-5, atol=1e-7)
+    np.testing.assert_array_equal(ours["COLOR_0"], theirs["COLOR_0"])
+    np.testing.assert_allclose(np.abs(ours["POSITION"]), np.abs(theirs["POSITION"]))
+
+
+def glb_of(path):
+    """The arrays of a .glb's one primitive, each packed, and what it says of its extension."""
+    data = path.read_bytes()
+    (size,) = struct.unpack_from("<I", data, 12)
+    tree, binary = json.loads(data[20 : 20 + size]), data[28 + size :]
+    (primitive,) = tree["meshes"][0]["primitives"]
+    found = {}
+    for name, index in primitive["attributes"].items():
+        accessor = tree["accessors"][index]
+        view = tree["bufferViews"][accessor["bufferView"]]
+        kind = {5126: "<f4", 5121: "u1"}[accessor["componentType"]]
+        width = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}[accessor["type"]]
+        start = view.get("byteOffset", 0) + accessor.get("byteOffset", 0)
+        found[name] = np.frombuffer(binary, kind, accessor["count"] * width, start).reshape(-1, width)
+    return found, primitive["extensions"]["KHR_gaussian_splatting"]

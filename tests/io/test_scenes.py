@@ -213,7 +213,7 @@ def test_glb_is_what_the_extension_says(tmp_path):
     np.testing.assert_allclose(tree["accessors"][0]["max"], columns.means.max(0), atol=1e-6)
     prefix = "KHR_gaussian_splatting:"
     np.testing.assert_allclose(attribute(f"{prefix}ROTATION", 4)[:, 3], columns.quats[:, 0], atol=1e-6)
-    np.testing.assert_allclose(attribute(f"{prefix}SCALE", 3), columns.log_scales, atol=1e-6)
+    np.testing.assert_allclose(attribute(f"{prefix}SCALE", 3), np.exp(columns.log_scales), rtol=1e-6)
     np.testing.assert_allclose(attribute(f"{prefix}OPACITY", 1), columns.opacities, atol=1e-6)
     np.testing.assert_allclose(attribute(f"{prefix}SH_DEGREE_2_COEF_4", 3), columns.rest[:, 7], atol=1e-6)
 
