@@ -149,11 +149,11 @@ def _streams(path: Path, data: bytes, header: _Header) -> list[bytes]:
     packed, unpacked = listed[::2], list(listed[1::2])
     if [size for size in unpacked if size] != sizes:
         raise SceneError(path, f"arrays of {sizes} bytes", f"{unpacked}", AGAIN)
+    expect_room(path, sum(unpacked), len(data), f"{header.count} Gaussians")
     start, arrays = table + entries.size, []
     for before, after in zip(packed, unpacked, strict=True):
         frame = data[start : start + before]
         start += before
-        expect_room(path, after, len(frame), f"{header.count} Gaussians")
         try:
             array = zstandard.ZstdDecompressor().stream_reader(frame).read(after + 1) if after else b""
         except zstandard.ZstdError as error:

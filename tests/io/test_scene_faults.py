@@ -6,6 +6,9 @@ import struct
 import tracemalloc
 import zipfile
 
+import equinox as eqx
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -48,6 +51,17 @@ def refusal(path, data=None) -> str:
         tracemalloc.stop()
     assert str(refused.value).startswith(f"{path}: expected ")
     return str(refused.value)
+
+
+def test_sizes_of_an_spz_of_version_4_are_compared_as_a_whole(tmp_path, monkeypatch):
+    """Harmonics that are all 0 take no room in the file, whose other arrays do."""
+    path, scene = tmp_path / "scene.spz", make_scene(20_000, 3)
+    scene = eqx.tree_at(lambda g: g.shN, scene, 0 * scene.shN)
+    monkeypatch.setattr("gsjax.io.scene_file._ALWAYS_ROOM", 1 << 19)
+    spz4(scene, path)
+    assert read_gaussians(path)[0].num == 20_000
+    spz4(jax.tree.map(jnp.ones_like, scene), path)
+    assert "20000 Gaussians of a size in keeping with its file, found 1300000 bytes from" in refusal(path)
 
 
 @pytest.mark.parametrize("share", [0.0, 0.03, 0.5, 0.99])
