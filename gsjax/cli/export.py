@@ -23,7 +23,7 @@ from gsjax.io.scenes import FORMATS, Format, format_of, write_gaussians
 from gsjax.io.sequences import frame_files
 from gsjax.scene.gaussians import Gaussians
 from gsjax.viz.viewer import Viewable
-from gsjax.viz.viewer.cameras import scene_up
+from gsjax.viz.viewer.cameras import first_pose, scene_up
 from gsjax.viz.viewer.player import frame_pause
 
 HELP = (
@@ -78,6 +78,8 @@ def run(options: Options) -> int:
             known = UP["-y"] if _read(options.path) else scene_up(scene)
             look["up"] = (known if options.up == "auto" else UP[options.up]).tolist()
             look["background"] = scene.background
+            if scene.shots is not None:  # a fit in the open has Gaussians far beyond what was photographed
+                look["view"] = tuple(place.tolist() for place in first_pose(scene)[:2])
         if numbered:
             return _write_frames(options, scene, rows, look, notes, console)
         plays = "film" in written.options and len(rows) > 1

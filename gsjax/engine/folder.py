@@ -41,11 +41,14 @@ SIGNATURE = "# gsjax run"  # the first line of config.yml: other programs write 
 
 
 def read_values(file: Path, parse: Callable[[str], Any]) -> dict[str, Any]:
-    """What a run stored by name; raises a ValueError if the file holds something else.
+    """What a run stored, by name.
 
     Args:
         file: the file.
         parse: its text, `parse_json` or `parse_yaml`.
+
+    Raises:
+        ValueError: the file holds something else.
     """
     try:
         found = parse(file.read_text(encoding="utf-8"))

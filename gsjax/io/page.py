@@ -52,6 +52,7 @@ def write_page(
     antialiased: bool = False,
     up: Sequence[float] = (0.0, -1.0, 0.0),
     background: Sequence[float] = (0.0, 0.0, 0.0),
+    view: tuple[Sequence[float], Sequence[float]] | None = None,
     film: Film | None = None,
 ) -> None:
     """Write the page, atomically.
@@ -62,6 +63,7 @@ def write_page(
         antialiased: whether the scene was fitted with antialiasing; it is drawn so.
         up: unit vector; by default as in most PLY files, whose y points down.
         background: RGB, 0 to 1.
+        view: where the page opens: the place of the eye and what it looks at; default: from the side.
         film: the scene over time, which the page plays; `gaussians` in its first frame. None if it stands
             still.
     """
@@ -77,6 +79,7 @@ def write_page(
         "antialiased": bool(antialiased),
         "center": center.tolist(),
         "distance": float(max(radius, 1e-6) * 2.7),
+        "view": None if view is None else [[float(value) for value in place] for place in view],
         "focal": _FOCAL,
         "motion": motion,
     }

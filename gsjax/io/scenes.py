@@ -46,7 +46,9 @@ FORMATS = {
     ".spz": Format("SPZ", spz.write_spz, options=("antialiased",)),
     ".sog": Format("SOG", sog.write_sog, options=("antialiased", "order")),
     ".glb": Format("glTF", glb.write_glb, options=("origin",)),
-    ".html": Format("a page", page.write_page, degree=0, options=("antialiased", "up", "background", "film")),
+    ".html": Format(
+        "a page", page.write_page, degree=0, options=("antialiased", "up", "background", "view", "film")
+    ),
 }
 """The formats that are written, by the ending of a file; of two that fit, the first."""
 
@@ -115,6 +117,7 @@ def write_gaussians(
     order: Int[np.ndarray, "N"] | None = None,
     up: Sequence[float] | None = None,
     background: Sequence[float] | None = None,
+    view: tuple[Sequence[float], Sequence[float]] | None = None,
     film: page.Film | None = None,
 ) -> tuple[str, ...]:
     """Write Gaussians in the format that the ending of `path` names, atomically.
@@ -133,6 +136,8 @@ def write_gaussians(
             keep the order of the scene.
         up: of a page alone: the direction that points up; default: -y, as in most PLY files.
         background: of a page alone: RGB, 0 to 1; default: black.
+        view: of a page alone: the place of the eye and what it looks at, as the page opens; default: from the
+            side.
         film: of a page alone: the scene over time, which it plays; `gaussians` is its first frame.
 
     Returns:
@@ -170,7 +175,7 @@ def write_gaussians(
         if "labels" not in written.options and len(np.unique(labels)) == 1:
             labels = None
     asked = {"labels": labels, "antialiased": antialiased or None, "origin": origin}
-    asked |= {"up": up, "background": background, "film": film}
+    asked |= {"up": up, "background": background, "view": view, "film": film}
     asked |= {"order": order} if "order" in written.options else {}
     options = {name: value for name, value in asked.items() if value is not None}
     no_room = {"labels": "labels", "antialiased": "that the scene is antialiased"}

@@ -104,8 +104,18 @@ def test_a_page_of_a_run_has_the_up_of_its_photographs(export, fitted, ply, tmp_
         code, _ = export(source, tmp_path / "scene.html", *option, "--overwrite")
         assert code == 0
         assert f'"up": {up}' in (tmp_path / "scene.html").read_text()
+        assert '"view": null' in (tmp_path / "scene.html").read_text()
     assert export(fitted, tmp_path / "fit.html")[0] == 0
     assert '"antialiased": true' in (tmp_path / "fit.html").read_text()
+
+
+def test_a_page_of_a_run_opens_where_its_first_camera_stood(export, tracked, recording, tmp_path):
+    assert export(tracked, tmp_path / "scene.html")[0] == 0
+    about = json.loads(re.search(r"const about = (\{.*\});", (tmp_path / "scene.html").read_text())[1])
+    eye, target = np.array(about["view"])
+    to_world = np.linalg.inv(open_sequence(str(recording)).viewmats[0, 0])
+    np.testing.assert_allclose(eye, to_world[:3, 3], atol=1e-6)
+    np.testing.assert_allclose(np.cross(target - eye, to_world[:3, 2]), 0, atol=1e-6)
 
 
 def test_what_is_read_in_one_format_is_written_in_another(export, ply, tmp_path):
