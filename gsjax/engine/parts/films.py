@@ -24,6 +24,7 @@ from gsjax.engine.parts.saved import PartsRun, read_parts_about
 from gsjax.geometry.cameras import Camera, resized
 from gsjax.io.atomic import atomic_write, write_json
 from gsjax.io.video import VideoWriter
+from gsjax.methods.parts.entries import relative
 from gsjax.methods.parts.film import Film, Layer, film_gaussians
 from gsjax.methods.parts.limits import Beyond, beyond_captured, describe_beyond
 from gsjax.methods.parts.operation import Edit
@@ -64,13 +65,15 @@ Watch = Callable[[Iterable[Shot], int], Iterable[Shot]]
 
 
 def edited(script: Script, saved: PartsRun) -> tuple[Film, list[str]]:
-    """The film of an edited run, and warnings about it, a sentence each.
+    """The film of an edited run, and warnings about it, a sentence each. Points of the script are in the
+    coordinates of the data.
 
     Raises:
         ValueError, OSError: there is no such part or other run, or the edits cannot be applied.
     """
-    # Each other run is read once.
-    known = cache(partial(read_parts_about, origin=saved.recording.judged.origin))
+    origin = saved.recording.judged.origin
+    script = relative(script, origin)
+    known = cache(partial(read_parts_about, origin=origin))  # each other run is read once
     film = apply(script, saved.layer, saved.names, known)
     recorded, now = saved.layer, film[0].trajectory
     doubts = []

@@ -7,9 +7,12 @@ and `metadata["example"]` is an example for a field without a default.
 
 import math
 from collections.abc import Callable, Collection
-from dataclasses import MISSING, Field, dataclass, fields
+from dataclasses import MISSING, Field, dataclass, fields, replace
 from difflib import get_close_matches
 from typing import Any, TypeVar
+
+import numpy as np
+from jaxtyping import Float
 
 ALL = "all"
 """Stands for all parts, including the background."""
@@ -18,6 +21,7 @@ Checked = dict[str, Any]
 """Metadata of a field."""
 _LONG = 200  # most characters of a value that a message shows
 _FAR = 1e6  # more metres, degrees or seconds than are ever meant
+_EARTH = 1e8  # farther than any coordinates of places on earth reach, metres
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -113,9 +117,9 @@ def whole(low: int, high: int) -> Checked:
     return {"check": check, "wanted": wanted}
 
 
-def vector(wanted: str, least: float = 0.0) -> Checked:
-    """A vector of three numbers whose length is at least `least`."""
-    one, wanted = number("")["check"], f"{wanted} as [x, y, z]"
+def vector(wanted: str, least: float = 0.0, far: float = _FAR) -> Checked:
+    """A vector of three numbers within `far` of 0 whose length is at least `least`."""
+    one, wanted = number("", -far, far)["check"], f"{wanted} as [x, y, z]"
 
     def check(value: Any) -> Vector:
         try:
@@ -127,6 +131,27 @@ def vector(wanted: str, least: float = 0.0) -> Checked:
         raise ValueError(f"expected {wanted}, found {shown(value)}")
 
     return {"check": check, "wanted": wanted}
+
+
+def point(wanted: str) -> Checked:
+    """A point in the coordinates of the data, which may be far from 0 (UTM, or earth-centred)."""
+    return vector(wanted, far=_EARTH) | {"point": True}
+
+
+def relative(entry: Kind, origin: Float[np.ndarray, "3"] | None) -> Kind:
+    """An entry, and those in it, with its points relative to an origin; as it is if that is None."""
+    if origin is None:
+        return entry
+    changed = {}
+    for f in fields(entry):
+        value = getattr(entry, f.name)
+        if isinstance(value, Entry):
+            changed[f.name] = relative(value, origin)
+        elif f.metadata.get("point") and value is not None:
+            changed[f.name] = tuple((np.array(value) - origin).tolist())
+        elif isinstance(value, tuple):
+            changed[f.name] = tuple(relative(e, origin) if isinstance(e, Entry) else e for e in value)
+    return replace(entry, **changed)
 
 
 def instance(kind: type, wanted: str) -> Checked:

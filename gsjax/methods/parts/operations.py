@@ -21,6 +21,7 @@ from gsjax.methods.parts.entries import (
     instance,
     key_of,
     number,
+    point,
     read,
     shown,
     vector,
@@ -31,7 +32,7 @@ from gsjax.methods.parts.operation import SECONDS, Edit, LookEdit, TimeEdit
 from gsjax.methods.parts.trajectory import Trajectory
 
 _AXIS = vector("a direction of the world", least=1e-6)
-_POINT = vector("a point in metres")
+_POINT = point("a point in metres")
 _DEGREES = number("degrees")
 _OPACITY = number("a factor on opacities, 0 to 1", 0.0, 1.0)
 _RATE = number("a factor from 0.01 to 100, or from -0.01 to -100 for backwards", 0.01, 100.0, of=abs)
