@@ -117,7 +117,8 @@ def rasterization(
             (default 1e-4).
         max_per_tile: draw at most this many Gaussians per tile, nearest first (default None: all). With a
             number the image is an approximation; `docs/choosing.md` says how good.
-        tile_size: edge of a tile, pixels (default 8); 4, 8, 16 or 32. Affects only speed.
+        tile_size: edge of a tile, pixels (default 8); 4, 8, 16 or 32. Affects speed, and the
+            rounding of gradients in float32, which grows with its square.
         tiles_per_batch: tiles composited together (default: 2048 pixels, 16384 on a GPU). Affects only speed.
         sort: "host" (default) sorts with numpy where XLA runs on the CPU, "device" with XLA; affects only
             speed.
