@@ -16,7 +16,7 @@ from gsjax.engine.streams import keep_streams_open, lost_output, say_error
 
 GROUPS = {
     "Inspect data": {
-        "info": ("gsjax.cli.info", "describe a recording or a set of photographs"),
+        "info": ("gsjax.cli.info", "describe a dataset, a run or a file of Gaussians"),
         "poses": ("gsjax.cli.poses", "find the cameras of photographs or of a video, for fit"),
     },
     "Reconstruct": {

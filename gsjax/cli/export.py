@@ -15,6 +15,7 @@ from rich.progress import track
 from gsjax.engine.messages import Notes, reason, stage
 from gsjax.engine.options import Common
 from gsjax.engine.recording import parse_frames
+from gsjax.engine.terminal import in_bytes
 from gsjax.engine.viewables import UP, Up, open_viewable
 from gsjax.io.labels import labels_beside
 from gsjax.io.page import Film
@@ -94,7 +95,7 @@ def run(options: Options) -> int:
             left_out = write_gaussians(options.out, _at(scene, rows[0]), **look)
         _warn(notes, options.out, written, left_out)
     text = f"{scene.gaussians.num:,} Gaussians, {written.name}{f' of {len(rows)} frames' if plays else ''}"
-    _tell(options.out, f"{text}, {_megabytes(options.out.stat().st_size)}")
+    _tell(options.out, f"{text}, {in_bytes(options.out.stat().st_size)}")
     return 0
 
 
@@ -123,7 +124,7 @@ def _write_frames(
         )
     part = "" if stopped is None else f" of {len(files)} (stopped by {stopped})"
     text = f"{len(sizes)} files{part} of {scene.gaussians.num:,} Gaussians, {written.name}"
-    _tell(options.out, f"{text}, {_megabytes(sum(sizes))}")
+    _tell(options.out, f"{text}, {in_bytes(sum(sizes))}")
     return 0 if stopped is None else 130
 
 
@@ -187,7 +188,3 @@ def _warn(notes: Notes, out: Path, written: Format, left_out: tuple[str, ...]) -
 
 def _tell(out: Path, text: str) -> None:
     Console(highlight=False).print(f"[bold]scene[/]  {out}: {text}", soft_wrap=True)
-
-
-def _megabytes(size: int) -> str:
-    return f"{size / 1e6:.1f} MB" if size >= 1e5 else f"{size / 1e3:.1f} kB"

@@ -1,4 +1,4 @@
-"""`gsjax info`: what a recording or a set of photographs holds."""
+"""`gsjax info`: what a dataset, a run or a file of Gaussians holds."""
 
 from gsjax.engine.info import Options, run
 

@@ -191,7 +191,7 @@ def _read(
         if not has(data):
             expected = f"data with {what}, as {_flag(name)} is given"
             raise ValueError(f"{path}: expected {expected}, found none. Leave it out.")
-    return data
+    return replace(data, layout=layout)
 
 
 def _flag(name: str) -> str:

@@ -68,6 +68,7 @@ class Photographs:
             the files, [3] float64; None if they are as in the files.
         fisheye: coefficients k1 to k4 of each camera (see `gsjax.geometry.cameras.Camera`), [N,4] float64;
             None for pinholes.
+        layout: name of the layout of its files, such as "COLMAP"; empty for a set that was made in Python.
 
     Raises:
         ValueError: shapes disagree, a pose is not a rigid motion, or there is no photograph.
@@ -91,6 +92,7 @@ class Photographs:
     locate: Callable[[str, int], str] | None = field(default=None, repr=False)
     origin: Float[np.ndarray, "..."] | None = None
     fisheye: Float[np.ndarray, "..."] | None = None
+    layout: str = ""
 
     def __post_init__(self):
         count = len(self.names)
@@ -263,5 +265,6 @@ def photographs_of(sequence: Sequence) -> Photographs:
         times=np.repeat(sequence.times, cameras) if frames > 1 else None,
         near=sequence.near,
         origin=sequence.origin,
+        layout=sequence.layout,
         locate=lambda kind, i: sequence.where("mask" if kind == "labels" else kind, *views[i]),
     )

@@ -52,6 +52,7 @@ class Sequence:
         locate: (kind, t, c) -> path of a file, for messages; kind is "image", "depth", "mask" or "flow".
         origin: where the data lie far from 0, what all places are relative to, in the coordinates of the
             files, [3] float64; None if they are as in the files.
+        layout: name of the layout of its files, such as "TUM RGB-D"; empty for one that was made in Python.
 
     Raises:
         ValueError: shapes disagree, a pose is not a rigid motion, or times do not increase.
@@ -76,6 +77,7 @@ class Sequence:
     near: float = NEAR
     locate: Callable[[str, int, int], str] | None = field(default=None, repr=False)
     origin: Float[np.ndarray, "..."] | None = None
+    layout: str = ""
 
     def __post_init__(self):
         for name in ("times", "Ks", "viewmats"):

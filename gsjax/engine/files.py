@@ -1,7 +1,8 @@
 """Files of a run read back, whichever command made it: arrays, the scene, the recording. `again` is the
 advice of error messages if a file is not as it was written."""
 
-from collections.abc import Callable, Mapping, Sequence
+import warnings
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
@@ -118,6 +119,33 @@ def read_drawable(file: Path) -> tuple[Gaussians, SceneReport]:
     if gaussians.num == 0:
         raise ValueError(f"{file}: expected Gaussians, found none that can be drawn")
     return gaussians, report
+
+
+def read_frames(files: Sequence[Path]) -> Iterator[tuple[Gaussians, SceneReport]]:
+    """The Gaussians of each file of a scene that moves, and what else it held. What is said of an origin is
+    said of the first file alone.
+
+    Args:
+        files: of its frames, in their order.
+
+    Raises:
+        FileNotFoundError, SceneError: as for `read_gaussians`.
+        ValueError: a file holds none, or other numbers of Gaussians or harmonics than the first.
+    """
+    first = None
+    for file in files:
+        with warnings.catch_warnings():
+            if first is not None:
+                warnings.filterwarnings("ignore", ".*relative to the origin")
+            gaussians, report = read_drawable(file)
+        first = first or gaussians
+        if (gaussians.num, gaussians.sh_degree) != (first.num, first.sh_degree):
+            raise ValueError(
+                f"{file}: expected {first.num} Gaussians of degree {first.sh_degree} as in {files[0].name}, "
+                f"found {gaussians.num} of degree {gaussians.sh_degree}; a scene that moves has the same in "
+                "every frame, so give one file, or put files of other scenes elsewhere"
+            )
+        yield gaussians, report
 
 
 def read_scene(

@@ -1,12 +1,15 @@
-"""What a recording or a set of photographs holds, as `gsjax info` prints it."""
+"""What a dataset, a run or a file of Gaussians holds, as `gsjax info` prints it."""
 
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
+import tyro
 from jaxtyping import Float
 from rich.console import Console
 
@@ -14,11 +17,12 @@ from gsjax.data import Photographs, Sequence, open_photographs, open_sequence, p
 from gsjax.data.consistency import check_photographs, check_recording
 from gsjax.data.errors import MissingFile
 from gsjax.data.open import is_photographs, is_recording
-from gsjax.engine.folder import expect_dataset
+from gsjax.engine.folder import is_run
 from gsjax.engine.info_picture import by_camera, by_split, write_picture
+from gsjax.engine.info_run import describe_run
 from gsjax.engine.info_scene import describe_frames, describe_scene, origin_fact
 from gsjax.engine.messages import Notes
-from gsjax.engine.options import Common, OneDataset, Reading
+from gsjax.engine.options import Common, Reading
 from gsjax.engine.summary import Column, Table
 from gsjax.engine.terminal import print_facts, print_table
 from gsjax.geometry.sight import bent
@@ -32,15 +36,18 @@ MOST_LABELS, MOST_CAMERAS = 8, 6  # in the table of masks
 
 
 @dataclass(frozen=True)
-class Options(Common, Reading, OneDataset):
+class Options(Common, Reading):
     """Options of `gsjax info`."""
 
+    dataset: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="DATASET|RUN|FILE")]
+    """Folder of a recording or of photographs; a built-in scene such as simulated:tabletop; folder of a run;
+    a file of Gaussians, or a folder of numbered ones."""
     picture: Path | None = None
     """Draw the cameras and the points, from above and from the side, into this file (.png, .svg or .pdf)."""
 
 
 def run(options: Options) -> int:
-    """Print what a dataset holds.
+    """Print what a dataset, a run or a file of Gaussians holds.
 
     Raises:
         DataError, ValueError: it cannot be read, or a picture cannot be written in that format.
@@ -50,15 +57,13 @@ def run(options: Options) -> int:
             f"--picture: expected a name that ends in {', '.join(PICTURES)}, found {options.picture.name!r}"
         )
     path = Path(options.dataset)
-    files = frame_files(path)
-    if files or (path.is_file() and is_scene(path)):
+    if (describe := _scene_at(path)) is not None:
         if options.picture is not None:
-            raise ValueError(f"--picture: draws cameras, and {path} has none; leave it out")
+            raise ValueError(f"--picture: draws the cameras of a dataset, found none in {path}; leave it out")
         with Notes(Console(stderr=True, highlight=False)):
-            facts = describe_frames(files) if files else describe_scene(path)
+            facts = describe()
         print_facts(facts, title=path.name)
         return 0
-    expect_dataset(options.dataset)
     table = None
     with Notes(Console(stderr=True, highlight=False)):
         if is_photographs(options.dataset) and not is_recording(options.dataset):
@@ -84,6 +89,15 @@ def run(options: Options) -> int:
     return 0
 
 
+def _scene_at(path: Path) -> Callable[[], dict[str, str]] | None:
+    """Describes the run, the frames or the file of Gaussians at a path; None if there is none of these."""
+    if is_run(path):
+        return partial(describe_run, path)
+    if files := frame_files(path):
+        return partial(describe_frames, files)
+    return partial(describe_scene, path) if path.is_file() and is_scene(path) else None
+
+
 def describe_photographs(photographs: Photographs) -> dict[str, str]:
     """Facts about photographs; opens nothing but the first depth image."""
     sizes = Counter(map(tuple, photographs.sizes.tolist()))
@@ -97,6 +111,7 @@ def describe_photographs(photographs: Photographs) -> dict[str, str]:
         valid = None if known is None else _range(known[known > 0])
         depth = "some, none in the first" if valid is None else f"{valid} in the first"
     return {
+        **({"layout": photographs.layout} if photographs.layout else {}),
         "photographs": f"{photographs.num}: {photographs.names[0]} to {photographs.names[-1]}",
         "size": ", ".join([*listed, *(["..."] if len(sizes) > 4 else [])]),
         "view": _view(photographs),
@@ -131,6 +146,7 @@ def describe_sequence(sequence: Sequence, masks: dict[int, np.ndarray]) -> dict[
         times = f"{last - first:.2f} s, every {1e3 * step:.1f} ms ({1 / step:.1f} Hz)"
     labels = ", ".join(map(str, _labels(masks))) or "none but the background"
     return {
+        **({"layout": sequence.layout} if sequence.layout else {}),
         "cameras": f"{len(ids)}: {', '.join(map(str, ids))} ({movement})",
         **origin_fact(sequence.origin),
         "image": f"{width} x {sequence.height}, {_fields_of_view(width, sequence.Ks[0])}",

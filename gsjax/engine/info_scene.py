@@ -6,7 +6,11 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
+from gsjax.engine.files import read_frames
+from gsjax.engine.terminal import in_bytes
+from gsjax.io.scene_file import SceneReport
 from gsjax.io.scenes import read_gaussians
+from gsjax.scene.gaussians import Gaussians
 from gsjax.scene.origin import in_numbers, in_world
 
 
@@ -16,8 +20,11 @@ def describe_scene(file: Path) -> dict[str, str]:
     Raises:
         SceneError: it holds no Gaussians.
     """
-    gaussians, report = read_gaussians(file)
-    facts = {"Gaussians": f"{gaussians.num:,}"}
+    return _facts_of(file, *read_gaussians(file))
+
+
+def _facts_of(file: Path, gaussians: Gaussians, report: SceneReport) -> dict[str, str]:
+    facts = {"file": f"{report.format}, {in_bytes(file.stat().st_size)}", "Gaussians": f"{gaussians.num:,}"}
     if report.stored != gaussians.num:
         facts["Gaussians"] += f" of {report.stored:,}"
     facts["colours"] = f"spherical harmonics of degree {gaussians.sh_degree}"
@@ -26,7 +33,10 @@ def describe_scene(file: Path) -> dict[str, str]:
         low, high = np.percentile(means, [1, 99], axis=0)
         facts["places"] = " to ".join(f"({', '.join(f'{x:.2f}' for x in end)})" for end in (low, high))
         facts["sizes"] = "{:.2g} to {:.2g}".format(*np.percentile(gaussians.scales, [1, 99]))
-        facts["opacities"] = "{:.2f} to {:.2f}".format(*np.percentile(gaussians.opacities, [1, 99]))
+        opacities = np.asarray(gaussians.opacities)
+        facts["opacities"] = "{:.2f} to {:.2f}".format(*np.percentile(opacities, [1, 99]))
+        if faint := int((opacities < 1 / 255).sum()):
+            facts["opacities"] += f"; {faint:,} are too faint to be drawn (below 1/255)"
     facts |= origin_fact(report.origin)
     if report.antialiased is not None:
         facts["drawn"] = "antialiased" if report.antialiased else "classic"
@@ -38,15 +48,21 @@ def describe_scene(file: Path) -> dict[str, str]:
 
 
 def describe_frames(files: Sequence[Path]) -> dict[str, str]:
-    """Facts about a scene that moves.
+    """Facts about a scene that moves: its first frame is described, the others are read for what is wrong.
 
     Args:
-        files: of its frames, of which the first is described.
+        files: of its frames.
 
     Raises:
-        SceneError: the first holds no Gaussians.
+        ValueError, OSError: as for `read_frames`.
     """
-    return {"frames": f"{len(files)}, {files[0].name} to {files[-1].name}"} | describe_scene(files[0])
+    read = read_frames(files)
+    first = next(read)
+    for _ in read:
+        pass
+    size = in_bytes(sum(file.stat().st_size for file in files))
+    frames = f"{len(files)}, {files[0].name} to {files[-1].name}, {size}"
+    return {"frames": frames} | _facts_of(files[0], *first)
 
 
 def origin_fact(origin: Float[np.ndarray, "3"] | None) -> dict[str, str]:

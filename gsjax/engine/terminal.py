@@ -61,6 +61,11 @@ def print_facts(facts: Mapping[str, str], title: str = "") -> None:
     console.print(_facts(facts))
 
 
+def in_bytes(size: int) -> str:
+    """A size in bytes, as it is said: "12.3 MB"."""
+    return f"{size / 1e6:.1f} MB" if size >= 1e5 else f"{size / 1e3:.1f} kB"
+
+
 def _facts(facts: Mapping[str, str]) -> Grid:
     grid = Grid.grid(padding=(0, 3, 0, 0))
     for name, text in facts.items():

@@ -1,6 +1,5 @@
 """The scenes that `gsjax view` opens: a run of any kind, a file of Gaussians or a folder of numbered ones."""
 
-import warnings
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Literal
@@ -17,7 +16,7 @@ from gsjax.engine.deform.query import QueryableScene, probabilities_of
 from gsjax.engine.distill.file import NAME
 from gsjax.engine.distill.query import QueryableField
 from gsjax.engine.distill.saved import AS_IT_WAS, FieldRun, Whereabouts, field_of, open_field_run
-from gsjax.engine.files import read_drawable, reopen
+from gsjax.engine.files import read_drawable, read_frames, reopen
 from gsjax.engine.folder import expect_run
 from gsjax.engine.messages import Notes, describe
 from gsjax.engine.parts.saved import blend_of, open_parts_run, read_parts
@@ -97,18 +96,9 @@ def open_viewable(path: Path, notes: Notes, now: Whereabouts = AS_IT_WAS) -> tup
 
 def _of_files(path: Path, files: list[Path], notes: Notes) -> Viewable:
     """The scene whose frames are files, in their order; in the coordinates of the first."""
-    first, report = read_drawable(files[0])
-    frames = [first]
-    for file in files[1:]:
-        with warnings.catch_warnings():
-            warnings.filterwarnings("ignore", ".*relative to the origin")  # as was said of the first
-            there, known = read_drawable(file)
-        if (there.num, there.sh_degree) != (first.num, first.sh_degree):
-            raise ValueError(
-                f"{file}: expected {first.num} Gaussians of degree {first.sh_degree} as in {files[0].name}, "
-                f"found {there.num} of degree {there.sh_degree}; view it alone"
-            )
-        frames.append(moved_to(there, known.origin, report.origin))
+    read = read_frames(files)
+    first, report = next(read)
+    frames = [first, *(moved_to(there, known.origin, report.origin) for there, known in read)]
     colors = np.asarray(first.sh0)
     if max(np.abs(np.asarray(each.sh0) - colors).max() for each in frames) > _SAME_COLOR:
         notes.warn("colours change from frame to frame; all are shown in those of the first")

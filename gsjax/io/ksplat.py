@@ -100,7 +100,8 @@ def read_ksplat(path: Path) -> tuple[Gaussians, SceneReport]:
     ]
     if not padded:
         raise SceneError(path, "Gaussians", "none", AGAIN)
-    return drawable(path, gaussians_of(Columns(*map(np.concatenate, zip(*padded, strict=True)))))
+    columns = Columns(*map(np.concatenate, zip(*padded, strict=True)))
+    return drawable(path, f".ksplat of level {level}", gaussians_of(columns))
 
 
 def _record(level: int, degree: int) -> np.dtype:

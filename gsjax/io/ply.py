@@ -145,17 +145,20 @@ def read_ply(path: str | os.PathLike) -> tuple[Gaussians, SceneReport]:
         places = positions(ply)
         origin = far_origin(places)
         gaussians, known = decompress(ply, _relative(places, origin)), {*PACKED}
+        format = "PlayCanvas's compressed PLY"
         invisible = np.zeros(len(vertices), bool)
     else:
         known = _known(path, vertices)
         places = np.stack([vertices[axis] for axis in _PLACE], axis=1).astype(np.float64)
         origin = far_origin(places)
         gaussians, invisible = _uncompressed(vertices, _relative(places, origin))
+        format = "PLY of 3DGS" + (", as text" if ply.text else "")
     names = vertices.dtype.names or ()
     if origin is not None:
         _warn_of_origin(path, origin, places, vertices)
     return drawable(
         path,
+        format,
         gaussians,
         invisible=invisible,
         extra=tuple(name for name in names if name not in {*known, "label"}),

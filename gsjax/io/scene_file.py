@@ -34,6 +34,7 @@ class SceneReport:
     """Contents of a file besides the returned Gaussians.
 
     Attributes:
+        format: what the file is, in words.
         stored: number of Gaussians in the file.
         culled: number of those left out because of a NaN, a zero quaternion, or an infinity without meaning.
         extra: properties that were not read.
@@ -46,6 +47,7 @@ class SceneReport:
         places: of the returned Gaussians as in the file, float64 [N,3]; None if they are as returned.
     """
 
+    format: str
     stored: int
     culled: int
     extra: tuple[str, ...]
@@ -116,6 +118,7 @@ def gaussians_of(columns: Columns) -> Gaussians:
 
 def drawable(
     path: str | os.PathLike,
+    format: str,
     gaussians: Gaussians,
     *,
     invisible: Bool[np.ndarray, "stored"] | None = None,
@@ -127,6 +130,7 @@ def drawable(
 
     Args:
         path: the file.
+        format: what it is, in words.
         gaussians: all of it.
         invisible: which of them have an opacity of 0.
         labels: one for each.
@@ -137,6 +141,7 @@ def drawable(
     unseen = np.zeros(len(valid), bool) if invisible is None else invisible & valid
     rows = np.flatnonzero(valid & ~unseen)
     report = SceneReport(
+        format=format,
         stored=gaussians.num,
         culled=int(np.sum(~valid)),
         extra=known.pop("extra", ()),

@@ -178,10 +178,9 @@ def _read(path: Path, load: Load) -> tuple[Gaussians, SceneReport]:
     sh0 = meta.numbers("sh0", "codebook", count=256)[colors[:, :3]]
     rest = np.zeros((count, 0, 3)) if not meta.get("shN") else _rest(meta, load, pixels)
     columns = Columns(means, _quats(quats), log_scales, colors[:, 3] / 255, sh0 * SH_C0 + 0.5, rest)
-    antialiased = meta.get("antialias")
-    return drawable(
-        path, gaussians_of(columns), antialiased=antialiased if isinstance(antialiased, bool) else None
-    )
+    said = meta.get("antialias")
+    antialiased = said if isinstance(said, bool) else None
+    return drawable(path, "SOG 2", gaussians_of(columns), antialiased=antialiased)
 
 
 def _picture(path: Path, name: str, data: bytes) -> UInt8[np.ndarray, "H W 4"]:

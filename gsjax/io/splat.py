@@ -48,7 +48,8 @@ def read_splat(path: Path) -> tuple[Gaussians, SceneReport]:
     length = np.linalg.norm(quats, axis=1, keepdims=True)
     quats /= np.where(length > 0, length, 1)
     none = np.zeros((len(records), 0, 3))
-    return drawable(path, gaussians_of(Columns(means, quats, log_scales, colors[:, 3], colors[:, :3], none)))
+    columns = Columns(means, quats, log_scales, colors[:, 3], colors[:, :3], none)
+    return drawable(path, ".splat", gaussians_of(columns))
 
 
 def splat_bytes(gaussians: Gaussians) -> bytes:

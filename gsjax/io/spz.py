@@ -98,7 +98,8 @@ def read_spz(path: Path) -> tuple[Gaussians, SceneReport]:
         ends = np.cumsum(header.sizes())
         arrays = [body[end - size : end] for end, size in zip(ends, header.sizes(), strict=True)]
     gaussians = gaussians_of(_decode(header, [np.frombuffer(array, np.uint8) for array in arrays]))
-    return drawable(path, gaussians, antialiased=bool(header.flags & _ANTIALIASED))
+    antialiased = bool(header.flags & _ANTIALIASED)
+    return drawable(path, f"SPZ {header.version}", gaussians, antialiased=antialiased)
 
 
 def _parse(path: Path, head: bytes) -> _Header:

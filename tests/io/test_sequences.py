@@ -16,7 +16,8 @@ from tests.io.scenes_to_write import make_scene
         (("0001.compressed.ply", "0000.COMPRESSED.PLY"), ("0000.COMPRESSED.PLY", "0001.compressed.ply")),
         (("1.sog", "2.sog", "3/meta.json"), ("1.sog", "2.sog")),
         (("1.ply",), ()),
-        (("1.ply", "2.ply", "notes.txt"), ()),
+        (("1.ply", "2.ply", "notes.txt"), ("1.ply", "2.ply")),
+        (("1.ply", "2.ply", "transforms.json"), ()),
         (("a1.ply", "b2.ply"), ()),
         (("1.ply", "2.spz"), ()),
         (("1.html", "2.html"), ()),
@@ -24,7 +25,7 @@ from tests.io.scenes_to_write import make_scene
     ],
 )
 def test_frames_of_a_folder(tmp_path, names, found):
-    """A folder is one scene only if all of its files are its frames."""
+    """A folder is one scene only if all of its files are its frames, or notes about them."""
     for name in names:
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).touch()

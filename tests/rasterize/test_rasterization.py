@@ -225,8 +225,8 @@ def test_the_offset_moves_projected_means_and_reads_their_gradient():
     ids=str,
 )
 def test_options_of_speed_do_not_change_the_image_or_its_gradient(small, options):
-    """Moments of a tile's pixels are taken about its centre, so float32 rounds them by the square of its edge:
-    by 1e-6 of the largest slope for tiles of 8 pixels, by up to 1.2e-4 for 32 (against float64)."""
+    """Moments of a tile's pixels are taken about its centre, so float32 rounds them by the square of its
+    edge: by 1e-6 of the largest slope for tiles of 8 pixels, by up to 1.2e-4 for 32 (against float64)."""
     _, scene = small()
     share = 3e-4 if options.get("tile_size") == 32 else 1e-4
     plans = PLAN, Plan(33, 17, 4096, **options)

@@ -4,13 +4,18 @@ import json
 import shutil
 
 import cv2
+import equinox as eqx
 import numpy as np
 import pytest
 
 from gsjax.cli import main
 from gsjax.data import DataWarning, open_photographs, open_sequence, photographs_of
 from gsjax.engine.info_picture import by_camera, by_split, scene_points
+from gsjax.io.ply import write_ply
+from gsjax.io.scenes import write_gaussians
 from gsjax.viz.cameras import cameras_and_points
+from tests.cli.compare.made_up_runs import write_run
+from tests.io.scenes_to_write import make_scene
 
 
 def test_photographs_are_described_and_what_is_missing_is_counted(photographs, capfd):
@@ -101,10 +106,55 @@ def test_a_recording_is_drawn_by_camera_with_points_of_its_depth(capfd, tmp_path
     assert "z (m)" in text
 
 
-def test_a_run_is_no_dataset(capfd, tmp_path):
-    (tmp_path / "config.yml").write_text("# gsjax run\n")
-    assert main(["info", str(tmp_path)]) == 2
-    assert "found the folder of a run; open its report.html" in " ".join(capfd.readouterr().err.split())
+@pytest.mark.parametrize("kind", ["parts", "distill", "deform"])
+def test_a_run_is_told_by_its_end_its_data_its_scores_and_its_scene(kind, capfd, tmp_path):
+    run = write_run(tmp_path / "run", kind, 20.0, dataset="data/room")
+    if kind == "parts":
+        write_ply(run / "scene.ply", make_scene(30))
+        (run / "report.html").touch()
+    else:
+        found = json.loads((run / "metrics.json").read_text())
+        (run / "metrics.json").write_text(json.dumps(found | {"complete": False, "stopped": "SIGTERM"}))
+    assert main(["info", str(run)]) == 0
+    said = " ".join(capfd.readouterr().out.split())
+    if kind == "parts":
+        assert "run gsjax parts, finished dataset data/room at 96x72, 10 frames 0 to 9, cameras" in said
+        assert "19.00 dB" in said  # held out
+        assert "file PLY of 3DGS, " in said
+        assert "Gaussians 30" in said
+        assert said.replace(" ", "").endswith(f"report{run / 'report.html'}")
+    else:
+        assert f"run gsjax {kind}, stopped by SIGTERM; continue it with --resume" in said
+
+
+def test_a_run_that_has_not_ended_is_told(capfd, tmp_path):
+    run = write_run(tmp_path / "run", "deform", 20.0, dataset="data/room")
+    (run / "metrics.json").unlink()
+    assert main(["info", str(run)]) == 0
+    said = " ".join(capfd.readouterr().out.split())
+    assert "still going on, or killed; if so, continue it with --resume" in said
+    assert main(["info", str(run), "--picture", "run.png"]) == 2
+    assert "--picture: draws the cameras of a dataset, found none in" in capfd.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("ending", "told"),
+    [
+        (".ply", "PLY of 3DGS, "),
+        (".compressed.ply", "PlayCanvas's compressed PLY, "),
+        (".splat", ".splat, "),
+        (".spz", "SPZ 3, "),
+        (".sog", "SOG 2, "),
+    ],
+)
+def test_a_file_is_told_by_its_format_and_what_is_odd_about_it(ending, told, capfd, tmp_path):
+    scene = make_scene(30, 0)
+    scene = eqx.tree_at(lambda g: g.logit_opacities, scene, scene.logit_opacities.at[:3].set(-7.0))
+    write_gaussians(tmp_path / f"scene{ending}", scene)
+    assert main(["info", str(tmp_path / f"scene{ending}")]) == 0
+    said = " ".join(capfd.readouterr().out.split())
+    assert f"file {told}" in said
+    assert "3 are too faint to be drawn" in said
 
 
 def test_pictures_of_another_kind_are_refused_before_anything_is_read(capfd):

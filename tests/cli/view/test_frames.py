@@ -39,7 +39,8 @@ def test_frames_as_numbered_files(export, tracked, tmp_path, notes, ending):
 def test_numbered_files_are_a_scene_for_every_command(export, tracked, tmp_path, view, capfd):
     folder = tmp_path / "frames"
     export(tracked, folder / "f#.ply")
-    (folder / "f9_labels.npz").touch()
+    for beside in ("f9_labels.npz", "note.txt", "README.md", ".DS_Store"):
+        (folder / beside).touch()
     code, said = view(folder)
     assert (code, "30 Gaussians, SH degree 0, 4 frames" in said) == (130, True), said
     capfd.readouterr()
@@ -55,9 +56,10 @@ def test_numbered_files_are_a_scene_for_every_command(export, tracked, tmp_path,
     assert (code, "expected another file than the one that is read" in said) == (2, True), said
     write_ply(folder / "f4.ply", some(7))
     code, said = view(folder)
-    assert (code, "f4.ply: expected 30 Gaussians of degree 0 as in f0.ply, found 7" in said) == (2, True), (
-        said
-    )
+    unlike = "f4.ply: expected 30 Gaussians of degree 0 as in f0.ply, found 7"
+    assert (code, unlike in said) == (2, True), said
+    assert main(["info", str(folder)]) == 2
+    assert unlike in " ".join(capfd.readouterr().err.split())
 
 
 @pytest.mark.filterwarnings("ignore:.*they are taken relative to the origin")
