@@ -87,9 +87,9 @@ class Trial:
         self._reader, self._root = reader, folder / "freiburg3_DATA"  # TUM's reader knows cameras by the name
         self._root.mkdir()
         reader.build(self._root)
-        reader.open(self._root)
         files = sorted(path for path in self._root.rglob("*") if path.is_file())
         self._files = {path: path.read_bytes() for path in files}
+        reader.open(self._root)
         kinds = collections.defaultdict(list)
         for path in files:
             kinds[path.parent, path.suffix].append(path)

@@ -136,7 +136,9 @@ def _is_text(content: bytes) -> bool:
 
 
 def _changed_lines(content: bytes, rng: Rng) -> bytes:
-    lines = [line.split(" ") for line in content.decode("utf-8").split("\n")]
+    text = content.decode("utf-8")
+    between = max(" ,;", key=text.count)
+    lines = [line.split(between) for line in text.split("\n")]
     for _ in range(rng.integers(1, _MOST_CHANGES + 1)):
         at, kind = int(rng.integers(len(lines))), rng.integers(8)
         if kind == 0:
@@ -152,7 +154,7 @@ def _changed_lines(content: bytes, rng: Rng) -> bytes:
             word = int(rng.integers(len(words)))
             words[word : word + 1] = [_any(_WORDS, rng)] if kind < 7 else []
             lines[at] = words or [""]
-    return "\n".join(" ".join(line) for line in lines).encode("utf-8", "surrogatepass")
+    return "\n".join(between.join(line) for line in lines).encode("utf-8", "surrogatepass")
 
 
 def _json_of(content: bytes) -> Any:
@@ -177,7 +179,7 @@ def _changed_json(tree: Any, rng: Rng) -> bytes:
             elif rng.random() < 0.2:
                 node[key] = [node[key]]
             else:
-                node[key] = _any(_VALUES, rng)
+                node[key] = copy.deepcopy(_any(_VALUES, rng))  # the next change may be within it
     if rng.random() < 0.05:
         return b'{"frames": ' + b"[" * _DEEP + b"]" * _DEEP + b"}"
     return _dumped(tree).encode("utf-8", "surrogatepass")

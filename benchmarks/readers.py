@@ -1,8 +1,10 @@
 """All readers that benchmarks/fuzz_files.py tries: those of data, and of what runs keep."""
 
 import json
+import socket
 from collections.abc import Callable
 from pathlib import Path
+from unittest import mock
 
 import jax
 import jax.numpy as jnp
@@ -11,9 +13,11 @@ import yaml
 
 from benchmarks.readers_of_data import CLOUDS, LAYOUTS, PICTURES, SCENES, Arrays, Reader, written
 from gsjax.data.text import decoded
+from gsjax.engine import locks
 from gsjax.engine.deform.file import origin_of, read_deformation, write_deformation
 from gsjax.engine.distill.file import read_field
 from gsjax.engine.folder import SIGNATURE
+from gsjax.engine.locks import LOCK
 from gsjax.engine.parts.saved import read_parts
 from gsjax.engine.records import read_record
 from gsjax.engine.teaching.source import Source
@@ -154,6 +158,18 @@ def _features(build: Callable[[Path], object]) -> Reader:
     return Reader(build, read)
 
 
+def _lock(root: Path) -> None:
+    """By the first process of this machine, which is always there, and shares it."""
+    there = {"pid": 1, "host": socket.gethostname(), "since": "2026-01-01 00:00:00", "shared": True}
+    (root / LOCK).write_text(json.dumps(there) + "\n")
+
+
+def _locked(root: Path) -> Arrays:
+    """Shared, where only the list decides: without locks of the file system."""
+    with mock.patch.object(locks, "fcntl", None), locks.locked(root, shared=True):
+        return ()
+
+
 _MAP = np.random.default_rng(0).normal(size=(6, 8, 4)).astype(np.float32)
 KEPT = {
     "checkpoint": Reader(_checkpoint, _restored),
@@ -162,6 +178,7 @@ KEPT = {
     "run of parts": Reader(_parts_run, _parts, 0.3),
     "deforming scene": Reader(_deforming, _deformation, 0.5),
     "field": Reader(_field, _features_of_field, 0.5),
+    "lock of a folder": Reader(_lock, _locked),
     "script of edits": Reader(lambda root: (root / "edit.yml").write_text(_SCRIPT), _script, 0.1),
     "features, .npy": _features(lambda root: np.save(root / "a.npy", _MAP)),
     "features, .npz": _features(lambda root: np.savez_compressed(root / "a.npz", features=_MAP)),

@@ -37,6 +37,7 @@ from tests.data import faults_of_photographs as photographs
 from tests.data import faults_of_recordings as recordings
 from tests.data import faults_of_surgery as surgery
 from tests.data.faulty import HEIGHT, WIDTH, K, deep, picture
+from tests.data.sensors import realsense
 from tests.io.scenes_to_write import ksplat, make_scene, sog, spz, spz4
 
 Arrays = Iterable[np.ndarray | None]
@@ -49,11 +50,13 @@ class Reader(NamedTuple):
         build: writes files that it reads into a folder.
         open: reads them, and returns what has to be finite.
         share: of the cases, where each takes long.
+        needs: the package of an extra that it takes; "" if none.
     """
 
     build: Callable[[Path], object]
     open: Callable[[Path], Arrays]
     share: float = 1.0
+    needs: str = ""
 
 
 def _look(data: Photographs | Sequence) -> Arrays:
@@ -63,7 +66,8 @@ def _look(data: Photographs | Sequence) -> Arrays:
         return data.Ks, data.viewmats, data.depth(0), *cloud
     last = data.num_cameras - 1
     data.image(0, 0), data.image(0, last), data.mask(0, 0)
-    return data.Ks, data.viewmats, data.times, data.depth(0, 0)
+    truth = () if data.truth is None else (data.truth.poses,)
+    return data.Ks, data.viewmats, data.times, data.depth(0, 0), *truth
 
 
 # Files of Gaussians.
@@ -156,6 +160,12 @@ def _structured(path: Path) -> None:
     np.save(path, rows)
 
 
+def _named(path: Path) -> None:
+    """Columns with units, and decimal commas."""
+    rows = "\n".join(";".join(map(str, row)) for row in _COLORED.tolist()).replace(".", ",")
+    path.write_text(f"X (m);Y (m);Z (m);R;G;B\n{rows}\n")
+
+
 CLOUDS = {
     "cloud, PLY": _cloud("points.ply", partial(_ply_cloud, text=False)),
     "cloud, PLY as text": _cloud("points.ply", partial(_ply_cloud, text=True)),
@@ -166,6 +176,10 @@ CLOUDS = {
     "cloud, .xyz": _cloud("points.xyz", lambda path: np.savetxt(path, _COLORED)),
     "cloud, .pts": _cloud("points.pts", lambda path: np.savetxt(path, _COLORED, header="9", comments="")),
     "cloud, .csv": _cloud("points.csv", lambda path: np.savetxt(path, _COLORED, delimiter=",")),
+    "cloud, .csv with names": _cloud("points.csv", _named),
+    "cloud, .txt with names": _cloud(
+        "points.txt", lambda path: np.savetxt(path, _COLORED, header="X Y Z R G B", comments="//")
+    ),
 }
 
 
@@ -208,9 +222,12 @@ _OWN_K = ReadOptions(K=K)
 
 
 def _layout(
-    build: Callable[[Path], object], read: Callable[[Path], Photographs | Sequence], share: float = 0.5
+    build: Callable[[Path], object],
+    read: Callable[[Path], Photographs | Sequence],
+    share: float = 0.5,
+    needs: str = "",
 ) -> Reader:
-    return Reader(build, lambda root: _look(read(root)), share)
+    return Reader(build, lambda root: _look(read(root)), share, needs)
 
 
 def _push_t(root: Path) -> None:
@@ -230,6 +247,14 @@ def _push_t(root: Path) -> None:
     (demo / "cameras.json").write_text(json.dumps({name: {"X_WC": np.eye(4).tolist()} for name in "ab"}))
 
 
+def _realsense(root: Path, compressed: bool) -> None:
+    realsense(WIDTH, HEIGHT, frames=2).write(root / recordings.BAG, compressed)
+
+
+def _bag(root: Path) -> Sequence:
+    return open_sequence(root / recordings.BAG)
+
+
 LAYOUTS = {
     "nerfstudio": _layout(photographs.build_transforms, open_photographs),
     "Blender": _layout(photographs.build_blender, open_photographs),
@@ -240,7 +265,12 @@ LAYOUTS = {
     "Open3D RGB-D": _layout(recordings.build_open3d, lambda root: read_open3d(root, K)),
     "TUM RGB-D": _layout(recordings.build_tum, lambda root: open_sequence(root, _OWN_K), 0.3),
     "7-Scenes": _layout(recordings.build_seven_scenes, open_sequence, 0.3),
+    "BOP": _layout(recordings.build_bop, open_sequence),
+    "PARIS": _layout(recordings.build_paris, open_sequence),
     "Panoptic": _layout(recordings.build_panoptic, open_sequence),
+    "Record3D": _layout(recordings.build_record3d, open_sequence, 0.5, "OpenEXR"),
+    "RealSense": _layout(partial(_realsense, compressed=False), _bag, 0.5, "rosbags"),
+    "RealSense, LZ4": _layout(partial(_realsense, compressed=True), _bag, 0.5, "rosbags"),
     "push-T": _layout(_push_t, open_sequence, 0.1),
     "EndoNeRF": _layout(surgery.build_endonerf, open_sequence),
     "EndoVis 2017": _layout(surgery.build_endovis17, open_sequence),

@@ -36,7 +36,7 @@ _COLORS = (
 )
 _OVERSHOOT = 1.5  # floats from 0 to 1 may end a little above 1
 _TEXT = (".xyz", ".txt", ".pts", ".csv", ".asc", ".xyzrgb")
-_UNITS = re.compile(r"\(.*?\)|\[.*?\]")
+_UNITS = re.compile(r"\([^()]*\)|\[[^][]*\]")
 _COMPRESSED = "binary_compressed"
 
 Columns = Mapping[str, Shaped[np.ndarray, "points"]]

@@ -24,7 +24,7 @@ MOST_VALUES = 2**24
 _MAGIC = b"\x76\x2f\x31\x01"
 _SHORT_NAMES, _LONG_NAMES = 0, 0x400  # other flags mark tiles, deep pixels and several parts
 _LINES = (1, 1, 1, 16, 32, 16, 32, 32, 32, 256)  # of a chunk, by compression
-_INTEGERS = 0  # type of a channel; the others are floats of 16 and 32 bits
+_INTEGERS, _FLOATS = 0, {1: np.float16, 2: np.float32}  # types of channels
 _DEPTHS = ("Z", "Y", "R")
 _KIND = "depth in one OpenEXR picture of scan lines"
 _FETCH = "Fetch the file again."
@@ -61,10 +61,11 @@ def read_exr_depth(path: Path) -> Float[np.ndarray, "height width"]:
     if not _is_complete(content, header):
         raise DataError(path, _KIND, f"a file that is cut off ({len(content)} bytes)", _FETCH)
     try:
-        pixels = codec.File(str(path), separate_channels=True).channels()[name].pixels
-    except (RuntimeError, ValueError, KeyError) as error:
+        pixels = codec.InputFile(str(path)).channel(name)  # codec.File tells of damage on stdout
+        depth = np.frombuffer(pixels, _FLOATS[header.channels[name]]).reshape(header.height, header.width)
+    except (OSError, RuntimeError, ValueError, TypeError, KeyError) as error:
         raise DataError(path, _KIND, f"bad data ({error})", _FETCH) from None
-    return np.asarray(pixels, np.float32)
+    return depth.astype(np.float32)
 
 
 def _checked(path: Path, header: _Header) -> str:
@@ -75,7 +76,8 @@ def _checked(path: Path, header: _Header) -> str:
         raise DataError(path, expected, f"{width}x{height} pixels, {len(channels)} channels", _EXPORT)
     name = next(iter(channels)) if len(channels) == 1 else next((n for n in _DEPTHS if n in channels), None)
     if name is None or channels[name] == _INTEGERS:
-        found = f"integers in {name}" if name else f"the channels {shortened(channels) or 'of none'}"
+        present = f"the channels {shortened(channels)}" if channels else "no channel"
+        found = f"integers in {name}" if name else present
         raise DataError(path, f"floats in one channel, or in {', '.join(_DEPTHS)}", found, _EXPORT)
     return name
 

@@ -19,9 +19,10 @@ import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from contextvars import ContextVar
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, astuple, dataclass, field, replace
 from pathlib import Path
 
+from gsjax.io.brief import brief
 from gsjax.io.parsed import parse_json
 
 try:
@@ -34,6 +35,7 @@ LOCK = ".gsjax.lock"
 _NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP, errno.EINVAL)
 _ATTEMPTS, _BETWEEN_S = 5, 0.1
 _MOST_BYTES = 2**16  # of a list of writers
+_QUOTED = 80  # characters of a name or a time in it
 
 
 @dataclass(frozen=True)
@@ -53,8 +55,8 @@ class Writer:
     shared: bool = False
 
     def __str__(self) -> str:
-        where = "" if self.host == socket.gethostname() else f" on {self.host}"
-        return f"process {self.pid}{where}, which has been writing there since {self.since}"
+        where = "" if self.host == socket.gethostname() else f" on {brief(self.host, _QUOTED)}"
+        return f"process {self.pid}{where}, which has been writing there since {brief(self.since, _QUOTED)}"
 
     @property
     def may_live(self) -> bool:
@@ -235,10 +237,18 @@ def _others(file: int, writer: Writer) -> list[Writer]:
     own, found = (writer.pid, writer.host), []
     for line in os.read(file, _MOST_BYTES).splitlines():
         with suppress(ValueError, TypeError):
-            other = Writer(**parse_json(line))
-            if type(other.pid) is int and (other.pid, other.host) != own and other.may_live:
+            other = _listed(line)
+            if (other.pid, other.host) != own and other.may_live:
                 found.append(other)
     return found
+
+
+def _listed(line: bytes) -> Writer:
+    """A line of the list; raises ValueError or TypeError if it is none that a writer wrote."""
+    writer = Writer(**parse_json(line))
+    if [type(value) for value in astuple(writer)] != [int, str, str, bool] or writer.pid < 1:
+        raise ValueError("another value")
+    return writer
 
 
 def _list_writers(file: int, writers: list[Writer]) -> None:

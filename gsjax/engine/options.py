@@ -14,7 +14,7 @@ from gsjax.data import ReadOptions
 
 AnyOptions = TypeVar("AnyOptions")
 Ids = Annotated[tuple[int, ...], tyro.conf.arg(metavar="ID [ID ...]")]
-Frames = Annotated[str, tyro.conf.arg(metavar="START:STOP[:STEP]")]
+Frames = Annotated[str, tyro.conf.arg(metavar="START:STOP[:STEP]", help_behavior_hint="(default: all)")]
 
 RESUME_MAY_CHANGE = ("out", "minutes", "resume", "overwrite", "cores", "debug")
 """Options that do not affect what is computed, so that a run may be resumed with others."""

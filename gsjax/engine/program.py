@@ -2,6 +2,8 @@
 
 from dataclasses import fields
 from importlib import import_module
+from shutil import get_terminal_size
+from textwrap import fill
 from typing import Any
 
 from gsjax.engine.machine import compute_on_host, keep_to_cores, missing_device
@@ -55,21 +57,27 @@ def parse_options(command: str, arguments: list[str], entry: tuple[str, str]) ->
         command, arguments, entry: as for `run_politely`.
 
     Raises:
-        ValueError: an option that takes a list has no values.
+        ValueError: an option does not exist, or one that takes a list has no values.
         SystemExit: the arguments are invalid, or ask for help; the message is printed.
     """
     import tyro
+
+    from gsjax.engine.usage import expect_known, plain_help
 
     module, does = entry
     chosen = import_module(module)
     options_for = getattr(chosen, "options_for", lambda given: (chosen.Options, given))
     kind, arguments = options_for(arguments)
+    expect_known(kind, command, arguments)
+    indent = "  "  # without it tyro joins the lines into one
+    about = f"{does[0].upper()}{does[1:]}." + getattr(chosen, "HELP", "")
     options = tyro.cli(
         kind,
         prog=f"gsjax {command}",
-        description=f"{does[0].upper()}{does[1:]}." + getattr(chosen, "HELP", ""),
+        description=fill(about, get_terminal_size().columns, initial_indent=indent, subsequent_indent=indent),
         args=arguments,
         config=(tyro.conf.FlagCreatePairsOff,),
+        registry=plain_help(),
     )
     _expect_values(options, arguments)
     return options

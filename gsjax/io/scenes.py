@@ -175,17 +175,15 @@ def write_gaussians(
         if "labels" not in written.options and len(np.unique(labels)) == 1:
             labels = None
     asked = {"labels": labels, "antialiased": antialiased or None, "origin": origin}
-    asked |= {"up": up, "background": background, "view": view, "film": film}
-    asked |= {"order": order} if "order" in written.options else {}
+    asked |= {"order": order, "up": up, "background": background, "view": view, "film": film}
     options = {name: value for name, value in asked.items() if value is not None}
     no_room = {"labels": "labels", "antialiased": "that the scene is antialiased"}
     if origin is not None:
         no_room["origin"] = f"the origin {in_numbers(origin)}, to which its places are relative"
     for name in [name for name in options if name not in written.options]:
         if name not in no_room:
-            raise ValueError(
-                f"{name}: expected a page (.html), which alone has it, found {path}; leave it out"
-            )
+            having = ", ".join(ending for ending, each in FORMATS.items() if name in each.options)
+            raise ValueError(f"{name}: expected a format that has it ({having}), found {path}; leave it out")
         left_out.append(no_room[name])
         del options[name]
     written.write(Path(path), drawn, **options)

@@ -2,6 +2,7 @@
 
 import json
 import struct
+from collections.abc import Callable
 from pathlib import Path
 
 import jax.numpy as jnp
@@ -11,7 +12,7 @@ from gsjax.data import open_sequence, read_open3d, write_panoptic
 from gsjax.data.simulated import tabletop
 from gsjax.io.ply import read_ply, write_ply
 from gsjax.scene.gaussians import Gaussians
-from tests.data import dots, realsense_bag
+from tests.data import dots
 from tests.data.exports import write_exr, write_record3d
 from tests.data.faults_of_photographs import build_transforms
 from tests.data.faulty import (
@@ -34,6 +35,7 @@ from tests.data.faulty import (
     picture,
     swap,
 )
+from tests.data.sensors import COLOR, DEPTH, Messages, realsense
 from tests.data.written import write_bop, write_paris
 
 
@@ -275,21 +277,52 @@ RECORD3D = (
 BAG = "desk.bag"
 
 
-def recorded(**changes) -> Damage:
-    return lambda root: realsense_bag.write(root / BAG, **({"lates": (0.0, 0.0)} | changes))
+def build_realsense(root: Path) -> None:
+    realsense(WIDTH, HEIGHT, frames=2).write(root / BAG)
+
+
+def recorded(edit: Callable[[Messages], object]) -> Damage:
+    def damage(root: Path) -> None:
+        messages = realsense(WIDTH, HEIGHT, frames=2)
+        edit(messages)
+        messages.write(root / BAG)
+
+    return damage
+
+
+def without(*topics: str) -> Damage:
+    return recorded(lambda messages: [messages.topics.pop(topic) for topic in topics])
+
+
+def colored(encoding: str, bytes_of_pixel: int) -> Damage:
+    pixels = np.zeros((HEIGHT, WIDTH, bytes_of_pixel), np.uint8)
+    return recorded(lambda messages: messages.images(COLOR, encoding, [(0.03, pixels)]))
+
+
+def late(messages: Messages) -> None:
+    depth = np.full((HEIGHT, WIDTH), 1500, np.uint16)
+    messages.images(DEPTH, "mono16", [(0.034, depth), (0.09, depth)], unit=0.001)
 
 
 REALSENSE = (
     Fault("another format", holds(BAG, b"PK\3\4"), (BAG,)),
     Fault("cut off", cut(BAG), (BAG,)),
-    Fault("no depth", recorded(drop=("Depth_0/image",)), (BAG, "Depth_0")),
-    Fault("no intrinsics", recorded(drop=("Color_0/info",)), (BAG, "Color_0")),
-    Fault("no places of the cameras", recorded(drop=("/tf/0",)), (BAG, "tf/0")),
-    Fault("compressed colour", recorded(encoding="MJPEG"), (BAG,)),
-    Fault("lines that are too short", recorded(step=40), (BAG,)),
-    Fault("size that the images do not have", recorded(info_size=(64, 48)), (BAG,)),
-    Fault("quaternion not normalised", recorded(turn=0), (BAG,)),
-    Fault("depth that is late", recorded(lates=(0.0, 0.025)), (BAG,)),
+    Fault("no depth", without(f"{DEPTH}/image/data"), (BAG, "Depth_0")),
+    Fault("no intrinsics", without(f"{COLOR}/info/camera_info"), (BAG, "Color_0")),
+    Fault("no places of the cameras", without(f"{COLOR}/tf/0", f"{DEPTH}/tf/0"), (BAG, "tf/0")),
+    Fault("compressed colour", colored("MJPEG", 3), (BAG,)),
+    Fault("lines that are too short", colored("rgb8", 2), (BAG,)),
+    Fault(
+        "size that the images do not have",
+        recorded(lambda messages: messages.info(COLOR, np.eye(3), size=(64, 48))),
+        (BAG,),
+    ),
+    Fault(
+        "quaternion not normalised",
+        recorded(lambda messages: messages.place(COLOR, quat=(0.0, 0.0, 0.0, 2.0))),
+        (BAG,),
+    ),
+    Fault("depth that is late", recorded(late), (BAG,)),
 )
 
 
@@ -321,6 +354,6 @@ RECORDINGS = {
     "PARIS": Layout(build_paris, lambda r: load_all(open_sequence(r)), PARIS),
     "Panoptic": Layout(build_panoptic, lambda r: load_all(open_sequence(r)), PANOPTIC),
     "Record3D": Layout(build_record3d, lambda r: load_all(open_sequence(r)), RECORD3D),
-    "RealSense": Layout(recorded(), lambda r: load_all(open_sequence(r / BAG)), REALSENSE),
+    "RealSense": Layout(build_realsense, lambda r: load_all(open_sequence(r / BAG)), REALSENSE),
     "PLY of Gaussians": Layout(build_gaussians, lambda r: read_ply(r / SCENE), GAUSSIANS),
 }

@@ -76,6 +76,7 @@ class Messages:
     def write(self, path, compressed=True):
         from rosbags.rosbag1 import Writer
 
+        path.unlink(missing_ok=True)
         writer = Writer(path)
         if compressed:
             writer.set_compression(Writer.CompressionFormat.LZ4)

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from plyfile import PlyData, PlyElement
 
+from benchmarks.fuzz_files import bounded
 from gsjax.data import DataError
 from gsjax.data.clouds import read_cloud
 
@@ -170,6 +171,13 @@ def test_colours_by_the_names_in_a_header(tmp_path):
     rows = np.concatenate([POINTS, NORMALS, BYTES[:, ::-1]], axis=1)
     (tmp_path / "a.txt").write_text("X;Y;Z;NX;NY;NZ;B;G;R\n" + lines_of(rows, ";"))
     np.testing.assert_allclose(read_cloud(tmp_path / "a.txt").colors, BYTES / 255)
+
+
+@pytest.mark.parametrize("bracket", "([")
+def test_brackets_that_are_never_closed_take_no_time(tmp_path, bracket):
+    (tmp_path / "a.xyz").write_text(f"x y z {bracket * 200_000}\n1 2 3\n")
+    with pytest.raises(DataError, match="a header of 4 names above rows of 3 numbers"), bounded():
+        read_cloud(tmp_path / "a.xyz")
 
 
 def test_files_without_colours_are_grey(tmp_path):

@@ -1,9 +1,11 @@
 """Damaged files of every reader are read or refused in a sentence, in bounds; benchmarks/fuzz_files.py tries
 more of them."""
 
+import numpy as np
 import pytest
 
 from benchmarks.fuzz_files import try_reader
+from benchmarks.mutations import mutated
 from benchmarks.readers import READERS
 
 CASES = 100  # of a reader; of slow ones, a share
@@ -12,6 +14,16 @@ SEED = 7
 
 @pytest.mark.parametrize("name", READERS)
 def test_what_is_damaged_is_read_or_refused_in_a_sentence(name, tmp_path):
+    if needs := READERS[name].needs:
+        pytest.importorskip(needs)
     cases = [*try_reader(name, range(round(CASES * READERS[name].share)), SEED, tmp_path)]
     assert not [case for case in cases if case.outcome == "fault"]
     assert "refused" in {case.outcome for case in cases}
+
+
+def test_a_case_is_made_from_its_number_alone():
+    content = b'{"a": {"b": [1, 2]}, "c": 3}'
+    numbers = range(3000)
+    first = [mutated(content, [content], np.random.default_rng([SEED, n])) for n in numbers]
+    again = [mutated(content, [content], np.random.default_rng([SEED, n])) for n in numbers]
+    assert first == again

@@ -219,6 +219,17 @@ def test_every_compression_is_read_and_its_end_is_found(tmp_path, compression):
             read_exr_depth(file)
 
 
+def test_damage_is_told_in_the_message_alone(tmp_path, capfd):
+    """Programs read what is on stdout."""
+    write_exr(tmp_path / "0.exr", R=np.ones((300, 300), np.float32))
+    content = bytearray((tmp_path / "0.exr").read_bytes())
+    content[-20:-10] = b"x" * 10
+    (tmp_path / "0.exr").write_bytes(content)
+    with pytest.raises(DataError, match=r"0.exr: expected depth .*, found bad data \(.*\). Fetch"):
+        read_exr_depth(tmp_path / "0.exr")
+    assert capfd.readouterr().out == ""
+
+
 def damaged(file, old, new):
     content = file.read_bytes()
     assert old in content
@@ -247,6 +258,14 @@ def test_a_size_that_no_camera_has_takes_no_memory(folder, side):
 def test_files_without_depth(tmp_path, channels, says):
     write_exr(tmp_path / "0.exr", **channels)
     with pytest.raises(DataError, match=f"0.exr: expected floats in one channel.*{says}"):
+        read_exr_depth(tmp_path / "0.exr")
+
+
+def test_a_file_without_channels(tmp_path):
+    write_exr(tmp_path / "0.exr", R=np.ones((12, 16), np.float32))
+    only = b"R\0" + struct.pack("<iIii", 2, 0, 1, 1)
+    damaged(tmp_path / "0.exr", only, bytes(len(only)))
+    with pytest.raises(DataError, match=r"found no channel\. Export"):
         read_exr_depth(tmp_path / "0.exr")
 
 

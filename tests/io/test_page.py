@@ -151,7 +151,7 @@ def test_what_cannot_be_played_is_refused(tmp_path, monkeypatch):
         ValueError, match="film: expected Gaussians that can all be drawn, found 1 that cannot"
     ):
         write_gaussians(tmp_path / "scene.html", bad, film=film)
-    with pytest.raises(ValueError, match=r"film: expected a page \(.html\), which alone has it"):
+    with pytest.raises(ValueError, match=r"film: expected a format that has it \(.html\), found"):
         write_gaussians(tmp_path / "scene.spz", scene, film=film)
     assert not list(tmp_path.iterdir())
 

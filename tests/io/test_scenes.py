@@ -218,11 +218,16 @@ def test_glb_is_what_the_extension_says(tmp_path):
     np.testing.assert_allclose(attribute(f"{prefix}SH_DEGREE_2_COEF_4", 3), columns.rest[:, 7], atol=1e-6)
 
 
-def test_only_a_page_has_an_up(tmp_path):
+@pytest.mark.parametrize(
+    ("name", "value", "having"),
+    [("up", (0, 0, 1), ".html"), ("order", np.arange(3), ".compressed.ply, .sog")],
+)
+def test_options_that_a_format_lacks_are_refused(tmp_path, name, value, having):
     with pytest.raises(
-        ValueError, match=r"up: expected a page \(.html\), which alone has it, found .*scene.spz"
+        ValueError, match=rf"{name}: expected a format that has it \({having}\), found .*a.spz"
     ):
-        write_gaussians(tmp_path / "scene.spz", make_scene(3), up=(0, 0, 1))
+        write_gaussians(tmp_path / "a.spz", make_scene(3), **{name: value})
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("name", ["scene.ksplat", "scene.obj", "scene", "scene.gltf"])

@@ -160,9 +160,15 @@ def test_without_locks_of_files_the_writers_that_are_listed_decide(tmp_path, mon
     assert f"if it is gone, remove {tmp_path / LOCK}" in said
     listed(tmp_path, host="elsewhere")
     assert "process 1 on elsewhere, which" in refusal(tmp_path)
+    listed(tmp_path, host="x" * 9000, since="y" * 9000)
+    assert len(refusal(tmp_path)) < 500 + 2 * len(str(tmp_path))
     listed(tmp_path, shared=True)
     with locked(tmp_path, shared=True):
         pass
+    for wrong in ({"pid": 0}, {"pid": -1}, {"host": [0]}, {"since": None}, {"shared": 1}):
+        listed(tmp_path, **wrong)
+        with locked(tmp_path):
+            pass
     ended = subprocess.Popen([sys.executable, "-c", ""])
     ended.wait()
     listed(tmp_path, pid=ended.pid)

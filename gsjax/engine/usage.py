@@ -1,0 +1,98 @@
+"""How the options of commands are shown by `--help`, and what is said of one that does not exist."""
+
+import re
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import fields, is_dataclass, replace
+from difflib import get_close_matches
+from typing import Annotated, Any, get_args, get_type_hints
+
+import tyro
+from tyro.constructors import ConstructorRegistry, StructConstructorSpec, StructFieldSpec, StructTypeInfo
+
+_UNSAID = (None, False, ())  # defaults that the help text explains, or that mean "not given"
+
+
+def plain_help() -> ConstructorRegistry:
+    """Rules for tyro by which help texts are wrapped once, and defaults that say nothing are left out."""
+    registry, within = ConstructorRegistry(), []
+
+    @registry.struct_rule
+    def of_dataclass(info: StructTypeInfo) -> StructConstructorSpec | None:
+        if not is_dataclass(info.type) or info.type in within:
+            return None
+        within.append(info.type)  # tyro's own rule answers the second time
+        try:
+            found = ConstructorRegistry.get_struct_spec(info)
+        finally:
+            within.pop()
+        if not isinstance(found, StructConstructorSpec):
+            return None
+        return replace(found, fields=tuple(map(_plain, found.fields)))
+
+    return registry
+
+
+def expect_known(kind: Any, command: str, arguments: Sequence[str]) -> None:
+    """Check that the options of a command line exist.
+
+    Args:
+        kind: the command's options, a dataclass or a union of them.
+        command: its name, for the message.
+        arguments: the arguments after the name.
+
+    Raises:
+        ValueError: one does not exist; the message names those that may be meant.
+    """
+    known = [name for member in get_args(kind) or (kind,) for name in _names(member)]
+    for argument in arguments:
+        given = argument.split("=")[0].replace("_", "-")
+        if (
+            re.match("--[a-zA-Z]", given)
+            and given not in known
+            and not given.startswith(("--help", "--tyro"))
+        ):
+            meant = " or ".join(_meant(given, known))
+            hint = f"; did you mean {meant}?" if meant else ";"
+            raise ValueError(f"{given}: no such option{hint} gsjax {command} --help lists all")
+
+
+def _plain(field: StructFieldSpec) -> StructFieldSpec:
+    """A field whose help text has no line breaks of the source, and no default that says nothing."""
+    kind, unsaid = field.type, any(field.default is value for value in _UNSAID)
+    if unsaid:
+        kind = Annotated[kind, tyro.conf.arg(help_behavior_hint="")]
+    if field.default is None:  # what is not given is None: nobody needs to write it
+        kind = tyro.conf.DisallowNone[kind]
+    return replace(field, type=kind, helptext=_one_paragraph(field.helptext))
+
+
+def _one_paragraph(text: str | Callable[[], str | None] | None) -> Callable[[], str | None]:
+    """The text without line breaks, when it is wanted: finding it takes a while."""
+
+    def joined() -> str | None:
+        found = text() if callable(text) else text
+        return None if found is None else " ".join(found.split())
+
+    return joined
+
+
+def _names(kind: type, prefix: str = "--") -> Iterator[str]:
+    """The options of a dataclass, those of its groups included."""
+    hints = get_type_hints(kind, include_extras=True)
+    for field in fields(kind):
+        group, *marks = get_args(hints[field.name]) or (hints[field.name],)
+        flat = tyro.conf.OmitArgPrefixes in marks or any(getattr(mark, "name", None) == "" for mark in marks)
+        name = prefix + field.name.replace("_", "-")
+        if is_dataclass(group):
+            yield from _names(group, prefix if flat else f"{name}.")
+        else:
+            yield name
+            if group is bool:  # where it is on by default, its option turns it off
+                yield name.replace(prefix, f"{prefix}no-", 1)
+
+
+def _meant(given: str, known: Sequence[str]) -> list[str]:
+    """The known options most like the given one, with or without the names of their groups."""
+    last = [f"--{name.removeprefix('--').split('.')[-1]}" for name in known]
+    close = get_close_matches(given, [*known, *last], 1, 0.7)
+    return [name for name, short in zip(known, last, strict=True) if name in close or short in close]

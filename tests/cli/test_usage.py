@@ -1,0 +1,69 @@
+"""What `--help` shows, and what is said of an option that does not exist."""
+
+import re
+from importlib import import_module
+from itertools import pairwise
+
+import pytest
+
+from gsjax.cli import COMMANDS
+from gsjax.engine.program import parse_options
+from gsjax.engine.usage import expect_known
+
+
+def help_of(command, width, monkeypatch, capsys):
+    """What --help prints in a terminal of this width."""
+    monkeypatch.setenv("COLUMNS", str(width))
+    with pytest.raises(SystemExit):
+        parse_options(command, ["--help"], COMMANDS[command])
+    return capsys.readouterr().out
+
+
+@pytest.mark.parametrize("width", [80, 120])
+@pytest.mark.parametrize("command", ["fit", "track", "export", "query"])
+def test_help_is_wrapped_once_and_says_no_empty_default(command, width, monkeypatch, capsys):
+    said = help_of(command, width, monkeypatch, capsys)
+    assert max(map(len, said.splitlines())) <= width
+    assert not re.search(r"\(default: (:|False|None)?\)", said)
+    assert "{None}" not in said.replace(
+        "everywhere {None}|INT", ""
+    )  # where None means all
+    # A word begins a line only where it did not fit into the line above.
+    lines = [line.strip("│") for line in said.splitlines()]
+    for above, below in pairwise(lines):
+        words, column = below.split(), len(below) - len(below.lstrip())
+        if words and words[0][0].islower() and above[:column].strip() == "" and above.strip():
+            assert len(above.rstrip()) + 1 + len(words[0]) > width - 4
+
+
+def test_defaults_that_say_something_stay(monkeypatch, capsys):
+    said = help_of("track", 120, monkeypatch, capsys)
+    assert all(words in said for words in ("(default: 1.0)", "(default: all)", "(required)"))
+
+
+@pytest.mark.parametrize(
+    ("command", "given", "meant"),
+    [
+        ("fit", "--stpes", "did you mean --fit.steps?"),
+        ("fit", "--steps", "did you mean --fit.steps?"),
+        ("fit", "--fit.stpes=3", "did you mean --fit.steps?"),
+        ("fit", "--sede", "did you mean --seed or --fit.seed?"),
+        ("track", "--test_evry", "no such option"),
+        ("query", "--min-scor", "did you mean --min-score?"),
+        ("poses", "--overwite", "did you mean --overwrite?"),
+        ("experiment", "--schedular", "did you mean --scheduler?"),
+    ],
+)
+def test_a_mistyped_option_is_guessed(command, given, meant):
+    with pytest.raises(ValueError, match=re.escape(f"gsjax {command} --help lists all")) as refused:
+        parse_options(command, ["x", given, "10"], COMMANDS[command])
+    assert f"{given.split('=')[0].replace('_', '-')}: no such option" in str(refused.value)
+    assert meant in str(refused.value)
+
+
+@pytest.mark.parametrize("command", ["fit", "deform", "query", "poses", "distill"])
+def test_every_option_of_a_command_is_known(command, monkeypatch, capsys):
+    said = help_of(command, 120, monkeypatch, capsys)
+    shown = re.findall(r"^[│ ] (--[\w.-]+)", said, re.MULTILINE)
+    assert len(shown) > 5
+    expect_known(import_module(COMMANDS[command][0]).Options, command, shown)
