@@ -4,7 +4,7 @@ verbs       fit, track, parts, distill, deform: data in, a tick a step, `now.res
 settings    FitConfig, TrackConfig, PartsConfig, DistillConfig, DeformConfig
 data        open_photographs, open_sequence, Photographs, Sequence
 tracking    start_scene, scene_from_shapes
-files       save, load, read_gaussians, write_gaussians, read_ply, write_ply
+files       save, load, open_scene, read_gaussians, write_gaussians, read_ply, write_ply
 scene       Gaussians, Tags, Camera, Frame, render, plan_render
 rasterize   rasterization, plan, Plan, sharded_rasterization, composite_tile
 speed       host_options, keep_freed_memory, keep_programs
@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from gsjax.data import Photographs, Sequence, open_photographs, open_sequence
     from gsjax.engine.checkpoint import load, save
     from gsjax.engine.verbs import deform, distill, fit, parts, track
+    from gsjax.engine.viewables import open_scene
     from gsjax.geometry.cameras import Camera
     from gsjax.io.ply import read_ply, write_ply
     from gsjax.io.scenes import read_gaussians, write_gaussians
@@ -41,6 +42,7 @@ _HOMES = {
     "gsjax.data": ("Photographs", "Sequence", "open_photographs", "open_sequence"),
     "gsjax.engine.checkpoint": ("load", "save"),
     "gsjax.engine.verbs": ("deform", "distill", "fit", "parts", "track"),
+    "gsjax.engine.viewables": ("open_scene",),
     "gsjax.geometry.cameras": ("Camera",),
     "gsjax.io.ply": ("read_ply", "write_ply"),
     "gsjax.io.scenes": ("read_gaussians", "write_gaussians"),
@@ -82,6 +84,7 @@ __all__ = [
     "keep_programs",
     "load",
     "open_photographs",
+    "open_scene",
     "open_sequence",
     "parts",
     "plan",

@@ -30,8 +30,14 @@ def load(path: str | os.PathLike) -> Tick:
 
     Raises:
         FileNotFoundError: there is no file at `path`.
+        IsADirectoryError: it is a folder, such as that of a run of the command line.
         CheckpointError: it is damaged, of another version of gsjax, or holds something else.
     """
+    if os.path.isdir(path):
+        raise IsADirectoryError(
+            f"{os.fspath(path)}: expected a file of gsjax.save, found a folder; gsjax.open_scene opens the "
+            "scene of a run"
+        )
     stored, times = load_checkpoint(path)
     if not isinstance(stored, dict) or set(stored) != {"method", "run", "result", "info"}:
         raise CheckpointError(

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 from plyfile import PlyData, PlyElement
 
+import gsjax
 from gsjax.engine.distill.saved import Whereabouts
 from gsjax.engine.viewables import open_viewable
 from gsjax.io.ply import read_ply, write_ply
@@ -74,6 +75,18 @@ def test_a_tracked_scene_over_time(tracked, notes):
         np.testing.assert_array_equal(scene.labels, saved["labels"])
     np.testing.assert_allclose(scene.at(3).means[:12] - scene.at(0).means[:12], 0.03, atol=1e-6)
     assert scene.colorings == ("colour", "depth", "label")
+
+
+def test_what_can_be_viewed_is_opened_in_python(tracked, ply, recording):
+    assert gsjax.open_scene(str(ply)).gaussians.num == gsjax.read_gaussians(ply)[0].num
+    scene = gsjax.open_scene(tracked)
+    with np.load(tracked / "trajectory.npz") as saved:
+        np.testing.assert_allclose(scene.at(2).means, saved["means"][2], atol=1e-6)
+    shutil.rmtree(recording)
+    with pytest.warns(UserWarning, match="its recording is not shown"):
+        assert gsjax.open_scene(tracked).num_frames == 4
+    with pytest.raises(IsADirectoryError, match=r"gsjax\.open_scene opens the scene"):
+        gsjax.load(tracked)
 
 
 def test_a_tracked_scene_whose_recording_is_gone_still_moves(tracked, recording, notes):
