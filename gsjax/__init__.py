@@ -15,9 +15,8 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from gsjax.data import Photographs, Sequence, open_photographs, open_sequence
-    from gsjax.engine.checkpoint import load, save
+    from gsjax.engine.checkpoint import load, open_scene, save
     from gsjax.engine.verbs import deform, distill, fit, parts, track
-    from gsjax.engine.viewables import open_scene
     from gsjax.geometry.cameras import Camera
     from gsjax.io.ply import read_ply, write_ply
     from gsjax.io.scenes import read_gaussians, write_gaussians
@@ -40,9 +39,8 @@ __version__ = "0.1.0"
 # Loaded at first use (PEP 562): `gsjax --help` need not wait for JAX.
 _HOMES = {
     "gsjax.data": ("Photographs", "Sequence", "open_photographs", "open_sequence"),
-    "gsjax.engine.checkpoint": ("load", "save"),
+    "gsjax.engine.checkpoint": ("load", "open_scene", "save"),
     "gsjax.engine.verbs": ("deform", "distill", "fit", "parts", "track"),
-    "gsjax.engine.viewables": ("open_scene",),
     "gsjax.geometry.cameras": ("Camera",),
     "gsjax.io.ply": ("read_ply", "write_ply"),
     "gsjax.io.scenes": ("read_gaussians", "write_gaussians"),

@@ -1,11 +1,19 @@
-"""`gsjax.save` and `gsjax.load`: a tick of any method in one file, read back without a template."""
+"""What was reconstructed, read back: `gsjax.save` and `gsjax.load`, a tick of any method in one file, without
+a template; and `gsjax.open_scene`, the scene of a run of the command line."""
 
 import dataclasses
 import os
-from typing import Any
+import warnings
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from gsjax.engine.drive import Tick
 from gsjax.io.checkpoints import CheckpointError, load_checkpoint, save_checkpoint
+
+if TYPE_CHECKING:
+    from gsjax.viz.viewer import Viewable
+else:
+    Viewable = Any  # slow to import, as all that shows a scene is
 
 
 def save(path: str | os.PathLike, now: Tick) -> None:
@@ -48,3 +56,26 @@ def load(path: str | os.PathLike) -> Tick:
     now = Tick(problem=None, **stored, **times)
     vars(now)["result"] = result
     return now
+
+
+def open_scene(path: str | os.PathLike) -> Viewable:
+    """The scene of a run of the command line over time; or that of a file of Gaussians, or of a folder of
+    numbered ones. `scene.at(frame)` is one frame, for `gsjax.render`. What is odd is warned of.
+
+    Args:
+        path: the folder of a run, the file, or the folder of files.
+
+    Raises:
+        FileNotFoundError: there is nothing at `path`, or no scene.
+        ValueError: a file is not as it was written, or holds no Gaussians.
+    """
+    from rich.console import Console
+
+    from gsjax.engine.messages import Notes
+    from gsjax.engine.viewables import open_viewable
+
+    notes = Notes(Console(quiet=True))
+    scene, _ = open_viewable(Path(path), notes)
+    for text in notes.warnings:
+        warnings.warn(text, UserWarning, stacklevel=2)
+    return scene

@@ -1,14 +1,11 @@
 """The scenes that `gsjax view` opens: a run of any kind, a file of Gaussians or a folder of numbered ones."""
 
-import os
-import warnings
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Literal
 
 import jax.numpy as jnp
 import numpy as np
-from rich.console import Console
 
 from gsjax.data.ordered import open_as_sequence
 from gsjax.data.origin import relative_to_origin
@@ -41,23 +38,6 @@ UP = {sign + axis: s * np.eye(3)[i] for sign, s in (("", 1), ("-", -1)) for i, a
 """Directions by their names."""
 _SAME_COLOR = 0.1  # of a coefficient: two steps of the coarsest format
 _AGAIN = "reconstruct it again with this version of gsjax"
-
-
-def open_scene(path: str | os.PathLike) -> Viewable:
-    """The scene of a run of the command line over time, for Python; or that of a file of Gaussians, or of a
-    folder of numbered ones. `scene.at(frame)` is one frame, for `gsjax.render`. What was odd is warned of.
-
-    Args:
-        path: the folder of a run, the file, or the folder.
-
-    Raises:
-        FileNotFoundError, ValueError: as for `open_viewable`.
-    """
-    notes = Notes(Console(quiet=True))
-    scene, _ = open_viewable(Path(path), notes)
-    for text in notes.warnings:
-        warnings.warn(text, UserWarning, stacklevel=2)
-    return scene
 
 
 def open_viewable(path: Path, notes: Notes, now: Whereabouts = AS_IT_WAS) -> tuple[Viewable, Path]:

@@ -118,7 +118,13 @@ def whole(low: int, high: int) -> Checked:
 
 
 def vector(wanted: str, least: float = 0.0, far: float = _FAR) -> Checked:
-    """A vector of three numbers within `far` of 0 whose length is at least `least`."""
+    """A vector of three numbers.
+
+    Args:
+        wanted: description for messages.
+        least: its least length.
+        far: how far from 0 each number may be.
+    """
     one, wanted = number("", -far, far)["check"], f"{wanted} as [x, y, z]"
 
     def check(value: Any) -> Vector:

@@ -10,9 +10,9 @@ import pytest
 import yaml
 
 from gsjax.data.video import describe_video
-from gsjax.engine.files import about_scene, write_scene
+from gsjax.engine.files import write_scene
 from gsjax.engine.parts import films
-from gsjax.engine.parts.films import edited, shots
+from gsjax.engine.parts.films import shots
 from gsjax.engine.parts.outputs import write_parts
 from gsjax.engine.parts.saved import open_parts_run
 from gsjax.io.ply import read_ply, write_ply
@@ -96,30 +96,6 @@ def test_of_a_partial_run_only_what_was_followed_is_taken(tmp_path, anchor, foll
     saved = open_parts_run(write_run(tmp_path / "run", followed=followed, anchor=anchor))
     assert not saved.complete
     np.testing.assert_allclose(saved.layer.trajectory.times, STEP * np.array(kept), rtol=1e-6)
-
-
-@pytest.mark.filterwarnings("ignore:.*coordinates reach")
-def test_points_are_in_the_coordinates_of_the_data_also_far_from_0(run, tmp_path):
-    """Of edits, of the place of another run's parts, and of their own edits."""
-    text = """
-    edits:
-      - {op: rotate, parts: [drawer], axis: [0, 0, 1], degrees: 30, about: [%s, 0.2, 0.1]}
-      - op: composite
-        from_run: %s
-        parts: [1]
-        place: {to: [%s, 0, 0]}
-        edits: [{op: redirect, parts: [1], degrees: 10, axis: [0, 1, 0], about: [%s, 0, 0]}]
-    """
-    near = open_parts_run(run)
-    origin = np.array([5e6, 0.0, 0.0])
-    far = replace(near, recording=about_scene(near.recording, origin))
-    other = write_run(tmp_path / "other")
-    far_other = write_run(tmp_path / "far", origin=origin)
-    expected, _ = edited(parse_script(text % (0.5, other, 1.5, 0.25)), near)
-    found, _ = edited(parse_script(text % (5000000.5, far_other, 5000001.5, 5000000.25)), far)
-    assert len(found) == len(expected) == 2
-    for was, now in zip(jax.tree.leaves(expected), jax.tree.leaves(found), strict=True):
-        np.testing.assert_allclose(now, was, atol=1e-6)
 
 
 def test_a_script_is_filmed_and_can_be_given_again(gsjax, run, tmp_path):
