@@ -49,7 +49,7 @@ _CALIBRATIONS = {
 }
 _SIZE = (640, 480)
 _COMPLETE = "Check the folder; was it copied completely?"
-_GIVE_K = "ive its intrinsics: K (--read.K), fx fy cx cy in pixels, centres at +0.5."
+_INTRINSICS = "the camera's intrinsics as K (--read.K): fx fy cx cy in pixels, with pixel centres at +0.5."
 _UNIT_TOLERANCE = 0.01  # on a quaternion's length: files have four digits
 
 
@@ -215,12 +215,12 @@ def _published(
     camera = re.search(r"(?:freiburg|fr)([123])(?!\d)", name.lower())
     if camera is None:
         expected = "a folder name with freiburg1, freiburg2 or freiburg3, which identifies the camera"
-        advice = f"Rename the folder, or g{_GIVE_K}"
+        advice = f"Rename the folder, or give {_INTRINSICS}"
         raise DataError(root, expected, repr(name), advice)
     if size != _SIZE:
         expected = f"{_SIZE[0]}x{_SIZE[1]} pixels, for which freiburg{camera[1]} is calibrated"
         found = f"{size[0]}x{size[1]}"
-        raise DataError(image, expected, found, f"G{_GIVE_K}")
+        raise DataError(image, expected, found, f"Give {_INTRINSICS}")
     (fx, fy, cx, cy), distortion = _CALIBRATIONS[int(camera[1])]
     return np.array([[fx, 0, cx + 0.5], [0, fy, cy + 0.5], [0, 0, 1]]), distortion
 

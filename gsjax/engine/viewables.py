@@ -106,7 +106,8 @@ def _of_files(path: Path, files: list[Path], notes: Notes) -> Viewable:
         if (there.num, there.sh_degree) != (first.num, first.sh_degree):
             raise ValueError(
                 f"{file}: expected {first.num} Gaussians of degree {first.sh_degree} as in {files[0].name}, "
-                f"found {there.num} of degree {there.sh_degree}; view it alone"
+                f"found {there.num} of degree {there.sh_degree}; move it out of "
+                "the folder, or name that file alone"
             )
         frames.append(moved_to(there, known.origin, report.origin))
     colors = np.asarray(first.sh0)

@@ -191,7 +191,7 @@ def test_missing_and_empty_lists(folder, name):
 def test_a_folder_whose_name_does_not_identify_the_camera(tmp_path):
     folder = Folder(tmp_path / "desk", size=(64, 48))
     with pytest.raises(
-        DataError, match=r"freiburg1, freiburg2 or .*found 'desk'.*give its intrinsics: K \(--read.K\)"
+        DataError, match=r"freiburg1, freiburg2 or .*found 'desk'.*or give the camera's intrinsics as K \("
     ):
         folder.read()
 

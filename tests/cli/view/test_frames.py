@@ -55,9 +55,8 @@ def test_numbered_files_are_a_scene_for_every_command(export, tracked, tmp_path,
     assert (code, "expected another file than the one that is read" in said) == (2, True), said
     write_ply(folder / "f4.ply", some(7))
     code, said = view(folder)
-    assert (code, "f4.ply: expected 30 Gaussians of degree 0 as in f0.ply, found 7" in said) == (2, True), (
-        said
-    )
+    for part in ("f4.ply: expected 30 Gaussians of degree 0 as in f0.ply, found 7", "move it out of the"):
+        assert (code, part in said) == (2, True), said
 
 
 @pytest.mark.filterwarnings("ignore:.*they are taken relative to the origin")
