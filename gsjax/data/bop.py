@@ -23,7 +23,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.optimize import linear_sum_assignment
 
-from gsjax.data.errors import DataError, DataWarning, shortened
+from gsjax.data.errors import COMPLETE, DataError, DataWarning, shortened
 from gsjax.data.files import image_size, read_depth, read_image, read_json
 from gsjax.data.frame_folders import DEFAULT_RATE_HZ, numbered
 from gsjax.data.masks import read_shades
@@ -35,7 +35,6 @@ from gsjax.data.validation import check_intrinsics, check_poses
 CAMERAS, POSES = "scene_camera.json", "scene_gt.json"
 _MM = 0.001
 _STANDING = "camera"
-_COMPLETE = "Check the folder; was it copied completely?"
 
 
 class _View(NamedTuple):
@@ -232,7 +231,7 @@ def _complete_frames(root: Path, frames: list[int], parts: dict[str, dict | None
             left_out.append(f"{len(lacking)} without {what} ({shortened(f'{n:06d}' for n in lacking)})")
     if not numbers:
         found = f"none of {len(frames)}: {', '.join(left_out)}" if left_out else "none"
-        raise DataError(root, "frames with image, depth, annotations and camera", found, _COMPLETE)
+        raise DataError(root, "frames with image, depth, annotations and camera", found, COMPLETE)
     if left_out:
         count = len(frames) - len(numbers)
         message = f"{root}: {count} of {len(frames)} frames are left out: {', '.join(left_out)}"

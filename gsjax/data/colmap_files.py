@@ -9,11 +9,12 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from gsjax.data.errors import DataError
+from gsjax.data.errors import COMPLETE, DataError
 from gsjax.data.files import read_text
 from gsjax.data.lens import Lens
 from gsjax.data.photographs import Cloud
 from gsjax.data.text import decoded
+from gsjax.data.validation import check_quaternions
 
 # Model id of a binary file -> (name, number of parameters).
 _MODELS = {
@@ -31,7 +32,6 @@ _MODELS = {
     14: ("SIMPLE_FISHEYE", 3),
     15: ("FISHEYE", 4),
 }
-_UNIT_TOLERANCE = 0.01  # on a quaternion's length: text files often have few digits
 _COUNTS = dict(_MODELS.values())
 _UNDISTORT = "Run COLMAP's image_undistorter, and give its folder."
 AGAIN = "The file may be truncated: fetch or export it again."
@@ -120,10 +120,9 @@ def _viewmat(
     Raises:
         DataError: the quaternion's length is neither 0 nor close to 1.
     """
-    if not np.isfinite([*quat, *translation]).all() or (length := np.hypot.reduce(quat)) < 1e-9:
+    if not np.isfinite([*quat, *translation]).all() or np.hypot.reduce(quat) < 1e-9:
         return np.full((4, 4), np.nan)
-    if abs(length - 1) > _UNIT_TOLERANCE:
-        raise DataError(where, f"a unit quaternion for {name}", f"{list(quat)} of length {length:.3g}", AGAIN)
+    check_quaternions(np.array([quat]), lambda _: f"{where}, {name}", AGAIN)
     viewmat = np.eye(4)
     viewmat[:3, :3] = Rotation.from_quat(quat, scalar_first=True).as_matrix()
     viewmat[:3, 3] = translation
@@ -138,9 +137,7 @@ class _Bytes:
         try:
             self.content = path.read_bytes()
         except FileNotFoundError:
-            raise DataError(
-                path, "a file of the reconstruction", "no such file", "Was the folder copied completely?"
-            ) from None
+            raise DataError(path, "a file of the reconstruction", "no such file", COMPLETE) from None
 
     def take(self, layout: str) -> tuple:
         layout = f"<{layout}"

@@ -4,6 +4,9 @@ from collections.abc import Iterable
 
 from gsjax.io.brief import brief
 
+COMPLETE = "Was the folder copied completely?"
+"""The advice where a file is missing that others tell of."""
+
 
 class DataError(ValueError):
     """A file or folder that cannot be used: its path, what was expected, what was found, what to do."""

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from gsjax.data.errors import DataError, MissingFile
+from gsjax.data.errors import COMPLETE, DataError, MissingFile
 from gsjax.data.pictures import is_cut_off, is_raw, unread_format
 from gsjax.data.text import decoded
 from gsjax.io.arrays import ArraysError, load_arrays
@@ -42,8 +42,7 @@ def read_text(path: Path, expected: str = "text") -> str:
     try:
         content = path.read_bytes()
     except (FileNotFoundError, NotADirectoryError, IsADirectoryError):
-        advice = "Check the folder; was it copied completely?"
-        raise DataError(path, expected, "no such file", advice) from None
+        raise DataError(path, expected, "no such file", COMPLETE) from None
     try:
         return decoded(content)
     except ValueError as error:
@@ -81,8 +80,7 @@ def read_arrays(path: Path) -> dict[str, np.ndarray]:
     try:
         return load_arrays(path)
     except FileNotFoundError:
-        advice = "Check the folder; was it copied completely?"
-        raise DataError(path, "arrays", "no such file", advice) from None
+        raise DataError(path, "arrays", "no such file", COMPLETE) from None
     except ArraysError as error:
         raise DataError(path, "plain arrays", f"bad data ({error})", "Fetch the file again.") from None
 

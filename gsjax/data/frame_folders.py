@@ -4,7 +4,7 @@ import re
 import warnings
 from pathlib import Path
 
-from gsjax.data.errors import DataError, DataWarning
+from gsjax.data.errors import COMPLETE, DataError, DataWarning
 from gsjax.data.files import picture_size
 from gsjax.data.pictures import SUFFIXES, is_picture, refuse_unread
 
@@ -42,7 +42,7 @@ def pictures_beside(folder: Path, count: int, frames: str) -> list[Path]:
     found = pictures(folder)
     if len(found) != count:
         expected = f"{count} pictures, one per frame of {frames}"
-        advice = "Was the folder copied completely? Pictures are paired in order of name."
+        advice = f"{COMPLETE} Pictures are paired in order of name."
         raise DataError(folder, expected, f"{len(found)}", advice)
     return found
 

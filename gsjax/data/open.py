@@ -15,7 +15,7 @@ from gsjax.data.bop import read_bop
 from gsjax.data.duplicates import without_duplicates
 from gsjax.data.endonerf import is_endonerf, is_unambiguous_endonerf, read_endonerf
 from gsjax.data.endovis import LEFT, is_endovis, read_endovis
-from gsjax.data.errors import DataError, shortened
+from gsjax.data.errors import COMPLETE, DataError, shortened
 from gsjax.data.open3d_rgbd import is_open3d, read_open3d
 from gsjax.data.panoptic import read_panoptic
 from gsjax.data.paris import Split, read_paris
@@ -319,8 +319,7 @@ def _find_poses(images: Path) -> str:
 
 def _unknown(root: Path, marks: dict[str, str], options: ReadOptions) -> DataError:
     if (missing := colmap.find_missing_file(root)) is not None:
-        advice = "Was the folder copied completely?"
-        return DataError(missing, "a file of the reconstruction", "no such file", advice)
+        return DataError(missing, "a file of the reconstruction", "no such file", COMPLETE)
     expected = f"poses of the photographs ({', '.join(layout.mark for layout in _PHOTOGRAPHS)})"
     for folder in (root, root / options.images):
         files = [*folder.iterdir()] if folder.is_dir() else []

@@ -13,7 +13,6 @@ from gsjax.data.errors import DataError, DataWarning
 from gsjax.data.objects import PointModel, Truth
 from gsjax.data.photographs import Photographs
 from gsjax.data.sequence import Sequence
-from gsjax.geometry.cameras import NEAR
 from gsjax.scene.origin import about, far_origin, in_words
 
 Data = TypeVar("Data", Photographs, Sequence)
@@ -45,7 +44,7 @@ def near_origin(read: Callable[Given, Data]) -> Callable[Given, Data]:
             expected, found = f"cameras within {_FARTHEST:g} of 0", f"one at {np.abs(centers).max():g}"
             raise DataError(args[0] if args else data.name, expected, found, "Correct its pose.")
         cloud = data.cloud if isinstance(data, Photographs) else None
-        least = _LEAST if _stand_still(centers) else NEAR
+        least = _LEAST if _stand_still(centers) else 0.0
         origin = far_origin(centers.reshape(-1, 3), [] if cloud is None else [cloud.points], least)
         if origin is None:
             return data

@@ -18,7 +18,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from gsjax.data.errors import DataError, DataWarning
+from gsjax.data.errors import COMPLETE, DataError, DataWarning
 from gsjax.data.files import SATURATED_DEPTH, as_numbers, read_arrays, read_depth, read_image, read_json
 from gsjax.data.frame_folders import DEFAULT_RATE_HZ
 from gsjax.data.masks import read_mask
@@ -242,8 +242,7 @@ def _present_frames(root: Path, names: list[list[str]]) -> list[int]:
     some, every = exists.any(1), exists.all(1)
     if not some.any():
         found = f"none of {exists.size} ({names[0][0]} is missing, for example)"
-        advice = "Was the folder copied completely?"
-        raise DataError(root / "ims", "the images listed in the metadata", found, advice)
+        raise DataError(root / "ims", "the images listed in the metadata", found, COMPLETE)
     if (some & ~every).any():
         t = int(np.argmax(some & ~every))
         missing = [name for name, present in zip(names[t], exists[t], strict=True) if not present]

@@ -16,7 +16,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from gsjax.data.errors import DataError, DataWarning, shortened
+from gsjax.data.errors import COMPLETE, DataError, DataWarning, shortened
 from gsjax.data.files import image_size, read_depth, read_image, read_json
 from gsjax.data.names import find_file
 from gsjax.data.objects import Truth
@@ -71,7 +71,7 @@ def read_paris(path: str | Path, *, split: Split = "train", depth_unit_m: float 
         counted = " and ".join(
             f"{len(state.poses)} in {which}" for which, state in zip(STATES, states, strict=True)
         )
-        advice = f"Check the names in camera_{split}.json; was the folder copied completely?"
+        advice = f"Check the names in camera_{split}.json. {COMPLETE}"
         raise DataError(root, "pictures of one name in both states", f"{counted}, none in both", advice)
     if len(names) < len(every):
         left_out = sorted(every - set(names))
@@ -119,8 +119,7 @@ def _read_state(root: Path, state: str, split: str) -> _State:
     images = {name: file for name, file in files.items() if file is not None}
     if poses and not images:
         found = f"none of {len(poses)}, for example no {min(poses)}.png"
-        advice = "Check the folder; was it copied completely?"
-        raise DataError(root / state / split, f"the pictures listed in {path.name}", found, advice)
+        raise DataError(root / state / split, f"the pictures listed in {path.name}", found, COMPLETE)
     usable = sorted(name for name in images if np.isfinite(poses[name]).all())
     if usable:
         checked = np.stack([poses[name] for name in usable])[:, None]

@@ -12,7 +12,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float, Int
 
-from gsjax.data.errors import DataError, DataWarning
+from gsjax.data.errors import COMPLETE, DataError, DataWarning
 from gsjax.data.files import BLACK, background_behind, picture_size, read_arrays, read_image
 from gsjax.data.frame_folders import pictures
 from gsjax.data.lens import scaled_intrinsics
@@ -84,9 +84,7 @@ def read_dynerf(path: str | Path, axes: Axes = "llff") -> Sequence:
     paths = sorted(root.glob("cam*.mp4"))
     if len(paths) != len(viewmats):
         expected, found = f"{len(viewmats)} videos cam*.mp4, one per row", f"{len(paths)}"
-        raise DataError(
-            file, expected, found, "Was the folder copied completely? Remove the rows of missing videos."
-        )
+        raise DataError(file, expected, found, f"{COMPLETE} Remove the rows of missing videos.")
     described = [describe_video(video) for video in paths]
     shapes = [(video.width, video.height) for video in described]
     if len(set(shapes)) > 1:

@@ -28,6 +28,7 @@ from gsjax.data.lens import Lens, intrinsics_matrix, undistort
 from gsjax.data.registration import registered
 from gsjax.data.rosbag import Bag, Message
 from gsjax.data.sequence import Sequence
+from gsjax.data.validation import check_quaternions
 
 MAX_SKEW_S = 0.02
 """Largest time between colour and depth of a frame: at 30 Hz, the nearest is at most 0.017 s away."""
@@ -43,7 +44,6 @@ _STAMP_AT, _FRAME_ID_AT = 4, 12  # bytes into a message with a header
 _ENDS_WITH_UNIT = struct.pack("<I", 1) + b"1"  # the frame_id
 _DISTORTIONS = ("brown conrady", "inverse brown conrady", "modified brown conrady")
 _COEFFICIENTS = 5  # k1 k2 p1 p2 k3, as OpenCV's
-_UNIT_TOLERANCE = 0.01  # on a quaternion's length
 
 # Encoding in lower case -> bytes per pixel, and OpenCV's conversion to RGB.
 _DEPTHS: dict[str, tuple[int, int | None]] = dict.fromkeys(("mono16", "16uc1", "z16"), (2, None))
@@ -178,8 +178,9 @@ def _from_reference(bag: Bag, stream: _Stream) -> Float[np.ndarray, "4 4"]:
     q, t = found.rotation, found.translation
     quat, transform = np.array([q.x, q.y, q.z, q.w]), np.eye(4)
     transform[:3, 3] = t.x, t.y, t.z
-    if not (np.isfinite(transform).all() and abs(np.linalg.norm(quat) - 1) < _UNIT_TOLERANCE):
-        raise DataError(bag.path, f"a rigid motion in {topic}", f"{quat.tolist()}", _RECORD)
+    if not np.isfinite(transform).all():
+        raise DataError(bag.path, f"a finite translation in {topic}", f"{transform[:3, 3].tolist()}", _RECORD)
+    check_quaternions(quat[None], lambda _: f"{bag.path}, {topic}", _RECORD)
     transform[:3, :3] = Rotation.from_quat(quat).as_matrix()
     return transform
 

@@ -19,7 +19,7 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from gsjax import extras
-from gsjax.data.errors import DataError, DataWarning, shortened
+from gsjax.data.errors import COMPLETE, DataError, DataWarning, shortened
 from gsjax.data.exr import read_exr_depth
 from gsjax.data.files import image_size, read_image, read_json
 from gsjax.data.frame_folders import DEFAULT_RATE_HZ, numbered
@@ -28,13 +28,12 @@ from gsjax.data.names import find_file
 from gsjax.data.origin import near_origin
 from gsjax.data.resizing import nearest_resized
 from gsjax.data.sequence import Sequence
+from gsjax.data.validation import check_quaternions
 from gsjax.geometry.cameras import viewmat_from_opengl
 
 EXPORT_THIS = 'In Record3D choose Export, "EXR + RGB sequence", and give that folder.'
 _FOLDER = "EXR_RGBD"
-_UNIT_TOLERANCE = 0.01  # on a quaternion's length
 _SAME_SHAPE = 0.05  # on a ratio of sides: that of a small depth map is rounded
-_COMPLETE = "Was the folder copied completely?"
 
 
 def is_record3d(root: Path) -> bool:
@@ -117,7 +116,7 @@ def _metadata_of(folder: Path) -> Path:
     for place in (folder, folder.parent) if folder.name == _FOLDER else (folder,):
         if (file := find_file(place, "metadata", (".json",))) is not None:
             return file
-    advice = f"Copy it from the export: it has the poses. {_COMPLETE}"
+    advice = f"Copy it from the export: it has the poses. {COMPLETE}"
     raise DataError(folder / "metadata.json", "Record3D's metadata", "no such file", advice)
 
 
@@ -208,16 +207,16 @@ def _usable(folder: Path, meta: _Metadata, images: dict[int, Path], depths: dict
     count = sum(map(len, left.values()))
     told = ", ".join(f"{len(of)} {reason} ({shortened(map(str, of))})" for reason, of in left.items())
     if not kept:
-        advice = f"{_COMPLETE} The app records poses with LiDAR, not with the front camera."
+        advice = f"{COMPLETE} The app records poses with LiDAR, not with the front camera."
         raise DataError(folder, "a frame with colour, depth and pose", f"none of {count}: {told}", advice)
     if left:
         message = f"{folder}: {count} of {count + len(kept)} frames are left out: {told}"
         warnings.warn(message, DataWarning, stacklevel=3)
-    bad = [number for number in kept if abs(lengths[number] - 1) > _UNIT_TOLERANCE]
-    if bad:
-        found = f"one of length {lengths[bad[0]]:.3g} in frame {bad[0]}"
-        advice = "Correct it, or remove that frame's picture."
-        raise DataError(meta.path, "unit quaternions first in poses", found, advice)
+    check_quaternions(
+        meta.poses[kept, :4],
+        lambda i: f"{meta.path}, frame {kept[i]}",
+        "Correct it, or remove that frame's picture.",
+    )
     return kept
 
 

@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from gsjax.data.errors import DataError, DataWarning, shortened
+from gsjax.data.errors import COMPLETE, DataError, DataWarning, shortened
 from gsjax.data.files import image_size, read_depth, read_image, read_text
 from gsjax.data.lens import intrinsics_matrix
 from gsjax.data.names import find_file
@@ -140,8 +140,7 @@ def _read_frames(root: Path) -> tuple[list[int], Float[np.ndarray, "t 4 4"], lis
     ]
     if not numbers:
         found = f"none of {len(names)}: {', '.join(left_out)}"
-        advice = "Check the folder; was it copied completely?"
-        raise DataError(root, "a frame with pose, colour and depth", found, advice)
+        raise DataError(root, "a frame with pose, colour and depth", found, COMPLETE)
     if left_out:
         count = len(lost) + len(missing)
         message = f"{root}: {count} of {len(names)} frames are left out: {', '.join(left_out)}"

@@ -19,13 +19,14 @@ from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation, Slerp
 
 from gsjax.data.association import associate
-from gsjax.data.errors import DataError, DataWarning
+from gsjax.data.errors import COMPLETE, DataError, DataWarning
 from gsjax.data.files import image_size, read_depth, read_image, read_text
 from gsjax.data.lens import intrinsics_matrix
 from gsjax.data.names import find_file
 from gsjax.data.origin import near_origin
 from gsjax.data.sequence import Sequence
 from gsjax.data.text import fields
+from gsjax.data.validation import check_quaternions
 from gsjax.geometry.distortion import undistort_map
 
 MAX_SKEW_S = 0.02
@@ -48,9 +49,7 @@ _CALIBRATIONS = {
     3: _Calibration((535.4, 539.2, 320.1, 247.6), ()),  # its images are published undistorted
 }
 _SIZE = (640, 480)
-_COMPLETE = "Check the folder; was it copied completely?"
-_GIVE_K = "ive its intrinsics: K (--read.K), fx fy cx cy in pixels, centres at +0.5."
-_UNIT_TOLERANCE = 0.01  # on a quaternion's length: files have four digits
+_INTRINSICS = "the camera's intrinsics as K (--read.K): fx fy cx cy in pixels, with pixel centres at +0.5."
 
 
 @near_origin
@@ -131,7 +130,7 @@ class _Listed(NamedTuple):
         exists = np.array([file is not None for file in files])
         if not exists.any():
             found = f"none of {len(rows)}, for example no {rows[0][0]}"
-            raise DataError(root / name, "files that exist", found, _COMPLETE)
+            raise DataError(root / name, "files that exist", found, COMPLETE)
         if not exists.all():
             message = f"{root / name}: {np.sum(~exists)} of {len(rows)} files do not exist and are left out"
             warnings.warn(message, DataWarning, stacklevel=4)
@@ -184,12 +183,11 @@ def _read_poses(path: Path) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "
         message = f"{path}: {np.sum(~known)} of {len(known)} poses are not finite and are left out"
         warnings.warn(message, DataWarning, stacklevel=3)
     stamps, poses = stamps[known], poses[known]
-    lengths = np.linalg.norm(poses[:, 3:], axis=1)
-    bad = np.abs(lengths - 1) > _UNIT_TOLERANCE
-    if bad.any():
-        i = int(np.argmax(bad))
-        found = f"one of length {lengths[i]:.3g} at {stamps[i]:.6f} s"
-        raise DataError(path, "unit quaternions", found, "Correct that line, or comment it out with #.")
+    check_quaternions(
+        poses[:, 3:],
+        lambda i: f"{path}, at {stamps[i]:.6f} s",
+        "Correct that line, or comment it out with #.",
+    )
     return stamps, poses
 
 
@@ -215,12 +213,12 @@ def _published(
     camera = re.search(r"(?:freiburg|fr)([123])(?!\d)", name.lower())
     if camera is None:
         expected = "a folder name with freiburg1, freiburg2 or freiburg3, which identifies the camera"
-        advice = f"Rename the folder, or g{_GIVE_K}"
+        advice = f"Rename the folder, or give {_INTRINSICS}"
         raise DataError(root, expected, repr(name), advice)
     if size != _SIZE:
         expected = f"{_SIZE[0]}x{_SIZE[1]} pixels, for which freiburg{camera[1]} is calibrated"
         found = f"{size[0]}x{size[1]}"
-        raise DataError(image, expected, found, f"G{_GIVE_K}")
+        raise DataError(image, expected, found, f"Give {_INTRINSICS}")
     (fx, fy, cx, cy), distortion = _CALIBRATIONS[int(camera[1])]
     return np.array([[fx, 0, cx + 0.5], [0, fy, cy + 0.5], [0, 0, 1]]), distortion
 

@@ -11,6 +11,8 @@ from gsjax.data.errors import DataError, DataWarning
 ROTATION_TOLERANCE = 1e-2
 """Largest accepted entry of |R^T R - I|; calibrations are often written with few digits."""
 
+_UNIT_TOLERANCE = 1e-2  # on a quaternion's length: files often have few digits
+
 FARTHEST_MEDIAN_M, NEAREST_MEDIAN_M = 50.0, 0.02
 """A median depth outside this range means a wrong unit rather than an unusual scene."""
 
@@ -56,6 +58,24 @@ def check_poses(
         if bad.any():
             frame, thing = (int(i) for i in np.argwhere(bad)[0])
             raise ValueError(f"{name} of {where(frame, thing)}: {describe((frame, thing))}. {advice}")
+
+
+def check_quaternions(quats: Float[np.ndarray, "n 4"], where: Callable[[int], str], advice: str) -> None:
+    """Check that every quaternion has length 1, as far as few digits tell.
+
+    Args:
+        quats: the quaternions.
+        where: row -> file and place of that quaternion, for the message.
+        advice: last sentence of the message.
+
+    Raises:
+        DataError: one has another length.
+    """
+    lengths = np.hypot.reduce(quats, axis=1)
+    odd = np.flatnonzero(~(np.abs(lengths - 1) <= _UNIT_TOLERANCE))
+    if len(odd):
+        found = f"one of length {lengths[odd[0]]:.3g}"
+        raise DataError(where(int(odd[0])), "a quaternion of length 1", found, advice)
 
 
 def check_intrinsics(Ks: Float[np.ndarray, "frames cameras 3 3"], where: Callable[[int, int], str]) -> None:

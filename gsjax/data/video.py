@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from gsjax.data.errors import DataError, DataWarning
+from gsjax.data.errors import COMPLETE, DataError, DataWarning
 from gsjax.io.video import Packets, list_packets
 
 # Decoding a few more frames is faster than seeking, which restarts at the previous key frame.
@@ -193,7 +193,7 @@ def _opened(path: Path) -> cv2.VideoCapture:
 
 
 def _no_such_video(path: Path) -> DataError:
-    return DataError(path, "a video", "no such file", "Check the folder; was it copied completely?")
+    return DataError(path, "a video", "no such file", COMPLETE)
 
 
 def _not_a_video(path: Path) -> DataError:

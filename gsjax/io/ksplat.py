@@ -30,15 +30,18 @@ from gsjax.scene.gaussians import Gaussians
 MAGIC = b"\x00\x01\x00\x00"
 """Version 0.1, the only one."""
 _HEADER_SIZE, _SECTION_SIZE = 4096, 1024
-_HEADER = struct.Struct("<4sIIIIHxx12xff")
-_SECTION = struct.Struct("<IIIIfHxxIIIIH")
+_HEADER = struct.Struct("<4xI12xH14xff")
+"""Number of sections, level, and range of harmonics."""
+_SECTION = struct.Struct("<IIIIfHxxI4xIIH")
+"""The fields of a `_Section`, but for its start."""
 _RANGE = 32767
+_CENTER = np.dtype(("<f4", 3))
 _TYPES = (("<f4", "<f4", "<f4"), ("<u2", "<f2", "<f2"), ("<u2", "<f2", "u1"))
 """Of centres, of scales and rotations, of harmonics, by level."""
 
 
 class _Section(NamedTuple):
-    """The header of a section, and where its data stand in the file."""
+    """The header of a section, and where its data start in the file."""
 
     count: int
     room: int
@@ -53,8 +56,12 @@ class _Section(NamedTuple):
     start: int
 
     @property
-    def buckets_end(self) -> int:
-        return self.start + 4 * self.partial + self.bucket_bytes * self.buckets
+    def buckets_start(self) -> int:
+        return self.start + 4 * self.partial
+
+    @property
+    def records_start(self) -> int:
+        return self.buckets_start + self.bucket_bytes * self.buckets
 
 
 def read_ksplat(path: Path) -> tuple[Gaussians, SceneReport]:
@@ -69,23 +76,19 @@ def read_ksplat(path: Path) -> tuple[Gaussians, SceneReport]:
     data = path.read_bytes()
     if len(data) < _HEADER_SIZE or data[:4] != MAGIC:
         raise SceneError(path, "a .ksplat of version 0.1", f"{data[:4]!r} in {len(data)} bytes", AGAIN)
-    _, num_sections, _, _, _, level, low, high = _HEADER.unpack_from(data)
+    num_sections, level, low, high = _HEADER.unpack_from(data)
     if level >= len(_TYPES):
         raise SceneError(path, "compression level 0, 1 or 2", f"{level}", AGAIN)
-    if _HEADER_SIZE + num_sections * _SECTION_SIZE > len(data):
-        raise SceneError(path, f"{num_sections} sections", f"only {len(data)} bytes", AGAIN)
     start, parts = _HEADER_SIZE + num_sections * _SECTION_SIZE, []
+    if start > len(data):
+        raise SceneError(path, f"{num_sections} sections", f"only {len(data)} bytes", AGAIN)
     for number in range(num_sections):
-        *_, reserved, full, partial, degree = fields = _SECTION.unpack_from(
-            data, _HEADER_SIZE + number * _SECTION_SIZE
-        )
-        del reserved  # the size of the section, which follows from the others
-        section = _Section(*fields[:6], fields[6] or _RANGE, full, partial, degree, start)
-        if degree >= len(REST_SIZES):
+        section = _Section(*_SECTION.unpack_from(data, _HEADER_SIZE + number * _SECTION_SIZE), start)
+        if section.degree >= len(REST_SIZES):
             advice = "Export the scene with spherical harmonics of degree 3 or less"
-            raise SceneError(path, "spherical harmonics of degree 0 to 3", f"degree {degree}", advice)
-        record = _record(level, degree)
-        end = section.buckets_end + record.itemsize * section.room
+            raise SceneError(path, "spherical harmonics of degree 0 to 3", f"degree {section.degree}", advice)
+        record = _record(level, section.degree)
+        end = section.records_start + record.itemsize * section.room
         if end > len(data) or section.count > section.room:
             found = f"{section.count} Gaussians in room for {section.room}, {len(data)} bytes of {end}"
             raise SceneError(path, f"section {number} with all its data", found, AGAIN)
@@ -115,11 +118,12 @@ def _decode(
     path: Path, data: bytes, section: _Section, record: np.dtype, limits: tuple[float, float]
 ) -> Columns:
     """The values of a section."""
-    records = np.frombuffer(data, record, section.count, section.buckets_end)
+    records = np.frombuffer(data, record, section.count, section.records_start)
     means = records["means"].astype(np.float64)
     if record["means"].base.kind == "u":
         centers = _bucket_centers(path, data, section)
-        means = (means - section.steps) * (section.block / 2 / section.steps) + centers
+        steps = section.steps or _RANGE
+        means = (means - steps) * (section.block / 2 / steps) + centers
     rest = records["rest"].astype(np.float64)
     if record["rest"].base == np.uint8:
         low, high = limits
@@ -141,7 +145,11 @@ def _bucket_centers(path: Path, data: bytes, section: _Section) -> np.ndarray:
     """The centre of the bucket of each Gaussian of a section, [N,3]."""
     lengths = np.frombuffer(data, "<u4", section.partial, section.start).astype(np.int64)
     total = section.full * section.bucket_size + int(lengths.sum())
-    if section.bucket_bytes < 12 or section.full + section.partial > section.buckets or total < section.count:
+    if (
+        section.bucket_bytes < _CENTER.itemsize
+        or section.full + section.partial > section.buckets
+        or total < section.count
+    ):
         found = f"{section.buckets} buckets of {section.bucket_bytes} bytes for {total}"
         raise SceneError(path, f"buckets of all {section.count} Gaussians", found, AGAIN)
     rows = np.arange(section.count)
@@ -152,7 +160,6 @@ def _bucket_centers(path: Path, data: bytes, section: _Section) -> np.ndarray:
         rows // max(section.bucket_size, 1),
         section.full + np.searchsorted(ends, rows, side="right"),
     )
-    table = np.frombuffer(
-        data, np.uint8, section.bucket_bytes * section.buckets, section.start + 4 * section.partial
-    ).reshape(section.buckets, section.bucket_bytes)
-    return np.ascontiguousarray(table[:, :12]).view("<f4").astype(np.float64)[bucket]
+    layout = np.dtype({"names": ["center"], "formats": [_CENTER], "itemsize": section.bucket_bytes})
+    table = np.frombuffer(data, layout, section.buckets, section.buckets_start)
+    return table["center"].astype(np.float64)[bucket]

@@ -15,6 +15,7 @@ import warnings
 from collections.abc import Iterable
 from pathlib import Path
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Integer
@@ -77,7 +78,8 @@ def write_ply(
                 f"{labels.shape}"
             )
     columns = _columns(gaussians, origin)
-    kind = "<f8" if _is_lost(columns, origin) else "<f4"
+    reach = max(np.abs(columns[axis]).max(initial=0) for axis in _PLACE)
+    kind = "<f8" if origin is not None and _are_moved(reach, _size(gaussians)) else "<f4"
     fields = [(name, kind if name in _PLACE else "<f4") for name in columns]
     vertices = np.empty(gaussians.num, dtype=fields)
     for name, column in columns.items():
@@ -92,13 +94,17 @@ def write_ply(
         labels_beside(path).unlink(missing_ok=True)
 
 
-def _is_lost(columns: dict[str, np.ndarray], origin: Float[np.ndarray, "3"] | None) -> bool:
-    """Whether float32 would move Gaussians by more than a small part of their size."""
-    if origin is None or not len(columns["x"]):
-        return False
-    reach = np.float32(max(np.abs(columns[axis]).max() for axis in _PLACE))
-    scales = np.exp(np.median([columns[f"scale_{i}"] for i in range(3)], axis=0))
-    return bool(np.spacing(reach) > _LOST * np.median(scales))
+def _size(gaussians: Gaussians) -> float:
+    """The median Gaussian's size; 0 if none has a finite one."""
+    log_scales = np.asarray(gaussians.log_scales, np.float64)
+    finite = log_scales[np.isfinite(log_scales).all(axis=1)]
+    with np.errstate(over="ignore"):
+        return float(np.exp(np.median(np.median(finite, axis=1)))) if len(finite) else 0.0
+
+
+def _are_moved(reach: float, size: float) -> bool:
+    """Whether float32 moves Gaussians by more than a small part of their size."""
+    return bool(np.spacing(np.float32(reach)) > _LOST * size)
 
 
 def _columns(gaussians: Gaussians, origin: Float[np.ndarray, "3"] | None) -> dict[str, np.ndarray]:
@@ -143,19 +149,21 @@ def read_ply(path: str | os.PathLike) -> tuple[Gaussians, SceneReport]:
         if fault := find_fault(ply):
             raise PlyError(path, *fault)
         places = positions(ply)
-        origin = far_origin(places)
-        gaussians, known = decompress(ply, _relative(places, origin)), {*PACKED}
+        gaussians, known = decompress(ply, _relative(places, None)), {*PACKED}
         format = "PlayCanvas's compressed PLY"
         invisible = np.zeros(len(vertices), bool)
     else:
         known = _known(path, vertices)
         places = np.stack([vertices[axis] for axis in _PLACE], axis=1).astype(np.float64)
-        origin = far_origin(places)
-        gaussians, invisible = _uncompressed(vertices, _relative(places, origin))
+        gaussians, invisible = _uncompressed(vertices, _relative(places, None))
         format = "PLY of 3DGS" + (", as text" if ply.text else "")
-    names = vertices.dtype.names or ()
-    if origin is not None:
-        _warn_of_origin(path, origin, places, vertices)
+    names, size = vertices.dtype.names or (), _size(gaussians)
+    if (origin := far_origin(places, least=size)) is not None:
+        gaussians = eqx.tree_at(lambda g: g.means, gaussians, jnp.asarray(_relative(places, origin)))
+        words = in_words(places, origin)
+        if "x" in names and vertices.dtype["x"].itemsize < 8 and _are_moved(np.abs(origin).max(), size):
+            words += "; the file itself is of float32, which has lost what is smaller than these steps"
+        warnings.warn(f"{path}: {words}", UserWarning, stacklevel=1)
     return drawable(
         path,
         format,
@@ -172,7 +180,8 @@ def read_ply(path: str | os.PathLike) -> tuple[Gaussians, SceneReport]:
 def _relative(
     places: Float[np.ndarray, "N 3"], origin: Float[np.ndarray, "3"] | None
 ) -> Float[np.ndarray, "N 3"]:
-    return (places if origin is None else places - origin).astype(np.float32)
+    with np.errstate(over="ignore"):
+        return (places if origin is None else places - origin).astype(np.float32)
 
 
 def _says_antialiased(comments: Iterable[str]) -> bool | None:
@@ -182,16 +191,6 @@ def _says_antialiased(comments: Iterable[str]) -> bool | None:
         return None
     mode, flag, flags = said[-1].groups()
     return (mode or "").lower() == "mip" or flag == "1" or "antialiasing" in (flags or "").lower()
-
-
-def _warn_of_origin(
-    path: Path, origin: Float[np.ndarray, "3"], places: Float[np.ndarray, "N 3"], vertices: np.ndarray
-) -> None:
-    words = in_words(places, origin)
-    types = vertices.dtype
-    if "x" in (types.names or ()) and types["x"].itemsize < 8:
-        words += "; the file itself is of float32, which has lost what is smaller than these steps"
-    warnings.warn(f"{path}: {words}", UserWarning, stacklevel=1)
 
 
 def _known(path: Path, vertices: np.ndarray) -> set[str]:

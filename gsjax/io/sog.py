@@ -82,7 +82,8 @@ def _of_zip(path: Path, stream: BinaryIO) -> tuple[Gaussians, SceneReport]:
     except SceneError:
         raise
     except _DAMAGED as error:
-        raise SceneError(path, "a zip of pictures and meta.json", f"another ({error})", AGAIN) from error
+        found = f"a file that cannot be unpacked ({error})"
+        raise SceneError(path, "a zip of pictures and meta.json", found, AGAIN) from error
 
 
 def _beside(path: Path, name: str) -> bytes:
@@ -195,7 +196,8 @@ def _picture(path: Path, name: str, data: bytes) -> UInt8[np.ndarray, "H W 4"]:
         with pillow_errors():
             return np.asarray(picture.convert("RGBA"))
     except PictureError as error:
-        raise SceneError(path, f"a WebP or PNG picture as {name}", f"another ({error})", AGAIN) from error
+        found = f"data that cannot be decoded ({error})"
+        raise SceneError(path, f"a WebP or PNG picture as {name}", found, AGAIN) from error
 
 
 def _quats(pixels: UInt8[np.ndarray, "N 4"]) -> np.ndarray:

@@ -86,7 +86,7 @@ def read_spz(path: Path) -> tuple[Gaussians, SceneReport]:
     try:
         head = zlib.decompressobj(31).decompress(data, size) if packed else data[:size]
     except zlib.error as error:
-        raise SceneError(path, "a gzip stream", f"another ({error})", AGAIN) from error
+        raise SceneError(path, "a gzip stream", f"a damaged one ({error})", AGAIN) from error
     header = _parse(path, head)
     if header.version == 4:
         arrays = _streams(path, data, header)

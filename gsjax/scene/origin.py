@@ -19,25 +19,25 @@ _MOST = 0.9  # quantile of distances that is the size, so that a few stray point
 
 
 def far_origin(
-    places: Float[np.ndarray, "n 3"], others: Sequence[Float[np.ndarray, "m 3"]] = (), least: float = NEAR
+    places: Float[np.ndarray, "n 3"], others: Sequence[Float[np.ndarray, "m 3"]] = (), least: float = 0.0
 ) -> Float[np.ndarray, "3"] | None:
     """An origin near the middle of `places`, in round numbers; None if they are not far from the present one.
 
     Args:
         places: of cameras or Gaussians, float64.
         others: further places of the same scene, which add to its size.
-        least: the least size.
+        least: the least size, if that is above `NEAR`.
     """
     finite = [each[np.isfinite(each).all(1)] for each in (places, *others)]
     if not len(finite[0]):
         return None
     middle = np.median(finite[0], axis=0)
     sizes = [np.quantile(np.linalg.norm(each - middle, axis=1), _MOST) for each in finite if len(each)]
-    size = max(*sizes, least)
+    size = max(*sizes, least, NEAR)
     if np.abs(middle).max() <= FAR * size:
         return None
     step = 10.0 ** np.floor(np.log10(size))
-    return np.round(middle / step) * step
+    return np.round(middle / step) * step + 0.0  # no -0
 
 
 def about(

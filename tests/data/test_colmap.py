@@ -251,7 +251,7 @@ def swap(old, new, count=1):
         (
             "images",
             lambda text: re.sub(r"\n8 .* 3 a.png", "\n8 2 0 0 0 1 2 3 3 a.png", text),
-            r"images.txt, line 7: expected a unit quaternion for a.png, found \[2.0, 0.0, 0.0, 0.0\] of le",
+            r"images.txt, line 7, a.png: expected a quaternion of length 1, found one of length 2",
         ),
         (
             "points3D",

@@ -162,7 +162,10 @@ def encoded(name, encoding, pixel=(1, 2)):
             lambda m: m.info(COLOR, SCENE.Ks[0, 0], size=(10**5, 10**5)),
             "expected 100000x100000 pixels of rgb8",
         ),
-        (lambda m: m.place(DEPTH, quat=(0.0, 0.0, 0.0, 0.0)), "expected a rigid motion in .*Depth_0/tf/0"),
+        (
+            lambda m: m.place(DEPTH, quat=(0.0, 0.0, 0.0, 0.0)),
+            "Depth_0/tf/0: expected a quaternion of length 1, found one of length 0",
+        ),
         (encoded(COLOR, "MJPEG"), "Color_0: expected one of rgb8, bgr8.*, found MJPEG"),
         (encoded(COLOR, "rgb8"), "expected 32x24 pixels of rgb8, found 32x24 in 1536 bytes"),
         (encoded(DEPTH, "8UC1"), "Depth_0: expected one of mono16, .*, found 8UC1"),

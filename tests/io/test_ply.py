@@ -1,6 +1,7 @@
 """PLY: scenes are read back as written, in the channel order of 3DGS; other files are refused."""
 
 import io
+import warnings
 
 import jax.numpy as jnp
 import numpy as np
@@ -196,6 +197,35 @@ def test_float32_far_from_0_is_said_to_have_lost_places(tmp_path):
     with pytest.warns(UserWarning, match="of float32, which has lost what is smaller than these steps"):
         loaded, report = read_ply(path)
     np.testing.assert_array_equal(in_world(np.asarray(loaded.means), report.origin), places)
+
+
+def of_size(size, count):
+    return {f"scale_{i}": np.full(count, np.log(size), np.float32) for i in range(3)}
+
+
+@pytest.mark.parametrize("distance", [5, 20, 2000])
+def test_only_what_float32_has_lost_is_said_to_be_lost(tmp_path, distance):
+    """A scene of some millimetres, of Gaussians of 0.3 mm: steps of 2e-6 m are nothing to them, those of
+    1e-4 m are."""
+    path, gaussians = tmp_path / "scene.ply", random_gaussians(50)
+    places = (0.003 * np.asarray(gaussians.means) + [distance, 0, 0]).astype(np.float32)
+    changed(path, gaussians, **dict(zip("xyz", places.T, strict=True)), **of_size(3e-4, 50))
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        loaded, report = read_ply(path)
+    said = "".join(str(warning.message) for warning in caught)
+    assert ("relative to the origin" in said, "has lost" in said) == (distance > 10, distance > 1000)
+    np.testing.assert_array_equal(in_world(np.asarray(loaded.means), report.origin), places)
+
+
+def test_a_scene_is_no_smaller_than_its_gaussians(tmp_path):
+    path = tmp_path / "scene.ply"
+    at = {axis: np.float32([where]) for axis, where in zip("xyz", (200, 0, 0), strict=True)}
+    changed(path, random_gaussians(1), **at, **of_size(3, 1))
+    assert read_ply(path)[1].origin is None
+    changed(path, random_gaussians(1), **at, **of_size(0.003, 1))
+    with pytest.warns(UserWarning, match=r"relative to the origin \(200, 0, 0\)$"):
+        assert read_ply(path)[1].origin is not None
 
 
 def test_near_0_nothing_is_taken_off(tmp_path):

@@ -95,6 +95,8 @@ def test_files_that_are_cut_off(tmp_path, ending, share):
         ("a.spz", gzip.compress(spz(3, 1 << 31, 3)), "in keeping with its file, found 139586437120 bytes"),
         ("a.spz", gzip.compress(spz(3, 1, arrays=bytes(20 + (1 << 25)))), "found more behind them"),
         ("a.spz", gzip.compress(b"something else"), "which starts with b'NGSP'"),
+        ("a.spz", b"\x1f\x8b" + bytes(30), "expected a gzip stream, found a damaged one (Error"),
+        ("a.sog", b"PK\3\4" + bytes(30), "found a file that cannot be unpacked (File is not a zip file). It"),
         ("a.spz", spz(4, 1 << 31), "a header of 32 bytes"),
         ("a.ply", b"ply\nformat binary_little_endian 1.0\nelement vertex 1099511627776\n"
          b"property float x\nend_header\n", "one that cannot be parsed"),
@@ -149,7 +151,7 @@ def test_a_sog_whose_text_lies(tmp_path, change, says):
     ("pictures", "says"),
     [
         ({"quats.webp": picture(2, 2)}, "expected 100 pixels in quats.webp, one a Gaussian, found 4"),
-        ({"quats.webp": b"RIFF????WEBPVP8L"}, "a WebP or PNG picture as quats.webp"),
+        ({"quats.webp": b"RIFF????WEBPVP8L"}, "picture as quats.webp, found data that cannot be decoded ("),
         ({"quats.webp": picture(12000, 12000)}, "found 576000000 bytes from"),
         ({"quats.webp": picture(12000, 12000, "WEBP")}, "found 576000000 bytes from"),
         ({"meta.json": b"{" * 100000}, "expected JSON in meta.json"),
