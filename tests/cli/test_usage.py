@@ -25,9 +25,7 @@ def test_help_is_wrapped_once_and_says_no_empty_default(command, width, monkeypa
     said = help_of(command, width, monkeypatch, capsys)
     assert max(map(len, said.splitlines())) <= width
     assert not re.search(r"\(default: (:|False|None)?\)", said)
-    assert "{None}" not in said.replace(
-        "everywhere {None}|INT", ""
-    )  # where None means all
+    assert "{None}" not in said.replace("everywhere {None}|INT", "")  # where None means all
     # A word begins a line only where it did not fit into the line above.
     lines = [line.strip("│") for line in said.splitlines()]
     for above, below in pairwise(lines):

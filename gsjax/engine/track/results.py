@@ -11,8 +11,8 @@ MOVED_MM = 30.0
 """An object that moved less is no test of a tracker."""
 
 
-def _largest_error(found: Metrics) -> float | None:
-    """The largest centroid error of objects that moved far enough to tell."""
+def _worst_error(found: Metrics) -> float | None:
+    """The centroid error, a mean over frames, of the worst object that moved far enough to tell."""
     errors = [
         scored["centroid_error_mm"]
         for scored in found["objects"].values()
@@ -27,7 +27,7 @@ def _lowest_iou(found: Metrics) -> float | None:
 
 SCORES = (
     Score("update rate", "update_hz", "Hz", 2, "more", at("update_hz"), "machine"),
-    Score("largest centroid error", "centroid_error_mm", "mm", 2, "less", _largest_error),
+    Score("mean centroid error, worst object", "centroid_error_mm", "mm", 2, "less", _worst_error),
     Score("lowest label IoU", "iou", "", 3, "more", _lowest_iou),
     Score("PSNR", "psnr", "dB", 2, "more", at("tracked", "psnr")),
     Score("PSNR held out", "psnr_held_out", "dB", 2, "more", at("held_out", "psnr")),
@@ -61,8 +61,8 @@ _CAMERA_NOTE = (
 _TIMES = {
     "preparing": "opening the recording, the first mask; drawing it if simulated",
     "start": "from the first frame to a fitted scene, compiling included",
-    "planning": "loop: planning, before the first update",
-    "compile": "loop: compiling the update, once a plan",
+    "planning": "loop: planning and compiling, before the first update",
+    "compile": "loop: compiling later, for a larger plan",
     "updates": "loop: updates, from images in memory to the new state",
     "loading": "loop: waiting for images",
     "loop_rest": "loop: the rest",

@@ -1,0 +1,22 @@
+"""The words of summaries: figures are named for what they are, datasets as people call them."""
+
+import pytest
+
+from gsjax.engine.track.results import _TIMES, SCORES
+
+
+def test_the_tile_of_the_tracker_is_a_mean_and_says_so():
+    score = next(score for score in SCORES if score.key == "centroid_error_mm")
+    still, moved = {"moved_mm": 0.0}, {"moved_mm": 200.0}
+    objects = {
+        "block": {"centroid_error_mm": 9.0, **still},  # no test of a tracker
+        "can": {"centroid_error_mm": 7.6, **moved},
+        "ball": {"centroid_error_mm": 0.8, **moved},
+    }
+    found = {"objects": objects, "over_frames": {"centroid_error_mm": {"can": [0.0, 13.3]}}}
+    assert score.head == "mean centroid error, worst object"
+    assert score.value(found) == pytest.approx(7.6)
+
+
+def test_compiling_before_the_first_update_is_not_called_planning_alone():
+    assert _TIMES["planning"] == "loop: planning and compiling, before the first update"
