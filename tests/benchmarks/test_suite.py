@@ -286,6 +286,7 @@ def test_ctrl_c_keeps_what_was_measured(bench, tmp_path, monkeypatch):
 
 
 @pytest.mark.usefixtures("forward_only")
+@pytest.mark.slow
 def test_the_real_thing_on_one_tiny_workload(monkeypatch, tmp_path, capfd):
     """Only the workload and the programs are replaced; floors, timing and files are the command's own."""
     monkeypatch.setattr(suite, "RESULTS", tmp_path / "none")

@@ -187,6 +187,7 @@ def test_a_bad_frame_in_the_middle_keeps_what_came_before(gsjax_track, recording
     assert "000002.png" in found["stopped"]
 
 
+@pytest.mark.slow
 def test_label_that_no_pixel_has(sound, recording, still):
     rewrite(recording / "seg" / "1" / "000000.png", lambda mask: np.where(mask == 4, 0, mask))
     said, found = sound(recording, "--mask-camera", "1")
@@ -195,6 +196,7 @@ def test_label_that_no_pixel_has(sound, recording, still):
     assert any(note.startswith("ball: not tracked") for note in found["notes"])
 
 
+@pytest.mark.slow
 def test_empty_frame(sound, recording, still):
     for path in recording.glob("ims/*/000002.png"):
         rewrite(path, np.zeros_like)
@@ -238,7 +240,7 @@ def test_no_depth_and_no_shapes(refused, recording):
     assert "depth" in refused(recording)
 
 
-@pytest.mark.parametrize("frame", [0, 2])
+@pytest.mark.parametrize("frame", [0, pytest.param(2, marks=pytest.mark.slow)])
 def test_a_bad_held_out_image_keeps_the_run_and_its_report(gsjax_track, recording, tmp_path, still, frame):
     (recording / "ims" / "2" / f"{frame:06d}.png").write_bytes(b"nonsense")
     code, said = gsjax_track(recording, "--cameras", "0", "1", "--eval-cameras", "2")

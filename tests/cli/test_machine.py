@@ -52,7 +52,9 @@ def test_threads_run_on_the_cores_that_are_kept_to_those_of_jax_too():
     assert said.stdout.split() == ["1", "True", "True"]
 
 
-@pytest.mark.parametrize("variable", ["JAX_PLATFORMS", "JAX_PLATFORM_NAME"])
+@pytest.mark.parametrize(
+    "variable", ["JAX_PLATFORMS", pytest.param("JAX_PLATFORM_NAME", marks=pytest.mark.slow)]
+)
 def test_only_commands_that_compute_need_the_backend_that_is_asked_for(variable, tmp_path):
     scene, out = "simulated:tabletop?frames=2&width=40&height=32", str(tmp_path / "run")
     for command, code in ((["info", scene], 0), (["fit", scene, "--out", out], 2)):

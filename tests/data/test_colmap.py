@@ -174,6 +174,7 @@ def test_binary_files_that_are_cut_off_anywhere(tmp_path, name):
 
 @pytest.mark.filterwarnings("ignore::gsjax.data.DataWarning")
 @pytest.mark.parametrize("name", ["cameras", "images", "points3D"])
+@pytest.mark.slow
 def test_damaged_files_are_reported_or_read(tmp_path, form, name):
     """Whichever byte changes, the reader returns something of the right shape, or names the file."""
     build(tmp_path, form, "OPENCV")

@@ -10,6 +10,8 @@ from gsjax.geometry.cameras import intrinsics, look_at
 from tests.data.scene_helpers import seconds_per_frame
 from tests.data.test_raycaster import GREY, HEIGHT, SOLIDS, WIDTH, outside, single
 
+SLOW = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def scene():
@@ -35,7 +37,7 @@ def test_it_is_as_documented(scene):
     assert scene.image(0, 0).std() > 20
 
 
-@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("seed", [0, 1, *(pytest.param(seed, marks=SLOW) for seed in range(2, 8))])
 @pytest.mark.parametrize("option", [None, "hide"])
 def test_objects_move_as_far_as_promised(seed, option):
     poses = tabletop(seed=seed, width=32, height=24, **({option: True} if option else {})).truth.poses
@@ -155,7 +157,7 @@ def test_the_can_leaves_all_views(seed):
     assert seen == [[True] * 3, [False] * 3]
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=SLOW) for seed in (1, 2))])
 def test_the_can_is_hidden_and_comes_back(seed):
     sequence = tabletop(seed=seed, frames=60, width=160, height=120, hide=True)
     seen = [[(sequence.mask(t, c) == 3).any() for c in range(3)] for t in (0, 20, 59)]

@@ -147,6 +147,11 @@ def test_where_a_plan_is_too_small_nothing_changes_and_what_is_needed_is_told(na
     assert any(jax.tree.leaves(more))
 
 
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(name, marks=() if name in ("fit", "track") else pytest.mark.slow) for name in CASES],
+    indirect=True,
+)
 def test_it_runs_in_a_scan_as_it_does_alone(name):
     case = case_of(name)
     params, state = case.params, state_of(name)

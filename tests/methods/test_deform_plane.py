@@ -62,6 +62,7 @@ def test_a_scene_starts_there_from_the_first_frame_with_pixels_that_count(frames
     assert (problem.bounds[1] - problem.bounds[0]).min() > 0.01 * problem.radius
 
 
+@pytest.mark.slow
 def test_no_depth_has_no_loss_and_learns(frames):
     method = Deform(TINY)
     infos = [jax.device_get(now.info) for now in drive(method, *method.start(frames[:1] * 2))]

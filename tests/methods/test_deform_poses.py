@@ -109,6 +109,7 @@ def test_recovers_the_true_poses(frames, askew):
 
 
 class TestRefining:
+    @pytest.mark.slow
     def test_leaves_the_first_frame_where_it_is_and_moves_others(self, learned, askew):
         twists = learned.run.params.twists
         np.testing.assert_array_equal(twists[learned.problem.first], 0)
@@ -121,6 +122,7 @@ class TestRefining:
         _, run = Deform(replace(CONFIG, refine_poses=False)).start(askew)
         assert run.params.twists is None
 
+    @pytest.mark.slow
     def test_gradients_are_of_the_frames_own_twist(self, learned):
         problem, run = learned.problem, learned.run
         loss, rows, key = deform_loss(CONFIG), run.params.twists, jax.random.key(0)

@@ -89,6 +89,7 @@ def test_a_padded_photograph_gives_the_steps_of_the_photograph():
     assert float(a.info["loss"]) == pytest.approx(float(b.info["loss"]), rel=5e-2)
 
 
+@pytest.mark.slow
 def test_padding_does_not_pull_gaussians_apart():
     """The pull by which `split` divides Gaussians is per half a photograph, without what was padded."""
     frame, method = photograph(32, 24), Fit(replace(CONFIG, strategy="split", dssim_weight=0.0, steps=1))
@@ -113,6 +114,7 @@ def test_many_sizes_share_the_programs_of_one():
     assert sum(compiled[1:]) == 0
 
 
+@pytest.mark.slow
 def test_light_in_the_padding_is_no_light():
     frame = photograph(32, 24)
     gaussians = Fit(CONFIG).start([frame])[1].params.gaussians

@@ -110,6 +110,7 @@ def halves(boxes):
     return Followed(boxes, of_halves(boxes))
 
 
+@pytest.mark.slow
 def test_two_halves_become_one_and_are_followed(boxes, halves):
     assert halves.parts.joined in (((1, 3),), ((3, 1),))
     assert max(errors_mm(boxes, halves, FRAMES - 1)) < 3  # a pixel is 15
@@ -123,6 +124,7 @@ def test_two_halves_become_one_and_are_followed(boxes, halves):
     assert not any(info["skipped"] for info in halves.steps)
 
 
+@pytest.mark.slow
 def test_the_result_moves_as_the_parts_did_and_can_be_edited(boxes, halves):
     result, parts = halves.result, halves.parts
     scene, trajectory = result.scene, result.trajectory
@@ -176,6 +178,7 @@ def test_weights_in_a_table_are_followed_too(boxes, kind):
     np.testing.assert_array_equal(now.run.kept.weights, before)
 
 
+@pytest.mark.slow
 def test_what_no_picture_needs_is_given_up(boxes, halves):
     """A piece of floor that was taken for a part is background again; the boxes stay."""
     parts, weights = halves.parts, halves.weights.copy()
@@ -192,6 +195,7 @@ def test_what_no_picture_needs_is_given_up(boxes, halves):
     assert kept == set(np.unique(halves.weights.argmax(-1)).tolist())
 
 
+@pytest.mark.slow
 def test_in_the_end_weights_that_only_tie_parts_together_are_cut(halves):
     weights, alive = halves.weights, np.asarray(halves.parts.canonical.alive)
     cut = cut_weights(weights, alive)
@@ -203,6 +207,7 @@ def test_in_the_end_weights_that_only_tie_parts_together_are_cut(halves):
     np.testing.assert_allclose(cut_weights(cut, alive), cut, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_parts_that_are_touched(halves):
     parts, weights = halves.parts, halves.weights
     labels = weights.argmax(-1)
@@ -218,6 +223,7 @@ def test_frames_go_onwards_and_then_back():
     assert order_of_frames(3, 2) == [1, 0]
 
 
+@pytest.mark.slow
 def test_nothing_joins_nothing(halves):
     same, weights = join_parts(halves.parts, halves.weights, np.arange(5))
     assert same is halves.parts

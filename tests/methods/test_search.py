@@ -60,6 +60,7 @@ def test_search_finds_a_jump_that_alignment_alone_misses(jumped):
     assert miss[1] < 1e-3
 
 
+@pytest.mark.slow
 def test_search_finds_what_is_pushed_while_it_turns(moved):
     """It keeps turning as before, but 36 mm further than expected: only a shift from there finds it."""
     (points, center), images, then = jax.device_get(moved[:2]), *moved[2:4]
@@ -95,6 +96,7 @@ def test_something_in_front_does_not_pull(moved):
     assert error(points, np.asarray(carried(points, found, center).means), then) < 2e-3
 
 
+@pytest.mark.slow
 def test_without_turns_only_translations_are_tried_and_found(moved):
     (points, center), images = jax.device_get(moved[:2]), moved[2]
     config = replace(CONFIG, max_turn=0.0)

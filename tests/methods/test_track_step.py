@@ -42,9 +42,9 @@ def assert_same(found, expected):
     "config",
     [
         CONFIG,
-        replace(CONFIG, cameras=(1,), shrink=2),
-        replace(CONFIG, coarseness=1, matching=True),
-        PRESETS["paper"],
+        pytest.param(replace(CONFIG, cameras=(1,), shrink=2), marks=pytest.mark.slow),
+        pytest.param(replace(CONFIG, coarseness=1, matching=True), marks=pytest.mark.slow),
+        pytest.param(PRESETS["paper"], marks=pytest.mark.slow),
     ],
 )
 def test_a_blank_state_has_the_form_that_a_first_look_fills(table, started, config):
@@ -84,6 +84,7 @@ def test_a_first_frame_that_cannot_be_read_leaves_the_state_blank(table, begun):
     assert_same(state, step.init(run.params))
 
 
+@pytest.mark.slow
 def test_it_runs_in_a_scan_as_frame_by_frame_and_grows_there(table, begun):
     _, frames, _ = table()
     step, update, run = begun

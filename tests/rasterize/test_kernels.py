@@ -18,6 +18,7 @@ from gsjax.rasterize.projection import project_gaussians
 
 pytest.importorskip("warp", reason="the kernels are written in Warp: pip install 'gsjax[cuda]'")
 
+SLOW = pytest.mark.slow
 ON_A_CARD = pytest.mark.skipif(not fused.available(), reason="what a warp does together needs a GPU")
 WIDTH, HEIGHT, VIEWS = 70, 45, 2
 K = jnp.array([[60.0, 0, WIDTH / 2], [0, 60.0, HEIGHT / 2], [0, 0, 1]])
@@ -81,7 +82,10 @@ def test_lists_hold_the_same_gaussians_in_the_same_order(tile_size, masked):
 
 
 @pytest.mark.parametrize("lanes", [1, pytest.param(32, marks=ON_A_CARD)])
-@pytest.mark.parametrize(("channels", "tile_size"), [(3, 8), (1, 4), (4, 16), (13, 8), (24, 32)])
+@pytest.mark.parametrize(
+    ("channels", "tile_size"),
+    [pytest.param(3, 8, marks=SLOW), (1, 4), (4, 16), (13, 8), pytest.param(24, 32, marks=SLOW)],
+)
 def test_images_and_gradients_of_tiles(channels, tile_size, lanes):
     arrays, (viewmats, Ks) = gaussians(300), cameras(1)
     plan = gsjax.plan(*arrays, viewmats, Ks, WIDTH, HEIGHT, tile_size=tile_size)
@@ -113,7 +117,7 @@ def test_images_and_gradients_of_tiles(channels, tile_size, lanes):
     close(got, want, 1e-5)
 
 
-@pytest.mark.parametrize("seed", [3, 9, 17, 38])
+@pytest.mark.parametrize("seed", [9, *(pytest.param(seed, marks=SLOW) for seed in (3, 17, 38))])
 def test_agrees_with_the_float64_reference(seed, on_kernels):
     with jax.enable_x64(True):
         found = compare(case(seed, num=400), dtypes=("float32",))
@@ -137,7 +141,7 @@ def test_a_plan_that_is_too_small_draws_nothing_and_says_so(on_kernels):
     assert (image > 0).any()
 
 
-@pytest.mark.parametrize("dtype", ["float32", "bfloat16"])
+@pytest.mark.parametrize("dtype", [pytest.param("float32", marks=SLOW), "bfloat16"])
 def test_options_of_a_call(dtype, monkeypatch):
     arrays, views = gaussians(600), cameras()
     colors = jnp.asarray(np.random.default_rng(4).uniform(size=(600, 3)), dtype)

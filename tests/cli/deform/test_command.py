@@ -73,6 +73,7 @@ def test_scores_over_time_and_of_classes(deformed):
     assert "Dice" in report
 
 
+@pytest.mark.slow
 def test_resumed_it_is_the_same_scene(gsjax, deformed, monkeypatch, tmp_path):
     told, heard = ("deform", SCENE, "--out", tmp_path / "run", "--tools", "draw", *SMALL), []
 
