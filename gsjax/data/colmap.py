@@ -94,7 +94,7 @@ def read_colmap(
         if (root / images).is_dir():
             refuse_unread(root / images, "registered photographs", (root / images).rglob("*"))
         found = f"{len(registered)} registered, {' and '.join(left_out)}"
-        advice = f"If their folder is not {images}, give its name."
+        advice = f"Give the folder that holds both {images} (or --read.images NAME) and the reconstruction."
         raise DataError(chosen.folder, "registered photographs that can be used", found, advice)
     if left_out:
         message = f"{root}: of {len(registered)} registered photographs, {' and '.join(left_out)}"

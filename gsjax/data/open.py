@@ -327,10 +327,17 @@ def _unknown(root: Path, marks: dict[str, str], options: ReadOptions) -> DataErr
         if count:
             return DataError(root, expected, f"{count} photographs without poses", _find_poses(folder))
         refuse_unread(folder, expected, files)
-    expected = ", ".join(f"{mark} ({layout} layout)" for mark, layout in marks.items())
+    by_layout: dict[str, list[str]] = {}
+    for mark, layout in marks.items():
+        by_layout.setdefault(layout, []).append(mark)
+    expected = ", ".join(f"{layout} ({' or '.join(several)})" for layout, several in by_layout.items())
     names = sorted(entry.name for entry in root.iterdir())
     found = shortened(names, 8) if names else "an empty folder"
-    return DataError(root, f"one of {expected}", found, "Give the folder that holds one of these.")
+    advice = "Give the folder that holds them."
+    if not any(layout.mark in marks for layout in _PHOTOGRAPHS):
+        photographs = ", ".join(layout.mark for layout in _PHOTOGRAPHS)
+        advice = f"Give the folder that holds them; photographs ({photographs}) are for gsjax fit."
+    return DataError(root, f"the files of a known layout: {expected}", found, advice)
 
 
 def _simulate(text: str) -> Sequence:

@@ -63,18 +63,21 @@ _BY_START: dict[bytes, Reader] = {
 }
 _KNOWN = {
     glb.MAGIC: "glTF, which is only written",
+    b"\x89PNG": "a PNG picture",
+    b"\xff\xd8": "a JPEG picture",
+    b"{": "JSON",
     b"<": "a page or another text of tags",
     b"version https://git-lfs": "a pointer of Git LFS, which stands for the file (git lfs pull fetches it)",
 }
 
 
 def is_scene(path: str | os.PathLike) -> bool:
-    """Whether a file has the ending of one that `read_gaussians` reads.
+    """Whether a file has the ending of one that `read_gaussians` reads, or is named as a SOG in a folder.
 
     Args:
         path: the file.
     """
-    return os.fspath(path).lower().endswith(READ)
+    return os.fspath(path).lower().endswith(READ) or Path(path).name == "meta.json"
 
 
 def read_gaussians(path: str | os.PathLike) -> tuple[Gaussians, SceneReport]:
@@ -104,7 +107,8 @@ def read_gaussians(path: str | os.PathLike) -> tuple[Gaussians, SceneReport]:
         return splat.read_splat(path)
     found = next((what for magic, what in _KNOWN.items() if start.startswith(magic)), None)
     found = found or (f"one that starts with {start[:8]!r}" if start else "an empty one")
-    raise SceneError(path, f"a file of Gaussians ({', '.join(READ)})", found, "Export the scene as .ply")
+    advice = "Give such a file, or export the scene as .ply"
+    raise SceneError(path, f"a file of Gaussians ({', '.join(READ)})", found, advice)
 
 
 def write_gaussians(

@@ -169,10 +169,12 @@ def test_one_file_of_photographs(tmp_path):
 
 
 def test_folders_without_photographs(tmp_path):
-    with pytest.raises(
-        DataError, match=r"expected one of transforms.json \(nerfstudio layout\), .*COLMAP.*LLFF"
-    ):
+    known = r"expected the files of a known layout: nerfstudio \(transforms.json\), COLMAP \(.*LLFF"
+    with pytest.raises(DataError, match=known):
         open_photographs(tmp_path)
+    scenes = r"7-Scenes \(frame-\*.pose.txt or .*photographs \(transforms.json, .*\) are for gsjax fit"
+    with pytest.raises(DataError, match=scenes):
+        open_sequence(tmp_path)
     for name in ("notes.txt", "nowhere"):
         with pytest.raises(DataError, match="expected a folder with a recording, found nothing there"):
             open_photographs(tmp_path / name)

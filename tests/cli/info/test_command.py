@@ -154,6 +154,10 @@ def test_a_file_is_told_by_its_format_and_what_is_odd_about_it(ending, told, cap
     assert main(["info", str(tmp_path / f"scene{ending}")]) == 0
     said = " ".join(capfd.readouterr().out.split())
     assert f"file {told}" in said
+    if ending == ".sog":
+        shutil.unpack_archive(tmp_path / "scene.sog", tmp_path / "scene", "zip")
+        assert main(["info", str(tmp_path / "scene" / "meta.json")]) == 0
+        assert "SOG 2" in capfd.readouterr().out
     assert "3 are too faint to be drawn" in said
 
 
