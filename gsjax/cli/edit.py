@@ -12,7 +12,7 @@ from rich.progress import track
 from gsjax.data.text import decoded
 from gsjax.engine.folder import holds_something
 from gsjax.engine.locks import lock, releasing_locks
-from gsjax.engine.messages import Notes, stage
+from gsjax.engine.messages import Notes, counted, stage
 from gsjax.engine.options import Common, Overwriting
 from gsjax.engine.parts.films import SCRIPT, VIDEO, Shot, edited, new_folder, telling_camera, write_film
 from gsjax.engine.parts.saved import open_parts_run
@@ -74,7 +74,8 @@ def run(options: Options) -> int:
     asked, stopped = len(film[0].trajectory.times), not found["complete"]
     part = f" of {asked} (stopped by Ctrl-C)" if stopped else ""
     pace = f"; rendered at {found['render_hz']:.1f} a second" if found["render_hz"] else ""
-    print(f"{found['seconds']:.2f} s, {found['frames']} frames{part}, seen by camera {camera}{pace}")
+    frames = counted(found["frames"], "frame")
+    print(f"{found['seconds']:.2f} s, {frames}{part}, seen by camera {camera}{pace}")
     print(f"edits   {'; '.join(_described(edit, saved.names) for edit in script.edits)}")
     print(f"film    {folder / VIDEO}")
     return 130 if stopped else 0

@@ -36,9 +36,7 @@ def test_invalid_built_in_scenes_are_refused(path, says):
 
 
 def test_folders_that_fit_no_layout(tmp_path):
-    with pytest.raises(
-        DataError, match=r"Panoptic \(train_meta.json\), push-T \(.*an empty folder"
-    ):
+    with pytest.raises(DataError, match=r"Panoptic \(train_meta.json\), push-T \(.*an empty folder"):
         open_sequence(tmp_path)
     (tmp_path / "notes.txt").write_text("")
     with pytest.raises(DataError, match=r"found notes.txt"):

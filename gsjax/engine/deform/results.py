@@ -4,6 +4,7 @@ from typing import Any
 
 from gsjax.engine.deform.scores import OVER_TIME
 from gsjax.engine.folder import RunFolder
+from gsjax.engine.messages import counted
 from gsjax.engine.summary import Column, Media, Metrics, Score, Summary, Table, at, cards_of, minutes
 from gsjax.viz.colors import label_color
 from gsjax.viz.plots import losses_over_steps, save
@@ -53,8 +54,8 @@ def summarize(folder: RunFolder, found: Metrics) -> Summary:
     return Summary(
         title=f"{found['dataset']} deforms",
         subtitle=(
-            f"{_RECIPES[found['preset']]}; {frames['learned']} frames learned, {frames['held_out']} held out"
-            f"; scores are of frames {judged}"
+            f"{_RECIPES[found['preset']]}; {counted(frames['learned'], 'frame')} learned, "
+            f"{frames['held_out']} held out; scores are of frames {judged}"
         ),
         cards=cards_of(SCORES, found),
         tables=[

@@ -1,6 +1,7 @@
 """The summary of a distillation: agreement with the teacher, classes, pictures of the features."""
 
 from gsjax.engine.folder import RunFolder
+from gsjax.engine.messages import counted
 from gsjax.engine.summary import Column, Media, Metrics, Score, Summary, Table, at, cards_of, minutes
 from gsjax.viz.plots import losses_over_steps, save
 
@@ -34,7 +35,7 @@ def summarize(folder: RunFolder, found: Metrics) -> Summary:
     return Summary(
         title=f"A field on {found['dataset']}",
         subtitle=(
-            f"{found['features_are']}; masks: {found['masks']}; {views['taught']} views taught, "
+            f"{found['features_are']}; masks: {found['masks']}; {counted(views['taught'], 'view')} taught, "
             f"{views['held_out']} held out; scores are of views {judged}"
         ),
         cards=cards_of(SCORES, found),

@@ -62,7 +62,7 @@ def summarize(folder: RunFolder, found: Metrics) -> Summary:
     orbit = folder.video(ORBIT)
     return Summary(
         title=found["dataset"],
-        subtitle=f"{photographs['fitted']} photographs fitted, {photographs['held_out']} held out",
+        subtitle=f"{counted(photographs['fitted'], 'photograph')} fitted, {photographs['held_out']} held out",
         cards=cards_of(SCORES, found),
         tables=[
             Table("Views", _VIEWS, found["views"]),

@@ -19,7 +19,7 @@ from jaxtyping import Array, Float, Int
 
 from gsjax.engine.files import write_scene
 from gsjax.engine.machine import describe as describe_machine
-from gsjax.engine.messages import Notes, reason
+from gsjax.engine.messages import Notes, counted, reason
 from gsjax.engine.parts.saved import PartsRun, read_parts_about
 from gsjax.geometry.cameras import Camera, resized
 from gsjax.io.atomic import atomic_write, write_json
@@ -180,7 +180,7 @@ def write_film(
                 seconds.append(shot.seconds)
         except KeyboardInterrupt as interrupt:
             stopped = True
-            after = f"after {len(seconds)} frames by {reason(interrupt)}"
+            after = f"after {counted(len(seconds), 'frame')} by {reason(interrupt)}"
             notes.add(f"This film is not complete: it was stopped {after}.")
     warm = [each for each in seconds if each is not None]
     found = {

@@ -12,7 +12,7 @@ from gsjax.engine.ending import ended, exit_code, finish
 from gsjax.engine.folder import RunFolder, expect_dataset
 from gsjax.engine.locks import releasing_locks
 from gsjax.engine.machine import describe as describe_machine
-from gsjax.engine.messages import FITTING, Notes, reason, stage
+from gsjax.engine.messages import FITTING, Notes, counted, reason, stage
 from gsjax.engine.options import (
     RESUME_MAY_CHANGE,
     FirstMasks,
@@ -293,7 +293,7 @@ def _note_what_was_lost(
         to_the_end = len(lost) > 0 and lost[-1] == tracking.num_frames - 1
         if len(lost):
             last = "to the end" if to_the_end else f"to {lost[-1]}"
-            notes.add(f"{names[label]}: lost in {len(lost)} frames, from {lost[0]} {last}.")
+            notes.add(f"{names[label]}: lost in {counted(len(lost), 'frame')}, from {lost[0]} {last}.")
         unknown = turn_unknown_from(tracking, values, label)
         if unknown is not None and not to_the_end:
             why = "it was lost then" if unknown in lost else "other rotations agree as well"
