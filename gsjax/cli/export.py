@@ -83,10 +83,11 @@ def run(options: Options) -> int:
                 look["view"] = tuple(place.tolist() for place in first_pose(scene)[:2])
         if numbered:
             return _write_frames(options, scene, rows, look, notes, console)
-        plays = "film" in written.options and len(rows) > 1
+        moves = len(rows) > 1 and scene.num_moving > 0
+        plays = "film" in written.options and moves
         if plays:
             look["film"] = _film_of(scene, rows)
-        elif len(rows) > 1:
+        elif moves:
             notes.warn(
                 f"{options.path} moves; only its first of {len(rows)} frames is written. A page (.html) "
                 f"plays all, and 'frame_####{_ending(written)}' writes a file for each"

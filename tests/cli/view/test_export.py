@@ -4,19 +4,24 @@ import json
 import os
 import re
 import shutil
+from dataclasses import replace
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from rich.console import Console
 
 from gsjax.data.open import open_sequence
 from gsjax.engine.folder import RunFolder
+from gsjax.engine.messages import Notes
 from gsjax.engine.track.outputs import write_tracking
 from gsjax.engine.track.saved import read_tracking
+from gsjax.engine.viewables import open_viewable
 from gsjax.io.ply import write_ply
 from gsjax.io.scenes import FORMATS, read_gaussians
 from gsjax.scene.origin import in_world
+from gsjax.viz.viewer import Motion
 from tests.cli.view.conftest import some
 from tests.io.scenes_to_write import ROUNDING, assert_alike
 
@@ -60,6 +65,17 @@ def test_a_page_of_a_tracked_scene_plays_at_the_rate_of_its_recording(export, tr
     assert about["motion"]["moving"] == 12
     times = open_sequence(str(recording)).times[1:4]
     np.testing.assert_allclose(about["motion"]["times"], times - times[0], atol=1e-6)
+
+
+@pytest.mark.parametrize("ending", [".ply", ".html"])
+def test_of_a_recording_in_which_nothing_moves_no_frames_are_told(
+    export, tracked, monkeypatch, tmp_path, ending
+):
+    scene, folder = open_viewable(tracked, Notes(Console(quiet=True)))
+    still = replace(scene, motion=Motion(4, 0, lambda frame: scene.gaussians))
+    monkeypatch.setattr("gsjax.cli.export.open_viewable", lambda *_: (still, folder))
+    code, said = export(tracked, tmp_path / f"scene{ending}")
+    assert (code, "frames" in said, "moves" in said) == (0, False, False), said
 
 
 @pytest.mark.parametrize("ending", [".ply", ".sog"])
