@@ -12,7 +12,7 @@ import tyro
 from rich.console import Console
 from rich.progress import track
 
-from gsjax.engine.messages import Notes, reason, stage
+from gsjax.engine.messages import Notes, counted, reason, stage
 from gsjax.engine.options import Common
 from gsjax.engine.recording import parse_frames
 from gsjax.engine.viewables import UP, Up, open_viewable
@@ -122,7 +122,7 @@ def _write_frames(
             "which programs take for frames of the same scene"
         )
     part = "" if stopped is None else f" of {len(files)} (stopped by {stopped})"
-    text = f"{len(sizes)} files{part} of {scene.gaussians.num:,} Gaussians, {written.name}"
+    text = f"{counted(len(sizes), 'file')}{part} of {scene.gaussians.num:,} Gaussians, {written.name}"
     _tell(options.out, f"{text}, {_megabytes(sum(sizes))}")
     return 0 if stopped is None else 130
 

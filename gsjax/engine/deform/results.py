@@ -4,7 +4,19 @@ from typing import Any
 
 from gsjax.engine.deform.scores import OVER_TIME
 from gsjax.engine.folder import RunFolder
-from gsjax.engine.summary import Column, Media, Metrics, Score, Summary, Table, at, cards_of, minutes
+from gsjax.engine.messages import counted
+from gsjax.engine.summary import (
+    Column,
+    Media,
+    Metrics,
+    Score,
+    Summary,
+    Table,
+    at,
+    cards_of,
+    in_title,
+    minutes,
+)
 from gsjax.viz.colors import label_color
 from gsjax.viz.plots import losses_over_steps, save
 
@@ -51,9 +63,10 @@ def summarize(folder: RunFolder, found: Metrics) -> Summary:
         plots.append(Media(plot, "Weighted losses over steps"))
     names = [f"Names: {', '.join(found['names'])}."] if found["names"] else []
     return Summary(
-        title=f"{found['dataset']} deforms",
+        title=f"{in_title(found['dataset'])} deforms",
         subtitle=(
-            f"{_RECIPES[found['preset']]}; {frames['learned']} frames learned, {frames['held_out']} held out"
+            f"{_RECIPES[found['preset']]}; {counted(frames['learned'], 'frame')} learned, "
+            f"{frames['held_out']} held out"
             f"; scores are of frames {judged}"
         ),
         cards=cards_of(SCORES, found),

@@ -5,7 +5,18 @@ from typing import Any
 
 from gsjax.engine.folder import RunFolder
 from gsjax.engine.scores import CAMERA_COLUMNS, camera_rows
-from gsjax.engine.summary import Column, Media, Metrics, Score, Summary, Table, at, cards_of, time_table
+from gsjax.engine.summary import (
+    Column,
+    Media,
+    Metrics,
+    Score,
+    Summary,
+    Table,
+    at,
+    cards_of,
+    in_title,
+    time_table,
+)
 
 MOVED_MM = 30.0
 """An object that moved less is no test of a tracker."""
@@ -81,7 +92,7 @@ def summarize(folder: RunFolder, found: Metrics, plots: Sequence[Media], images:
         plots, images: those that it has written.
     """
     return Summary(
-        title=found["dataset"],
+        title=in_title(found["dataset"]),
         subtitle=_subtitle(found),
         cards=cards_of(SCORES, found),
         tables=[
