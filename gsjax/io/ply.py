@@ -299,5 +299,8 @@ def _advice(names: tuple[str, ...]) -> str:
     if {"scale_0", "scale_1"} <= set(names) and "scale_2" not in names:
         return "This seems to be a scene of 2D Gaussian splatting, which has no third axis"
     if {"x", "y", "z"} <= set(names):
-        return "This seems to be a point cloud or a mesh: convert it with gaussians_from_points"
+        return (
+            "This seems to be a point cloud or a mesh, without Gaussians: gsjax fit makes a scene of "
+            "photographs, and gaussians_from_points one of points"
+        )
     return "Export the scene in the 3D Gaussian splatting PLY format"
