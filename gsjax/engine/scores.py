@@ -30,6 +30,10 @@ CAMERA_COLUMNS = (
     Column("PSNR drawn", "psnr_covered", "dB", 2),
     Column("PSNR robot", "psnr_robot", "dB", 2),
 )
+CAMERA_NOTE = (
+    "PSNR and SSIM are over whole pictures, black where the scene has nothing; 'drawn' is the part that it "
+    "covers, and 'PSNR drawn' is over that part."
+)
 
 
 def mean_scores(rows: list[dict[str, Any]], names: Iterable[str]) -> dict[str, float | None]:

@@ -5,7 +5,7 @@ from collections.abc import Callable
 
 from gsjax.engine.folder import RunFolder
 from gsjax.engine.messages import counted
-from gsjax.engine.scores import CAMERA_COLUMNS, camera_rows
+from gsjax.engine.scores import CAMERA_COLUMNS, CAMERA_NOTE, camera_rows
 from gsjax.engine.summary import (
     Column,
     Media,
@@ -91,7 +91,7 @@ def summarize(folder: RunFolder, found: Metrics) -> Summary:
         cards=cards_of(SCORES, found),
         tables=[
             Table("Parts", _PARTS, rows, _PART_NOTE, colors=colors, brief=True),
-            Table("Cameras", CAMERA_COLUMNS, cameras),
+            Table("Cameras", CAMERA_COLUMNS, cameras, CAMERA_NOTE),
             time_table(_TIMES, found["seconds"]),
         ],
         videos=[Media(folder.video(row["name"]), f"Camera {row['name']}, {row['kind']}") for row in cameras],

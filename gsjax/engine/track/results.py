@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from gsjax.engine.folder import RunFolder
-from gsjax.engine.scores import CAMERA_COLUMNS, camera_rows
+from gsjax.engine.scores import CAMERA_COLUMNS, CAMERA_NOTE, camera_rows
 from gsjax.engine.summary import (
     Column,
     Media,
@@ -65,9 +65,9 @@ _OBJECT_NOTE = (
     "pools pixels over frames and cameras. 'Moved' is the truth's, 'travelled' the tracker's. "
     "Pixels are those of the first mask."
 )
-_CAMERA_NOTE = (
-    "PSNR and SSIM are over whole pictures, black where the scene has nothing; 'drawn' is the part that it "
-    "covers, and 'PSNR drawn' is over that part."
+_HOLES = (
+    "What an object hid from all cameras in the first frame was never measured: there is a hole once it moves "
+    "away."
 )
 _TIMES = {
     "preparing": "opening the recording, the first mask; drawing it if simulated",
@@ -97,7 +97,7 @@ def summarize(folder: RunFolder, found: Metrics, plots: Sequence[Media], images:
         cards=cards_of(SCORES, found),
         tables=[
             Table("Objects", _OBJECTS, _object_rows(found), _OBJECT_NOTE, brief=True),
-            Table("Cameras", CAMERA_COLUMNS, camera_rows(found), _CAMERA_NOTE, brief=True),
+            Table("Cameras", CAMERA_COLUMNS, camera_rows(found), f"{CAMERA_NOTE} {_HOLES}", brief=True),
             time_table(_TIMES, found["seconds"]),
         ],
         videos=[
