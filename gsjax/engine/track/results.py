@@ -66,8 +66,8 @@ _OBJECT_NOTE = (
     "Pixels are those of the first mask."
 )
 _HOLES = (
-    "What an object hid from all cameras in the first frame was never measured: there is a hole once it moves "
-    "away."
+    "What an object hid from all cameras in the first frame was never measured: there is a hole once it "
+    "moves away."
 )
 _TIMES = {
     "preparing": "opening the recording, the first mask; drawing it if simulated",
