@@ -23,7 +23,7 @@ from gsjax.engine.photographs import photographs_of_run, read_frames, split
 from gsjax.engine.records import EVALUATION, Record, digest, read_record
 from gsjax.engine.report import write_report
 from gsjax.engine.scores import mean_scores
-from gsjax.engine.summary import Card, Column, Media, Summary, Table
+from gsjax.engine.summary import Card, Column, Media, Summary, Table, in_title
 from gsjax.engine.terminal import print_summary
 from gsjax.io.atomic import write_json
 from gsjax.io.ply import read_ply
@@ -241,7 +241,8 @@ def _summarize(folder: Path, record: Record, found: dict[str, Any]) -> Summary:
     split = [Column("split", "split")] if len(means) > 1 else []
     return Summary(
         title=f"Scores of {record.path.resolve().name}",
-        subtitle=f"{found['dataset']}: {counted(len(rows), 'view')}, {found['num_gaussians']:,} Gaussians"
+        subtitle=f"{in_title(found['dataset'])}: {counted(len(rows), 'view')}, "
+        f"{found['num_gaussians']:,} Gaussians"
         + ("" if found["complete"] else ", of a run that was not finished"),
         cards=[
             Card(f"{column.head}, {kind}", values[column.key], column.unit, column.decimals)

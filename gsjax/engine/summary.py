@@ -1,6 +1,7 @@
 """The outcome of a run as one value, which the terminal, report.html and `gsjax compare` all draw."""
 
 import math
+import re
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -187,6 +188,11 @@ def minutes(stage: str = "steps") -> Callable[[Metrics], float]:
         return (found["seconds"][stage] + found["seconds"]["compile"]) / 60
 
     return value
+
+
+def in_title(dataset: str) -> str:
+    """The name of a dataset for people: "tabletop, seed 0" for the built-in scene tabletop_seed0."""
+    return re.sub(r"_seed(\d+)$", r", seed \1", dataset)
 
 
 def time_table(times: Mapping[str, str], seconds: Mapping[str, float]) -> Table:

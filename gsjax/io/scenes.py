@@ -63,10 +63,10 @@ _BY_START: dict[bytes, Reader] = {
 }
 _KNOWN = {
     glb.MAGIC: "glTF, which is only written",
-    b"\x89PNG": "a PNG picture",
-    b"\xff\xd8": "a JPEG picture",
-    b"{": "JSON",
     b"<": "a page or another text of tags",
+    b"\x89PNG": "a PNG picture",
+    b"\xff\xd8\xff": "a JPEG picture",
+    b"{": "JSON, as a run has beside its scene (give the folder of the run)",
     b"version https://git-lfs": "a pointer of Git LFS, which stands for the file (git lfs pull fetches it)",
 }
 

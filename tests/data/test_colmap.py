@@ -307,3 +307,11 @@ def test_what_is_transparent_is_white_as_the_background(tmp_path, form):
     assert scene.image(1)[20, 5].tolist() == [10, 20, 30]
     assert (scene.image(1)[:, 40:] == 255).all()
     assert scene.image(0).max() > 200
+
+
+def test_the_folder_of_the_reconstruction_alone_points_above(tmp_path):
+    build(tmp_path)
+    with pytest.raises(
+        DataError, match=rf"Give the folder above, which has them: {re.escape(str(tmp_path))}\."
+    ):
+        open_photographs(tmp_path / "sparse/0")

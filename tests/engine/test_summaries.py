@@ -2,6 +2,7 @@
 
 import pytest
 
+from gsjax.engine.summary import in_title
 from gsjax.engine.track.results import _TIMES, SCORES
 
 
@@ -20,3 +21,16 @@ def test_the_tile_of_the_tracker_is_a_mean_and_says_so():
 
 def test_compiling_before_the_first_update_is_not_called_planning_alone():
     assert _TIMES["planning"] == "loop: planning and compiling, before the first update"
+
+
+@pytest.mark.parametrize(
+    ("dataset", "title"),
+    [
+        ("tabletop_seed0", "tabletop, seed 0"),
+        ("bar_seed12", "bar, seed 12"),
+        ("fox", "fox"),
+        ("a_seeds", "a_seeds"),
+    ],
+)
+def test_a_built_in_scene_has_a_title_for_people(dataset, title):
+    assert in_title(dataset) == title

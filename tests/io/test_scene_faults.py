@@ -85,7 +85,7 @@ def test_files_that_are_cut_off(tmp_path, ending, share):
         ("a.sog", b"version https://git-lfs.github.com/spec/v1\n", "git lfs pull"),
         ("a.ksplat", b"\xff\xd8\xff\xe0", "found a JPEG picture. Give such a file, or export"),
         ("a.ply", b"\x89PNG\r\n\x1a\n", "found a PNG picture"),
-        ("metrics.json", b'{"psnr": 20}', "found JSON"),
+        ("metrics.json", b'{"psnr": 20}', "found JSON, as a run has beside its scene"),
         ("a.splat", b"", "an empty one"),
         ("a.bin", bytes(64), r"one that starts with b'\x00\x00"),
         ("a.splat", b"once upon a time there was a scene" * 32, "with other values"),

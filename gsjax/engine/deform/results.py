@@ -5,7 +5,18 @@ from typing import Any
 from gsjax.engine.deform.scores import OVER_TIME
 from gsjax.engine.folder import RunFolder
 from gsjax.engine.messages import counted
-from gsjax.engine.summary import Column, Media, Metrics, Score, Summary, Table, at, cards_of, minutes
+from gsjax.engine.summary import (
+    Column,
+    Media,
+    Metrics,
+    Score,
+    Summary,
+    Table,
+    at,
+    cards_of,
+    in_title,
+    minutes,
+)
 from gsjax.viz.colors import label_color
 from gsjax.viz.plots import losses_over_steps, save
 
@@ -52,7 +63,7 @@ def summarize(folder: RunFolder, found: Metrics) -> Summary:
         plots.append(Media(plot, "Weighted losses over steps"))
     names = [f"Names: {', '.join(found['names'])}."] if found["names"] else []
     return Summary(
-        title=f"{found['dataset']} deforms",
+        title=f"{in_title(found['dataset'])} deforms",
         subtitle=(
             f"{_RECIPES[found['preset']]}; {counted(frames['learned'], 'frame')} learned, "
             f"{frames['held_out']} held out; scores are of frames {judged}"

@@ -29,7 +29,7 @@ from gsjax.engine.files import write_scene
 from gsjax.engine.folder import RunFolder, expect_dataset
 from gsjax.engine.locks import releasing_locks
 from gsjax.engine.machine import describe as describe_machine
-from gsjax.engine.messages import Notes, stage
+from gsjax.engine.messages import Notes, counted, stage
 from gsjax.engine.options import RESUME_MAY_CHANGE, OfDataset, checked
 from gsjax.engine.progress import Progress, Schedule, load_run, means_of, note_if_cut_short, watch
 from gsjax.engine.recording import located, open_recording
@@ -93,7 +93,7 @@ def run(options: Options) -> int:
         if options.resume:
             run, progress = load_run(folder.resume, run, progress)
             budget.expect_more_than(progress.used_seconds)
-            notes.add(f"Resumed after {run.step} steps of an earlier run.")
+            notes.add(f"Resumed after {counted(run.step, 'step')} of an earlier run.")
             if (folder.path / "query").exists():
                 notes.warn(f"{folder.path / 'query'} answers a query of the earlier scene; query again")
         folder.write_config(settings)  # from here on an earlier run is gone

@@ -2,7 +2,18 @@
 
 from gsjax.engine.folder import RunFolder
 from gsjax.engine.messages import counted
-from gsjax.engine.summary import Column, Media, Metrics, Score, Summary, Table, at, cards_of, minutes
+from gsjax.engine.summary import (
+    Column,
+    Media,
+    Metrics,
+    Score,
+    Summary,
+    Table,
+    at,
+    cards_of,
+    in_title,
+    minutes,
+)
 from gsjax.viz.plots import losses_over_steps, save
 
 SCORES = (
@@ -33,7 +44,7 @@ def summarize(folder: RunFolder, found: Metrics) -> Summary:
         plots.append(Media(plot, "Losses, unweighted, over steps"))
     names = [f"Names: {', '.join(found['names'])}."] if found["names"] else []
     return Summary(
-        title=f"A field on {found['dataset']}",
+        title=f"A field on {in_title(found['dataset'])}",
         subtitle=(
             f"{found['features_are']}; masks: {found['masks']}; {counted(views['taught'], 'view')} taught, "
             f"{views['held_out']} held out; scores are of views {judged}"

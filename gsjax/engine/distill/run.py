@@ -20,7 +20,7 @@ from gsjax.engine.ending import exit_code, finish
 from gsjax.engine.folder import RunFolder, plain
 from gsjax.engine.locks import releasing_locks
 from gsjax.engine.machine import describe as describe_machine
-from gsjax.engine.messages import Notes, stage
+from gsjax.engine.messages import Notes, counted, stage
 from gsjax.engine.options import RESUME_MAY_CHANGE, Common, Resuming, Seeded, Timed, checked
 from gsjax.engine.progress import Progress, Schedule, load_run, means_of, note_if_cut_short, watch
 from gsjax.engine.recording import located
@@ -88,7 +88,7 @@ def run(options: Options) -> int:
         if options.resume:
             run, progress = load_run(folder.resume, run, progress)
             budget.expect_more_than(progress.used_seconds)
-            notes.add(f"Resumed after {run.step} steps of an earlier run.")
+            notes.add(f"Resumed after {counted(run.step, 'step')} of an earlier run.")
         folder.write_config(settings)  # from here on an earlier field is gone
         ticks = drive(method, problem, run)
         total, losses = method.total(problem), means_of("rec", "cos", "contrast", "tv")

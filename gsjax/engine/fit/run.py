@@ -25,7 +25,7 @@ from gsjax.engine.fit.tensorboard import TensorBoard
 from gsjax.engine.folder import RunFolder
 from gsjax.engine.locks import releasing_locks
 from gsjax.engine.machine import describe as describe_machine
-from gsjax.engine.messages import Notes
+from gsjax.engine.messages import Notes, counted
 from gsjax.engine.options import RESUME_MAY_CHANGE, OfDataset, checked, expect_positive
 from gsjax.engine.photographs import choose_photographs, read_frames, smaller, split
 from gsjax.engine.progress import Progress, load_run, watch
@@ -109,7 +109,7 @@ def run(options: Options) -> int:
         if options.resume:
             run, progress = load_run(folder.resume, run, progress)
             budget.expect_more_than(progress.used_seconds)
-            notes.add(f"Resumed after {run.step} steps of an earlier run.")
+            notes.add(f"Resumed after {counted(run.step, 'step')} of an earlier run.")
             if is_default:  # the slots that an earlier run chose for its minutes are kept
                 config = replace(config, cap=run.params.gaussians.num)
                 method = Fit(config)

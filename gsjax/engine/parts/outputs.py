@@ -11,7 +11,7 @@ from gsjax.engine.ending import ended
 from gsjax.engine.files import write_scene
 from gsjax.engine.folder import RunFolder
 from gsjax.engine.machine import describe as describe_machine
-from gsjax.engine.messages import Notes, reason
+from gsjax.engine.messages import Notes, counted, reason
 from gsjax.engine.parts.loop import update_seconds
 from gsjax.engine.parts.scoring import part_rows, score_parts
 from gsjax.engine.parts.views import part_views
@@ -55,7 +55,7 @@ def finished(
     complete = stopped is None
     if stopped is not None:
         why = reason(stopped).rstrip(".")
-        notes.add(f"This run is not complete: it was stopped after {len(frames)} frames by {why}.")
+        notes.add(f"This run is not complete: it was stopped after {counted(len(frames), 'frame')} by {why}.")
     origin = recording.tracked.origin
     write_parts(folder.path / "parts.npz", scene, trajectory, found.anchor, origin)
     write_scene(folder.scene, scene.gaussians, np.asarray(scene.labels), origin=origin)
@@ -66,7 +66,7 @@ def finished(
         try:
             film.score(views, scores, len(frames), console)
         except (KeyboardInterrupt, OSError) as error:
-            notes.warn(f"scoring was stopped after {scores.num_frames} frames by {reason(error)}")
+            notes.warn(f"scoring was stopped after {counted(scores.num_frames, 'frame')} by {reason(error)}")
             progress.stopped = error if isinstance(error, KeyboardInterrupt) else None
     rows, against_truth = part_rows(scene, trajectory, joints), {}
     for row in rows if origin is not None else ():

@@ -6,7 +6,18 @@ from collections.abc import Callable
 from gsjax.engine.folder import RunFolder
 from gsjax.engine.messages import counted
 from gsjax.engine.scores import CAMERA_COLUMNS, CAMERA_NOTE, camera_rows
-from gsjax.engine.summary import Column, Media, Metrics, Score, Summary, Table, at, cards_of, time_table
+from gsjax.engine.summary import (
+    Column,
+    Media,
+    Metrics,
+    Score,
+    Summary,
+    Table,
+    at,
+    cards_of,
+    in_title,
+    time_table,
+)
 from gsjax.viz.colors import label_color
 
 
@@ -70,11 +81,12 @@ def summarize(folder: RunFolder, found: Metrics) -> Summary:
     colors, frames, image = [label_color(row["part"]) for row in rows], found["frames"], found["image"]
     cameras = camera_rows(found, "observed")
     return Summary(
-        title=found["dataset"],
+        title=in_title(found["dataset"]),
         subtitle=(
             f"Parts found from motion (MotionSplicer), of {counted(found['pieces'], 'piece')}; "
-            f"{frames['followed']} frames, canonical {found['anchor']}; {len(found['tracked_cameras'])} "
-            f"cameras, {image['width']}×{image['height']}; {found['seconds']['total'] / 60:.1f} min"
+            f"{counted(frames['followed'], 'frame')}, canonical {found['anchor']}; "
+            f"{counted(len(found['tracked_cameras']), 'camera')}, "
+            f"{image['width']}×{image['height']}; {found['seconds']['total'] / 60:.1f} min"
         ),
         cards=cards_of(SCORES, found),
         tables=[

@@ -25,7 +25,7 @@ from gsjax.engine.folder import RunFolder
 from gsjax.engine.locks import releasing_locks
 from gsjax.engine.machine import describe as describe_machine
 from gsjax.engine.machine import resident_mb
-from gsjax.engine.messages import FITTING, MEASURING, Notes, stage
+from gsjax.engine.messages import FITTING, MEASURING, Notes, counted, stage
 from gsjax.engine.options import Common, FirstMasks, Overwriting, Selection, checked, expect_positive
 from gsjax.engine.recording import (
     Recording,
@@ -345,9 +345,9 @@ def _facts(found: dict[str, Any]) -> dict[str, str]:
             "late": f"{found['late']} updates were over the budget",
         }
     if found["skipped"]:
-        facts["skipped"] = f"{found['skipped']} updates gave non-finite values and were skipped"
+        facts["skipped"] = f"{counted(found['skipped'], 'update')} gave non-finite values and were skipped"
     for title, key in (("lost", "frames_lost"), ("turn unknown", "frames_turn_unknown")):
-        counts = [f"{name} in {count} updates" for name, count in found[key].items() if count]
+        counts = [f"{name} in {counted(count, 'update')}" for name, count in found[key].items() if count]
         if counts:
             facts[title] = ", ".join(counts)
     if budget := found["budget"]:

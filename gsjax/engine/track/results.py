@@ -5,7 +5,18 @@ from typing import Any
 
 from gsjax.engine.folder import RunFolder
 from gsjax.engine.scores import CAMERA_COLUMNS, CAMERA_NOTE, camera_rows
-from gsjax.engine.summary import Column, Media, Metrics, Score, Summary, Table, at, cards_of, time_table
+from gsjax.engine.summary import (
+    Column,
+    Media,
+    Metrics,
+    Score,
+    Summary,
+    Table,
+    at,
+    cards_of,
+    in_title,
+    time_table,
+)
 
 MOVED_MM = 30.0
 """An object that moved less is no test of a tracker."""
@@ -54,6 +65,10 @@ _OBJECT_NOTE = (
     "pools pixels over frames and cameras. 'Moved' is the truth's, 'travelled' the tracker's. "
     "Pixels are those of the first mask."
 )
+_HOLES = (
+    "What an object hid from all cameras in the first frame was never measured: there is a hole once it "
+    "moves away."
+)
 _TIMES = {
     "preparing": "opening the recording, the first mask; drawing it if simulated",
     "start": "from the first frame to a fitted scene, compiling included",
@@ -77,12 +92,12 @@ def summarize(folder: RunFolder, found: Metrics, plots: Sequence[Media], images:
         plots, images: those that it has written.
     """
     return Summary(
-        title=found["dataset"],
+        title=in_title(found["dataset"]),
         subtitle=_subtitle(found),
         cards=cards_of(SCORES, found),
         tables=[
             Table("Objects", _OBJECTS, _object_rows(found), _OBJECT_NOTE, brief=True),
-            Table("Cameras", CAMERA_COLUMNS, camera_rows(found), CAMERA_NOTE, brief=True),
+            Table("Cameras", CAMERA_COLUMNS, camera_rows(found), f"{CAMERA_NOTE} {_HOLES}", brief=True),
             time_table(_TIMES, found["seconds"]),
         ],
         videos=[

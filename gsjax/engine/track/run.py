@@ -99,7 +99,7 @@ def run(options: Options) -> int:
         )
         if options.resume:
             tracking = load(folder.resume, options.track)
-            notes.add(f"Resumed after {tracking.resumed} frames of an earlier run.")
+            notes.add(f"Resumed after {counted(tracking.resumed, 'frame')} of an earlier run.")
         else:
             with drawing_ahead(recording):
                 scene, seconds["start"] = _start(recording, mask, rehearsal, console, notes)
@@ -278,7 +278,7 @@ def _note_what_is_missing(
             f"no settings keep the budget on this machine; {tracking.chosen.name} take {base} an update"
         )
     if tracking.skipped:
-        notes.add(f"{tracking.skipped} updates produced non-finite numbers and were skipped.")
+        notes.add(f"{counted(tracking.skipped, 'update')} produced non-finite numbers and were skipped.")
 
 
 def _note_what_was_lost(
