@@ -39,7 +39,7 @@ MOST_LABELS, MOST_CAMERAS = 8, 6  # in the table of masks
 class Options(Common, Reading):
     """Options of `gsjax info`."""
 
-    dataset: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="DATASET|RUN|FILE")]
+    path: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="DATASET|RUN|FILE")]
     """Folder of a recording or of photographs; a built-in scene such as simulated:tabletop; folder of a run;
     a file of Gaussians, or a folder of numbered ones."""
     picture: Path | None = None
@@ -56,7 +56,7 @@ def run(options: Options) -> int:
         raise ValueError(
             f"--picture: expected a name that ends in {', '.join(PICTURES)}, found {options.picture.name!r}"
         )
-    path = Path(options.dataset)
+    path = Path(options.path)
     if (describe := _scene_at(path)) is not None:
         if options.picture is not None:
             raise ValueError(f"--picture: draws the cameras of a dataset, found none in {path}; leave it out")
@@ -66,13 +66,13 @@ def run(options: Options) -> int:
         return 0
     table = None
     with Notes(Console(stderr=True, highlight=False)):
-        if is_photographs(options.dataset) and not is_recording(options.dataset):
-            photographs = open_photographs(options.dataset, options.read)
+        if is_photographs(options.path) and not is_recording(options.path):
+            photographs = open_photographs(options.path, options.read)
             photographs.image(0)  # an error if it cannot be read
             check_photographs(photographs)
             facts, groups = describe_photographs(photographs), by_split
         else:
-            sequence = open_sequence(options.dataset, options.read)
+            sequence = open_sequence(options.path, options.read)
             for c in range(sequence.num_cameras):
                 sequence.image(0, c)  # an error if it cannot be read
             check_recording(sequence)

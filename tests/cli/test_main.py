@@ -98,7 +98,7 @@ def test_info_of_a_ply_file_says_what_it_holds_and_what_is_odd(say, tmp_path):
     assert "coordinates reach 5e+06" in err
     code, _, err = say("info", str(file), "--picture", "cameras.png")
     assert code == 2
-    assert "--picture: draws cameras" in err
+    assert "--picture: draws the cameras of a dataset, found none" in err
 
 
 def test_info_of_a_file_that_is_no_scene_says_so(say, tmp_path):
