@@ -94,10 +94,14 @@ def read_colmap(
         if (root / images).is_dir():
             refuse_unread(root / images, "registered photographs", (root / images).rglob("*"))
         found = f"{len(registered)} registered, {' and '.join(left_out)}"
-        advice = f"Give the folder that holds both {images} (or --read.images NAME) and the reconstruction."
-        above = list(root.parents)[:3] if chosen.folder == root else []
-        if holder := next((folder for folder in above if (folder / images).is_dir()), None):
-            advice = f"Give the folder above, which has them: {holder}."
+        advice = "Did the reconstruction fail? Give another model, or reconstruct again."
+        if missing:
+            advice = (
+                f"Give the folder that holds both {images} (or --read.images NAME) and the reconstruction."
+            )
+            above = list(root.parents)[:3] if chosen.folder == root else []
+            if holder := next((folder for folder in above if find_file(folder / images, missing[0])), None):
+                advice = f"Give the folder above, which has them: {holder}."
         raise DataError(chosen.folder, "registered photographs that can be used", found, advice)
     if left_out:
         message = f"{root}: of {len(registered)} registered photographs, {' and '.join(left_out)}"

@@ -252,6 +252,11 @@ def is_photographs(path: str | Path) -> bool:
     )
 
 
+def is_dataset_file(path: Path) -> bool:
+    """Whether a file by itself may be a dataset: a video, a recording, a list of photographs."""
+    return _is_bag(path) or clip.is_clip(path) or path.suffix.lower() in (".json", ".r3d")
+
+
 class _PhotographLayout(NamedTuple):
     """A layout of photographs: its name, the file that marks it, whether a folder has it, and its reader."""
 

@@ -68,7 +68,8 @@ class Photographs:
             the files, [3] float64; None if they are as in the files.
         fisheye: coefficients k1 to k4 of each camera (see `gsjax.geometry.cameras.Camera`), [N,4] float64;
             None for pinholes.
-        layout: name of the layout of its files, such as "COLMAP"; empty for a set that was made in Python.
+        layout: name of the layout of its files, such as "COLMAP"; empty where it was not opened by its
+            folder.
 
     Raises:
         ValueError: shapes disagree, a pose is not a rigid motion, or there is no photograph.

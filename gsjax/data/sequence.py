@@ -52,7 +52,8 @@ class Sequence:
         locate: (kind, t, c) -> path of a file, for messages; kind is "image", "depth", "mask" or "flow".
         origin: where the data lie far from 0, what all places are relative to, in the coordinates of the
             files, [3] float64; None if they are as in the files.
-        layout: name of the layout of its files, such as "TUM RGB-D"; empty for one that was made in Python.
+        layout: name of the layout of its files, such as "TUM RGB-D"; empty where it was not opened by its
+            folder.
 
     Raises:
         ValueError: shapes disagree, a pose is not a rigid motion, or times do not increase.

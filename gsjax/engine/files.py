@@ -139,6 +139,12 @@ def read_frames(files: Sequence[Path]) -> Iterator[tuple[Gaussians, SceneReport]
                 warnings.filterwarnings("ignore", ".*relative to the origin")
             gaussians, report = read_drawable(file)
         first = first or gaussians
+        if gaussians.num != first.num and gaussians.num < report.stored:
+            found = f"{report.stored - gaussians.num} that cannot, of {report.stored}"
+            raise ValueError(
+                f"{file}: expected {first.num} Gaussians that can be drawn, as in {files[0].name}, found "
+                f"{found}; leave these out of every frame"
+            )
         if (gaussians.num, gaussians.sh_degree) != (first.num, first.sh_degree):
             raise ValueError(
                 f"{file}: expected {first.num} Gaussians of degree {first.sh_degree} as in {files[0].name}, "

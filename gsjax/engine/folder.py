@@ -65,6 +65,21 @@ def is_run(folder: Path) -> bool:
     return config.is_file() and config.read_bytes().startswith(SIGNATURE.encode())
 
 
+def is_finished(folder: Path) -> bool:
+    """Whether a run that was not stopped has written everything: its report comes last."""
+    metrics = folder / "metrics.json"
+    if not metrics.is_file():
+        return False
+    found = read_values(metrics, parse_json)
+    written = (folder / "report.html").is_file() or not found.get("report", True)
+    return found.get("complete", True) and written
+
+
+def is_resumable(folder: Path) -> bool:
+    """Whether a run has left what it can be resumed from."""
+    return any(any(folder.glob(pattern)) for pattern in _RESUMED)
+
+
 def expect_run(path: Path, made_by: str = "") -> None:
     """Raises FileNotFoundError if this is not the folder of a run (of the command `made_by`)."""
     expect_folder(path, made_by)
@@ -200,7 +215,7 @@ class RunFolder:
                 f"{self.path}: holds a finished run{nothing}; name another folder, or replace it with "
                 "--overwrite"
             )
-        resumable = any(any(self.path.glob(pattern)) for pattern in _RESUMED)
+        resumable = is_resumable(self.path)
         valuable = resumable or any((self.path / name).exists() for name in _VALUABLE)
         if valuable and not (resume or overwrite):
             advice = "continue it with --resume, or " if resumable and resume is not None else ""
@@ -212,10 +227,7 @@ class RunFolder:
     @property
     def finished(self) -> bool:
         """Whether a run that was not stopped has written everything: its report comes last."""
-        if not self.metrics.is_file():
-            return False
-        found = read_values(self.metrics, parse_json)
-        return found.get("complete", True) and (self.report.is_file() or not found.get("report", True))
+        return is_finished(self.path)
 
     def forget_resume(self) -> None:
         """Remove what only an unfinished run needs."""

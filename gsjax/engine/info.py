@@ -16,7 +16,7 @@ from rich.console import Console
 from gsjax.data import Photographs, Sequence, open_photographs, open_sequence, photographs_of
 from gsjax.data.consistency import check_photographs, check_recording
 from gsjax.data.errors import MissingFile
-from gsjax.data.open import is_photographs, is_recording
+from gsjax.data.open import SIMULATED_PREFIX, ReadOptions, is_dataset_file, is_photographs, is_recording
 from gsjax.engine.folder import is_run
 from gsjax.engine.info_picture import by_camera, by_split, write_picture
 from gsjax.engine.info_run import describe_run
@@ -60,9 +60,11 @@ def run(options: Options) -> int:
     if (describe := _scene_at(path)) is not None:
         if options.picture is not None:
             raise ValueError(f"--picture: draws the cameras of a dataset, found none in {path}; leave it out")
+        if options.read != ReadOptions():
+            raise ValueError(f"--read: is about datasets, and {path} is none; leave it out")
         with Notes(Console(stderr=True, highlight=False)):
             facts = describe()
-        print_facts(facts, title=path.name)
+        print_facts(facts, title=path.absolute().name)
         return 0
     table = None
     with Notes(Console(stderr=True, highlight=False)):
@@ -90,12 +92,24 @@ def run(options: Options) -> int:
 
 
 def _scene_at(path: Path) -> Callable[[], dict[str, str]] | None:
-    """Describes the run, the frames or the file of Gaussians at a path; None if there is none of these."""
+    """Describes the run, the frames or the file of Gaussians at a path; None for a dataset.
+
+    Raises:
+        FileNotFoundError: there is nothing.
+    """
     if is_run(path):
         return partial(describe_run, path)
     if files := frame_files(path):
         return partial(describe_frames, files)
-    return partial(describe_scene, path) if path.is_file() and is_scene(path) else None
+    if is_scene(path / "meta.json"):
+        return partial(describe_scene, path / "meta.json")
+    if path.is_file() and (is_scene(path) or not is_dataset_file(path)):
+        return partial(describe_scene, path)
+    if not path.exists() and not str(path).startswith(SIMULATED_PREFIX):
+        raise FileNotFoundError(
+            f"{path}: expected a dataset, a run or a file of Gaussians, found nothing there; check the path"
+        )
+    return None
 
 
 def describe_photographs(photographs: Photographs) -> dict[str, str]:

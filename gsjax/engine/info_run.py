@@ -1,36 +1,60 @@
 """What a run came to, as `gsjax info` prints it."""
 
+import warnings
 from pathlib import Path
 
 from gsjax.engine.compare.data import SCORES, data_in_words, data_of
+from gsjax.engine.folder import is_finished, is_resumable
 from gsjax.engine.info_scene import describe_scene
-from gsjax.engine.records import Record, read_record
+from gsjax.engine.messages import describe
+from gsjax.engine.records import EVALUATION, Record, kind_of, read_record
 from gsjax.engine.summary import cards_of
 
 
 def describe_run(path: Path) -> dict[str, str]:
-    """Facts about a run: how it ended, its data, its scores, and its scene.
+    """Facts about a run: how it ended, its data, its scores, and its scene; what is odd is warned of.
 
     Raises:
-        ValueError, OSError: a file of it cannot be read, or it is of a command that keeps no scores.
+        ValueError, OSError: its settings or scores cannot be read.
     """
-    record = read_record(path)
-    facts = {"run": f"gsjax {record.kind}, {_ending(record)}", "dataset": str(record.config["dataset"])}
-    if record.metrics is not None:
-        facts["dataset"] = data_in_words(facts["dataset"], data_of(record.kind, record.metrics))
-        cards = cards_of(SCORES[record.kind], record.metrics)
-        facts |= {card.head: f"{card.text} {card.unit}".strip() for card in cards}
+    if kind_of(path) is None:
+        facts = {"run": f"of a command whose scores are not listed here; they are in {path / 'metrics.json'}"}
+    else:
+        record = read_record(path)
+        facts = {"run": f"gsjax {record.kind}, {_ending(record)}"} | _scores(record)
+        for note in record.notes:
+            warnings.warn(note, UserWarning, stacklevel=1)
+        if record.evaluation is not None:
+            facts["gsjax eval"] = str(path / EVALUATION)
     if (scene := path / "scene.ply").is_file():
-        facts |= describe_scene(scene)
+        try:
+            facts |= describe_scene(scene)
+        except (ValueError, OSError) as error:
+            warnings.warn(describe(error), UserWarning, stacklevel=1)
     if (report := path / "report.html").is_file():
         facts["report"] = str(report)
     return facts
 
 
 def _ending(record: Record) -> str:
-    """Whether a run ended, in words."""
-    if record.complete:
+    """Whether a run ended, in words, and what to do if not."""
+    if is_finished(record.path):
         return "finished"
+    stopped = (record.metrics or {}).get("stopped")
+    ending = f"stopped by {stopped}" if stopped else "still going on, or killed"
+    return f"{ending}; " + ("continue it with --resume" if is_resumable(record.path) else "run it again")
+
+
+def _scores(record: Record) -> dict[str, str]:
+    """The data of a run, and its scores if it has any."""
     if record.metrics is None:
-        return "still going on, or killed; if so, continue it with --resume"
-    return f"stopped by {record.metrics.get('stopped') or 'something'}; continue it with --resume"
+        return {"dataset": str(record.config.get("dataset") or record.config.get("scene"))}
+    try:
+        data = data_in_words(record.metrics["dataset"], data_of(record.kind, record.metrics))
+        cards = cards_of(SCORES[record.kind], record.metrics)
+        return {"dataset": data} | {card.head: f"{card.text} {card.unit}".strip() for card in cards}
+    except (KeyError, TypeError, ValueError, IndexError, AttributeError) as error:
+        raise ValueError(
+            f"{record.path / 'metrics.json'}: expected the scores of gsjax {record.kind}, found others "
+            f"({describe(error)}); run it again with this version of gsjax"
+        ) from error

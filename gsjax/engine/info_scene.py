@@ -1,5 +1,6 @@
 """What a file of Gaussians holds, as `gsjax info` prints it."""
 
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -7,6 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from gsjax.engine.files import read_frames
+from gsjax.engine.messages import describe
 from gsjax.engine.terminal import in_bytes
 from gsjax.io.scene_file import SceneReport
 from gsjax.io.scenes import read_gaussians
@@ -24,7 +26,9 @@ def describe_scene(file: Path) -> dict[str, str]:
 
 
 def _facts_of(file: Path, gaussians: Gaussians, report: SceneReport) -> dict[str, str]:
-    facts = {"file": f"{report.format}, {in_bytes(file.stat().st_size)}", "Gaussians": f"{gaussians.num:,}"}
+    parts = file.parent.iterdir() if file.name == "meta.json" else [file]  # of a SOG in a folder
+    size = in_bytes(sum(part.stat().st_size for part in parts if part.is_file()))
+    facts = {"file": f"{report.format}, {size}", "Gaussians": f"{gaussians.num:,}"}
     if report.stored != gaussians.num:
         facts["Gaussians"] += f" of {report.stored:,}"
     facts["colours"] = f"spherical harmonics of degree {gaussians.sh_degree}"
@@ -48,18 +52,22 @@ def _facts_of(file: Path, gaussians: Gaussians, report: SceneReport) -> dict[str
 
 
 def describe_frames(files: Sequence[Path]) -> dict[str, str]:
-    """Facts about a scene that moves: its first frame is described, the others are read for what is wrong.
+    """Facts about a scene that moves: its first frame is described, and what is wrong with others is warned
+    of.
 
     Args:
         files: of its frames.
 
     Raises:
-        ValueError, OSError: as for `read_frames`.
+        ValueError, OSError: the first cannot be read.
     """
     read = read_frames(files)
     first = next(read)
-    for _ in read:
-        pass
+    try:
+        for _ in read:
+            pass
+    except (ValueError, OSError) as error:
+        warnings.warn(describe(error), UserWarning, stacklevel=1)
     size = in_bytes(sum(file.stat().st_size for file in files))
     frames = f"{len(files)}, {files[0].name} to {files[-1].name}, {size}"
     return {"frames": frames} | _facts_of(files[0], *first)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
+from gsjax.data.open import SIMULATED_SCENES
 from gsjax.engine.machine import in_words
 
 Metrics = Mapping[str, Any]
@@ -192,7 +193,7 @@ def minutes(stage: str = "steps") -> Callable[[Metrics], float]:
 
 def in_title(dataset: str) -> str:
     """The name of a dataset for people: "tabletop, seed 0" for the built-in scene tabletop_seed0."""
-    return re.sub(r"_seed(\d+)$", r", seed \1", dataset)
+    return re.sub(rf"^({'|'.join(SIMULATED_SCENES)})(.*)_seed(\d+)$", r"\1\2, seed \3", dataset)
 
 
 def time_table(times: Mapping[str, str], seconds: Mapping[str, float]) -> Table:

@@ -49,7 +49,8 @@ def expect_known(kind: Any, command: str, arguments: Sequence[str]) -> None:
         if (
             re.match("--[a-zA-Z]", given)
             and given not in known
-            and not given.startswith(("--help", "--tyro"))
+            and given != "--help"
+            and not given.startswith("--tyro")
         ):
             meant = " or ".join(_meant(given, known))
             hint = f"; did you mean {meant}?" if meant else ";"

@@ -4,6 +4,7 @@ from dataclasses import fields, replace
 from pathlib import Path
 from typing import Literal
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
@@ -26,6 +27,7 @@ from gsjax.engine.query import asking_of
 from gsjax.engine.recording import Recording
 from gsjax.engine.track.saved import open_run, read_tracking
 from gsjax.io.parsed import parse_yaml
+from gsjax.io.scenes import is_scene
 from gsjax.io.sequences import frame_files
 from gsjax.methods.deform import DeformResult
 from gsjax.methods.deform.query import most_likely
@@ -54,6 +56,8 @@ def open_viewable(path: Path, notes: Notes, now: Whereabouts = AS_IT_WAS) -> tup
         ValueError: the file holds no Gaussians, or is not as the run wrote it; or a path in `now` does not
             apply.
     """
+    if is_scene(path / "meta.json"):
+        path = path / "meta.json"
     if path.is_file():
         _expect_only((), now, f"{path} is a file")
         gaussians, report = read_drawable(path)
@@ -99,6 +103,7 @@ def _of_files(path: Path, files: list[Path], notes: Notes) -> Viewable:
     read = read_frames(files)
     first, report = next(read)
     frames = [first, *(moved_to(there, known.origin, report.origin) for there, known in read)]
+    still = all(eqx.tree_equal(each, first) for each in frames[1:])
     colors = np.asarray(first.sh0)
     if max(np.abs(np.asarray(each.sh0) - colors).max() for each in frames) > _SAME_COLOR:
         notes.warn("colours change from frame to frame; all are shown in those of the first")
@@ -106,7 +111,7 @@ def _of_files(path: Path, files: list[Path], notes: Notes) -> Viewable:
         path.absolute().name,
         first,
         report.labels,
-        motion=Motion(len(frames), first.num, frames.__getitem__),
+        motion=Motion(len(frames), 0 if still else first.num, frames.__getitem__),
         antialiased=bool(report.antialiased),
         origin=report.origin,
     )

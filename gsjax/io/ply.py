@@ -78,7 +78,7 @@ def write_ply(
                 f"{labels.shape}"
             )
     columns = _columns(gaussians, origin)
-    reach = max(np.abs(columns[axis]).max(initial=0) for axis in _PLACE)
+    reach = max(np.abs(columns[axis][np.isfinite(columns[axis])]).max(initial=0) for axis in _PLACE)
     kind = "<f8" if origin is not None and _are_moved(reach, _size(gaussians)) else "<f4"
     fields = [(name, kind if name in _PLACE else "<f4") for name in columns]
     vertices = np.empty(gaussians.num, dtype=fields)

@@ -72,12 +72,12 @@ _KNOWN = {
 
 
 def is_scene(path: str | os.PathLike) -> bool:
-    """Whether a file has the ending of one that `read_gaussians` reads, or is named as a SOG in a folder.
+    """Whether a file has the ending of one that `read_gaussians` reads, or is the meta.json of a SOG.
 
     Args:
         path: the file.
     """
-    return os.fspath(path).lower().endswith(READ) or Path(path).name == "meta.json"
+    return os.fspath(path).lower().endswith(READ) or sog.is_meta(Path(path))
 
 
 def read_gaussians(path: str | os.PathLike) -> tuple[Gaussians, SceneReport]:

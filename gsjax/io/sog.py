@@ -59,6 +59,23 @@ _DAMAGED = (zipfile.BadZipFile, zlib.error, NotImplementedError, RuntimeError, E
 Load = Callable[[str], bytes]
 
 
+def is_meta(path: Path) -> bool:
+    """Whether a file is the meta.json of a SOG in a folder, by what it says.
+
+    Args:
+        path: the file, which need not exist.
+    """
+    if path.name != _META or not path.is_file():
+        return False
+    with path.open("rb") as stream:
+        text = stream.read(_MOST_TEXT)
+    try:
+        found = parse_json(text)
+    except ValueError:
+        return False
+    return isinstance(found, dict) and {"means", "scales", "quats", "sh0"} <= found.keys()
+
+
 def read_sog(path: Path) -> tuple[Gaussians, SceneReport]:
     """The Gaussians of a .sog, or of a meta.json with its pictures beside it, and the report.
 

@@ -3,6 +3,7 @@
 import io
 import warnings
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -187,6 +188,13 @@ def test_places_far_from_0_are_written_as_double_and_read_relative_to_an_origin(
     assert report.origin is not None
     np.testing.assert_allclose(in_world(np.asarray(loaded.means), report.origin), places, rtol=0, atol=1e-6)
     np.testing.assert_array_equal(report.places, places)
+
+
+def test_a_place_that_is_not_finite_takes_no_digits_from_the_others(tmp_path):
+    path, gaussians = tmp_path / "scene.ply", random_gaussians(50)
+    gaussians = eqx.tree_at(lambda g: g.means, gaussians, gaussians.means.at[0, 0].set(jnp.nan))
+    write_ply(path, gaussians, origin=UTM)
+    assert PlyData.read(str(path))["vertex"].data.dtype["x"].str == "<f8"
 
 
 def test_float32_far_from_0_is_said_to_have_lost_places(tmp_path):

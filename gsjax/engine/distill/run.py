@@ -14,7 +14,7 @@ from gsjax.engine.budget import Budget, note_if_few
 from gsjax.engine.distill.file import FOLDER, NAME
 from gsjax.engine.distill.judge import judge
 from gsjax.engine.distill.results import summarize
-from gsjax.engine.distill.scene import FieldScene, SceneOptions, open_scene
+from gsjax.engine.distill.scene import FieldScene, SceneOptions, open_field_scene
 from gsjax.engine.drive import drive
 from gsjax.engine.ending import exit_code, finish
 from gsjax.engine.folder import RunFolder, plain
@@ -54,7 +54,7 @@ def run(options: Options) -> int:
     budget = Budget(options.minutes, begun)
     with Notes(console) as notes:
         options.check()
-        scene = open_scene(options)
+        scene = open_field_scene(options)
         sha256 = digest(scene.file)
         out = _out(options, scene.file)
         folder = RunFolder.locked(out, overwrite=options.overwrite, resume=options.resume)

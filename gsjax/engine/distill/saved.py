@@ -13,7 +13,7 @@ from jaxtyping import Float, Int
 
 from gsjax.data.photographs import Photographs
 from gsjax.engine.distill.file import FOLDER, NAME, read_field
-from gsjax.engine.distill.scene import SceneOptions, open_scene
+from gsjax.engine.distill.scene import SceneOptions, open_field_scene
 from gsjax.engine.files import read_drawable, read_options
 from gsjax.engine.folder import is_run
 from gsjax.engine.messages import Notes, describe
@@ -171,7 +171,7 @@ def _photographs(
                 f"{folder / NAME}: expected the training photographs' names, found others ({error}); "
                 "distil it again with this version of gsjax"
             ) from error
-        return open_scene(options, read).photographs
+        return open_field_scene(options, read).photographs
     except (ValueError, OSError) as error:
         if images is not None:
             raise ValueError(f"--images {images}: {describe(error)}") from error

@@ -67,7 +67,7 @@ class FieldScene:
     rasterize_mode: str = "classic"
 
 
-def open_scene(options: SceneOptions, read_scene: Read | None = None) -> FieldScene:
+def open_field_scene(options: SceneOptions, read_scene: Read | None = None) -> FieldScene:
     """The scene and its photographs.
 
     Args:

@@ -345,7 +345,7 @@ def _facts(found: dict[str, Any]) -> dict[str, str]:
             "late": f"{found['late']} updates were over the budget",
         }
     if found["skipped"]:
-        facts["skipped"] = f"{counted(found['skipped'], 'update')} gave non-finite values and were skipped"
+        facts["skipped"] = f"{counted(found['skipped'], 'update')}, whose numbers were not finite"
     for title, key in (("lost", "frames_lost"), ("turn unknown", "frames_turn_unknown")):
         counts = [f"{name} in {counted(count, 'update')}" for name, count in found[key].items() if count]
         if counts:

@@ -278,7 +278,7 @@ def _note_what_is_missing(
             f"no settings keep the budget on this machine; {tracking.chosen.name} take {base} an update"
         )
     if tracking.skipped:
-        notes.add(f"{counted(tracking.skipped, 'update')} produced non-finite numbers and were skipped.")
+        notes.add(f"Skipped, as numbers were not finite: {counted(tracking.skipped, 'update')}.")
 
 
 def _note_what_was_lost(

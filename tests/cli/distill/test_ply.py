@@ -10,7 +10,7 @@ import pytest
 import yaml
 
 from gsjax.cli import main
-from gsjax.engine.distill.scene import SceneOptions, open_scene
+from gsjax.engine.distill.scene import SceneOptions, open_field_scene
 from gsjax.io.scenes import read_gaussians, write_gaussians
 
 SMALL = (
@@ -59,7 +59,7 @@ def test_a_file_that_says_it_is_antialiased_is_drawn_so(pristine, scene, tmp_pat
     gaussians, _ = read_gaussians(scene)
     for antialiased in (False, True):
         write_gaussians(tmp_path / "scene.spz", gaussians, antialiased=antialiased)
-        opened = open_scene(SceneOptions(tmp_path / "scene.spz", str(pristine), frames="0:1"))
+        opened = open_field_scene(SceneOptions(tmp_path / "scene.spz", str(pristine), frames="0:1"))
         assert opened.gaussians.num == gaussians.num
         assert opened.rasterize_mode == ("antialiased" if antialiased else "classic")
 

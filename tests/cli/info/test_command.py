@@ -8,6 +8,7 @@ import equinox as eqx
 import numpy as np
 import pytest
 
+import gsjax
 from gsjax.cli import main
 from gsjax.data import DataWarning, open_photographs, open_sequence, photographs_of
 from gsjax.engine.info_picture import by_camera, by_split, scene_points
@@ -16,6 +17,13 @@ from gsjax.io.scenes import write_gaussians
 from gsjax.viz.cameras import cameras_and_points
 from tests.cli.compare.made_up_runs import write_run
 from tests.io.scenes_to_write import make_scene
+
+
+def told(path, capfd) -> tuple[str, str]:
+    """What `gsjax info` says on stdout, and on stderr, as one line each."""
+    assert main(["info", str(path)]) == 0
+    out, err = capfd.readouterr()
+    return " ".join(out.split()), " ".join(err.split())
 
 
 def test_photographs_are_described_and_what_is_missing_is_counted(photographs, capfd):
@@ -108,33 +116,82 @@ def test_a_recording_is_drawn_by_camera_with_points_of_its_depth(capfd, tmp_path
 
 @pytest.mark.parametrize("kind", ["parts", "distill", "deform"])
 def test_a_run_is_told_by_its_end_its_data_its_scores_and_its_scene(kind, capfd, tmp_path):
-    run = write_run(tmp_path / "run", kind, 20.0, dataset="data/room")
+    data = {"scene" if kind == "distill" else "dataset": "data/room"}
+    run = write_run(tmp_path / "run", kind, 20.0, **data)
+    write_ply(run / "scene.ply", make_scene(30))
+    (run / "report.html").touch()
+    said, _ = told(run, capfd)
+    assert f"run gsjax {kind}, finished dataset made up at 96x72, " in said
+    assert "file PLY of 3DGS, " in said
+    assert "Gaussians 30" in said
+    assert said.replace(" ", "").endswith(f"report{run / 'report.html'}")
     if kind == "parts":
-        write_ply(run / "scene.ply", make_scene(30))
-        (run / "report.html").touch()
-    else:
-        found = json.loads((run / "metrics.json").read_text())
-        (run / "metrics.json").write_text(json.dumps(found | {"complete": False, "stopped": "SIGTERM"}))
-    assert main(["info", str(run)]) == 0
-    said = " ".join(capfd.readouterr().out.split())
-    if kind == "parts":
-        assert "run gsjax parts, finished dataset data/room at 96x72, 10 frames 0 to 9, cameras" in said
         assert "19.00 dB" in said  # held out
-        assert "file PLY of 3DGS, " in said
-        assert "Gaussians 30" in said
-        assert said.replace(" ", "").endswith(f"report{run / 'report.html'}")
-    else:
-        assert f"run gsjax {kind}, stopped by SIGTERM; continue it with --resume" in said
+    (run / "scene.ply").write_bytes((run / "scene.ply").read_bytes()[:900])
+    said, warned = told(run, capfd)
+    assert "run gsjax" in said
+    assert "one that cannot be parsed" in warned
 
 
-def test_a_run_that_has_not_ended_is_told(capfd, tmp_path):
+def test_a_run_that_is_not_finished_is_told(capfd, tmp_path):
     run = write_run(tmp_path / "run", "deform", 20.0, dataset="data/room")
+    assert "gsjax deform, still going on, or killed; run it again" in told(run, capfd)[0]  # without a report
+    (run / "resume").mkdir()
+    (run / "resume" / "state.npz").touch()
+    found = json.loads((run / "metrics.json").read_text()) | {"complete": False, "stopped": "SIGTERM"}
+    (run / "metrics.json").write_text(json.dumps(found))
+    assert "stopped by SIGTERM; continue it with --resume" in told(run, capfd)[0]
     (run / "metrics.json").unlink()
-    assert main(["info", str(run)]) == 0
-    said = " ".join(capfd.readouterr().out.split())
-    assert "still going on, or killed; if so, continue it with --resume" in said
-    assert main(["info", str(run), "--picture", "run.png"]) == 2
-    assert "--picture: draws the cameras of a dataset, found none in" in capfd.readouterr().err
+    said, _ = told(run, capfd)
+    assert "still going on, or killed; continue it with --resume dataset data/room" in said
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [("size", 5), ("size", []), ("frames", {}), ("seconds", 5), ("test", None), ("size", None)],
+)
+def test_scores_of_another_type_are_refused_by_file(key, value, capfd, tmp_path):
+    run = write_run(tmp_path / "run", "deform", 20.0, dataset="data/room")
+    found = json.loads((run / "metrics.json").read_text())
+    (run / "metrics.json").write_text(json.dumps(found | {key: value}))
+    code = main(["info", str(run)])
+    said = " ".join(capfd.readouterr().err.split())
+    assert (code, "a fault of gsjax" in said) in ((0, False), (2, False)), said
+    assert code == 0 or "metrics.json: expected the scores of gsjax deform, found others" in said
+
+
+def test_a_run_without_scores_is_told_with_its_scene(capfd, tmp_path):
+    (tmp_path / "config.yml").write_text("# gsjax run\nsource: camera:0\n")
+    write_ply(tmp_path / "scene.ply", make_scene(30))
+    said, _ = told(tmp_path, capfd)
+    assert "scores are not listed here" in said
+    assert "Gaussians 30" in said
+
+
+def test_what_is_about_datasets_alone_is_refused_for_scenes_and_runs(capfd, tmp_path):
+    write_ply(tmp_path / "scene.ply", make_scene(30))
+    for option, says in (
+        (("--picture", "run.png"), "--picture: draws the cameras of a dataset, found none in"),
+        (("--read.images", "pictures"), "--read: is about datasets, and"),
+    ):
+        assert main(["info", str(tmp_path / "scene.ply"), *option]) == 2
+        assert says in " ".join(capfd.readouterr().err.split())
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "says"),
+    [
+        ("a.glb", b"glTF\2\0\0\0", "found glTF, which is only written"),
+        ("p.jpg", b"\xff\xd8\xff\xe0", "found a JPEG picture"),
+        ("nothing.ply", None, "expected a dataset, a run or a file of Gaussians, found nothing there"),
+        ("meta.json", b'{"frames": []}', "meta.json: expected frames, a non-empty list"),
+    ],
+)
+def test_what_it_is_not_is_told(name, content, says, capfd, tmp_path):
+    if content is not None:
+        (tmp_path / name).write_bytes(content)
+    assert main(["info", str(tmp_path / name)]) == 2
+    assert says in " ".join(capfd.readouterr().err.split())
 
 
 @pytest.mark.parametrize(
@@ -156,8 +213,11 @@ def test_a_file_is_told_by_its_format_and_what_is_odd_about_it(ending, told, cap
     assert f"file {told}" in said
     if ending == ".sog":
         shutil.unpack_archive(tmp_path / "scene.sog", tmp_path / "scene", "zip")
-        assert main(["info", str(tmp_path / "scene" / "meta.json")]) == 0
-        assert "SOG 2" in capfd.readouterr().out
+        size = sum(file.stat().st_size for file in (tmp_path / "scene").iterdir())
+        for path in (tmp_path / "scene", tmp_path / "scene" / "meta.json"):
+            assert main(["info", str(path)]) == 0
+            assert f"SOG 2, {size / 1e3:.1f} kB" in capfd.readouterr().out
+            assert gsjax.open_scene(path).gaussians.num == 30
     assert "3 are too faint to be drawn" in said
 
 

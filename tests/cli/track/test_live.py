@@ -56,7 +56,7 @@ def test_a_recording_is_replayed_and_all_frames_are_accounted_for(pristine, live
     assert frames["used"] + frames["dropped"] == 12
     assert found["complete"]
     assert found["skipped"] == 1
-    assert "1 updates gave non-finite values" in said
+    assert "1 update, whose numbers were not finite" in said
     assert found["latency_ms"]["median"] > 0
     assert found["memory_mb"]["max"] > 10
     assert "12 offered" in said

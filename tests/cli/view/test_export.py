@@ -4,24 +4,19 @@ import json
 import os
 import re
 import shutil
-from dataclasses import replace
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from rich.console import Console
 
 from gsjax.data.open import open_sequence
 from gsjax.engine.folder import RunFolder
-from gsjax.engine.messages import Notes
 from gsjax.engine.track.outputs import write_tracking
 from gsjax.engine.track.saved import read_tracking
-from gsjax.engine.viewables import open_viewable
 from gsjax.io.ply import write_ply
 from gsjax.io.scenes import FORMATS, read_gaussians
 from gsjax.scene.origin import in_world
-from gsjax.viz.viewer import Motion
 from tests.cli.view.conftest import some
 from tests.io.scenes_to_write import ROUNDING, assert_alike
 
@@ -68,14 +63,11 @@ def test_a_page_of_a_tracked_scene_plays_at_the_rate_of_its_recording(export, tr
 
 
 @pytest.mark.parametrize("ending", [".ply", ".html"])
-def test_of_a_recording_in_which_nothing_moves_no_frames_are_told(
-    export, tracked, monkeypatch, tmp_path, ending
-):
-    scene, folder = open_viewable(tracked, Notes(Console(quiet=True)))
-    still = replace(scene, motion=Motion(4, 0, lambda frame: scene.gaussians))
-    monkeypatch.setattr("gsjax.cli.export.open_viewable", lambda *_: (still, folder))
-    code, said = export(tracked, tmp_path / f"scene{ending}")
-    assert (code, "frames" in said, "moves" in said) == (0, False, False), said
+def test_of_frames_in_which_nothing_moves_no_motion_is_told(export, tmp_path, ending):
+    for frame in range(3):
+        write_ply(tmp_path / "frames" / f"{frame}.ply", some())
+    code, said = export(tmp_path / "frames", tmp_path / f"scene{ending}")
+    assert (code, "of 3 frames" in said, "moves" in said) == (0, False, False), said
 
 
 @pytest.mark.parametrize("ending", [".ply", ".sog"])

@@ -39,7 +39,7 @@ def test_frames_as_numbered_files(export, tracked, tmp_path, notes, ending):
 def test_numbered_files_are_a_scene_for_every_command(export, tracked, tmp_path, view, capfd):
     folder = tmp_path / "frames"
     export(tracked, folder / "f#.ply")
-    for beside in ("f9_labels.npz", "note.txt", "README.md", ".DS_Store"):
+    for beside in ("f9_labels.npz", "note.txt", "NOTES.TXT", "README", ".DS_Store"):
         (folder / beside).touch()
     code, said = view(folder)
     assert (code, "30 Gaussians, SH degree 0, 4 frames" in said) == (130, True), said
@@ -58,8 +58,13 @@ def test_numbered_files_are_a_scene_for_every_command(export, tracked, tmp_path,
     code, said = view(folder)
     unlike = "f4.ply: expected 30 Gaussians of degree 0 as in f0.ply, found 7"
     assert (code, unlike in said) == (2, True), said
-    assert main(["info", str(folder)]) == 2
-    assert unlike in " ".join(capfd.readouterr().err.split())
+    assert main(["info", str(folder)]) == 0
+    told = capfd.readouterr()
+    assert f"warning: {folder / unlike}" in " ".join(told.err.split())
+    assert "5, f0.ply to f4.ply, " in " ".join(told.out.split())
+    write_ply(folder / "f4.ply", eqx.tree_at(lambda g: g.means, some(), some().means.at[3, 0].set(np.nan)))
+    code, said = view(folder)
+    assert (code, "as in f0.ply, found 1 that cannot, of 30; leave these out" in said) == (2, True), said
 
 
 @pytest.mark.filterwarnings("ignore:.*they are taken relative to the origin")
