@@ -80,7 +80,7 @@ def test_missing_option_is_named(say, capfd):
 
 
 def test_debug_shows_where_it_failed(tmp_path):
-    with pytest.raises(ValueError, match="expected a folder"):
+    with pytest.raises(FileNotFoundError, match="expected a dataset, a run or a file"):
         main(["info", str(tmp_path / "nowhere"), "--debug"])
 
 
