@@ -78,8 +78,7 @@ def write_ply(
                 f"{labels.shape}"
             )
     columns = _columns(gaussians, origin)
-    reach = max(np.abs(columns[axis][np.isfinite(columns[axis])]).max(initial=0) for axis in _PLACE)
-    kind = "<f8" if origin is not None and _are_moved(reach, _size(gaussians)) else "<f4"
+    kind = "<f8" if origin is not None and _are_moved(_reach(columns), _size(gaussians)) else "<f4"
     fields = [(name, kind if name in _PLACE else "<f4") for name in columns]
     vertices = np.empty(gaussians.num, dtype=fields)
     for name, column in columns.items():
@@ -92,6 +91,12 @@ def write_ply(
         write_labels(path, labels)
     elif replaced:
         labels_beside(path).unlink(missing_ok=True)
+
+
+def _reach(columns: dict[str, np.ndarray]) -> float:
+    """The largest coordinate that is finite."""
+    finite = (columns[axis][np.isfinite(columns[axis])] for axis in _PLACE)
+    return float(max(np.abs(values).max(initial=0) for values in finite))
 
 
 def _size(gaussians: Gaussians) -> float:
