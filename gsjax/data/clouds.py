@@ -19,6 +19,7 @@ from gsjax.data.photographs import Cloud
 from gsjax.data.text import decoded, fields
 from gsjax.geometry.spherical_harmonics import SH_C0
 from gsjax.io.arrays import load_arrays
+from gsjax.io.parsed_ply import parse_ply
 
 NAMES = ("sparse_pc.ply", "points3D.ply")
 """Files of points that nerfstudio and 3DGS write beside their poses without naming them there."""
@@ -51,8 +52,6 @@ def read_cloud(path: Path) -> Cloud:
     """
     suffix = path.suffix.lower()
     read = _READERS.get(suffix, _read_text if suffix in _TEXT else _read_ply)
-    from plyfile import PlyParseError
-
     try:
         columns = {name.lower(): column for name, column in read(path).items()}
         points = np.stack([columns[axis] for axis in "xyz"], axis=-1).astype(np.float64)
@@ -60,7 +59,7 @@ def read_cloud(path: Path) -> Cloud:
     except (FileNotFoundError, IsADirectoryError):
         advice = "Restore it, or remove the reference to it."
         raise DataError(path, "a point cloud", "no such file", advice) from None
-    except (PlyParseError, KeyError, ValueError, TypeError, EOFError, OverflowError, MemoryError) as error:
+    except (KeyError, ValueError, TypeError, EOFError, OverflowError, MemoryError) as error:
         expected = f"{_KINDS[read]} with x, y, z"
         raise DataError(path, expected, f"something else ({error})", "Fetch it again.") from None
     finite = np.isfinite(points).all(-1) & np.isfinite(colors).all(-1)
@@ -102,9 +101,7 @@ def _largest(colors: Shaped[np.ndarray, "points 3"]) -> float:
 
 
 def _read_ply(path: Path) -> Columns:
-    from plyfile import PlyData
-
-    vertices = PlyData.read(str(path))["vertex"]
+    vertices = parse_ply(path)["vertex"]
     return {prop.name: vertices[prop.name] for prop in vertices.properties}
 
 

@@ -32,6 +32,7 @@ _TIMES_AS_MANY = 2.0  # as without it
 _ANGLE = np.deg2rad(40)  # between views that may see the same surface
 _JUMP, _FEW = 20.0, 0.1  # in median steps; of all steps
 _SAME_PLACE = 1e-6  # of their distance from the origin
+_LEAST_LEFT = 0.02  # of what masks are asked about: the points in view or, without points, the pixels
 
 
 class _View(NamedTuple):
@@ -67,14 +68,17 @@ def check_recording(sequence: Sequence) -> None:
 def check_photographs(photographs: Photographs) -> None:
     """Look for mistakes in a set of photographs that none of them shows by itself.
 
-    Warns with DataWarning if depth is in another unit than the poses or the points that come with them; or
-    if the cameras look away from each other or from the points, or stand at one place.
+    Warns with DataWarning if depth is in another unit than the poses or the points that come with them; if
+    the cameras look away from each other or from the points, or stand at one place; or if masks hide nearly
+    all.
     """
     name, cloud, load = photographs.name, photographs.cloud, photographs.load_depth
     _check_places(name, photographs.viewmats, "photographs")
     points = np.zeros((0, 3)) if cloud is None else cloud.points
     if len(points):
         _check_directions(photographs, points)
+    if photographs.load_mask is not None:
+        _check_masks(photographs, points)
     if load is None or photographs.fisheye is not None:
         return
     Ks, viewmats = photographs.Ks, photographs.viewmats
@@ -249,6 +253,31 @@ def _check_directions(photographs: Photographs, points: Float[np.ndarray, "m 3"]
         found = f"{blind} of {len(some)} photographs look away from all points that come with the poses"
         advice = "give points and poses in one frame, and in the axes that the layout expects"
         warnings.warn(f"{photographs.name}: {found}; {advice}", DataWarning, stacklevel=4)
+
+
+def _check_masks(photographs: Photographs, points: Float[np.ndarray, "m 3"]) -> None:
+    """Warns if masks hide nearly all points in view, or nearly all pixels if there are no points."""
+    points, left = points[:: max(1, len(points) // (10 * _POINTS))], []
+    for i in _spread(photographs.num):
+        try:
+            mask = photographs.mask(i)
+        except (ValueError, OSError):  # which is said when it is used
+            return
+        if mask is None:
+            return
+        if not len(points):
+            left.append(mask.ravel())
+            continue
+        local = points @ photographs.viewmats[i, :3, :3].T + photographs.viewmats[i, :3, 3]
+        lens = None if photographs.fisheye is None else photographs.fisheye[i]
+        pixels, _ = pixels_at(local, photographs.Ks[i], lens)
+        pixels = pixels[((pixels >= 0) & (pixels < photographs.sizes[i])).all(1)].astype(int)
+        left.append(mask[pixels[:, 1], pixels[:, 0]])
+    counted = np.concatenate(left)
+    if len(counted) and (share := counted.mean()) < _LEAST_LEFT:
+        what = "points in view" if len(points) else "pixels"
+        message = f"{photographs.name}: masks hide {1 - share:.1%} of the {what}; what is black is left out"
+        warnings.warn(f"{message}: are they inverted?", DataWarning, stacklevel=4)
 
 
 def _check_clock(name: str, sequence: Sequence) -> None:

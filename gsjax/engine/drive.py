@@ -72,6 +72,10 @@ UPDATE = "/gsjax/update"
 """Event of `jax.monitoring` after each tick, with its seconds, for those who listen."""
 
 
+COMPILING = "/gsjax/compiling"
+"""Event of `jax.monitoring` as a step begins to compile: the first, and those with arrays of other shapes."""
+
+
 def announced(tick: Tick) -> Tick:
     """The tick, after its event."""
     jax.monitoring.record_event_duration_secs(UPDATE, tick.seconds)
@@ -159,6 +163,7 @@ def _compiled(method: Method) -> Callable:
     update = method.step.update
 
     def advance(params, state, batch, step, key):
+        jax.monitoring.record_event(COMPILING)  # Python runs only while JAX traces
         return update(params, state, batch, step=step, key=jax.random.fold_in(key, step))
 
     return jit_once(advance, method, compiler_options=host_options(), donate_argnums=(0, 1))

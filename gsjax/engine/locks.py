@@ -161,14 +161,17 @@ def _taken(folder: Path, path: Path, shared: bool) -> _Held | None:
                 return None
             raise
         try:
-            _acquire(file, folder, path, writer)
+            sure = _acquire(file, folder, path, writer)
+            if _is_at(file, path):
+                _list_writers(file, [*(_others(file, writer) if shared else []), writer])
+                if not sure:  # of two that began at one instant, the one that listed itself last has it
+                    time.sleep(_BETWEEN_S)
+                    _acquire(file, folder, path, writer)
+                break
         except BaseException:
             os.close(file)
             raise
-        if _is_at(file, path):
-            break
         os.close(file)  # whoever had it has removed the file meanwhile
-    _list_writers(file, [*(_others(file, writer) if shared else []), writer])
     _held[path] = _Held(file, made, writer)
     return _held[path]
 
@@ -187,8 +190,8 @@ def _opened(folder: Path, path: Path) -> int:
         ) from error
 
 
-def _acquire(file: int, folder: Path, path: Path, writer: Writer) -> None:
-    """Lock an open file.
+def _acquire(file: int, folder: Path, path: Path, writer: Writer) -> bool:
+    """Lock an open file; returns whether the file system has locks, so that it is this process's alone.
 
     Raises:
         BlockingIOError: others have locked it.
@@ -197,7 +200,7 @@ def _acquire(file: int, folder: Path, path: Path, writer: Writer) -> None:
         free = _flock(file, writer.shared)
         others = _others(file, writer)
         if free or (free is None and not any(not (writer.shared and one.shared) for one in others)):
-            return
+            return free is not None
         if others:
             break
         time.sleep(_BETWEEN_S * (attempt + 1 < _ATTEMPTS))  # it has not listed itself yet, or is ending

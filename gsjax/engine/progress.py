@@ -17,11 +17,11 @@ from rich.progress import BarColumn, TextColumn, TimeRemainingColumn
 from rich.progress import Progress as Bar
 
 from gsjax.engine.budget import Budget
-from gsjax.engine.drive import Drive, Tick
+from gsjax.engine.drive import COMPILING, Drive, Tick
 from gsjax.engine.ending import ended
 from gsjax.engine.folder import RunFolder
 from gsjax.engine.interrupts import raise_if_interrupted, shielded
-from gsjax.engine.messages import Notes
+from gsjax.engine.messages import Notes, counted
 from gsjax.engine.saving import Saver
 from gsjax.io.atomic import atomic_write
 from gsjax.io.checkpoints import CheckpointError, load_checkpoint, save_checkpoint
@@ -31,6 +31,7 @@ KEPT = 2
 """Number of checkpoints kept: if one is damaged, the one before is left."""
 _SHOWN_EVERY_S = 0.2
 _LINES = 10  # of a log
+_COMPILING = "compiling"
 
 
 @dataclass
@@ -203,6 +204,12 @@ def note_if_cut_short(progress: Progress, schedule: Schedule, steps: int, notes:
         notes.add(f"Stopped by --minutes after {steps:,} of {schedule.total:,} steps.")
 
 
+def warn_if_skipped(progress: Progress, notes: Notes) -> None:
+    """Warn of steps that changed nothing, because a number was not finite."""
+    if progress.skipped:
+        notes.warn(f"{counted(progress.skipped, 'step')} produced non-finite numbers and changed nothing")
+
+
 def save_run(folder: Path, run: Run, progress: Progress) -> None:
     """Write a checkpoint; the newest few are kept.
 
@@ -290,7 +297,7 @@ class _Display:
         )
         self._bar = Bar(*columns, console=console, transient=True, disable=not console.is_terminal)
         self._task = self._bar.add_task(
-            "compiling", total=1.0, completed=self._share(), reached=self._reached()
+            _COMPILING, total=1.0, completed=self._share(), reached=self._reached()
         )
 
     def __enter__(self) -> "_Display":
@@ -298,9 +305,11 @@ class _Display:
             words = f"{self._schedule.doing}; compiling, which takes half a minute the first time"
             self._console.print(words, soft_wrap=True)
         self._bar.start()
+        jax.monitoring.register_event_listener(self._announce)
         return self
 
     def __exit__(self, *exception: object) -> None:
+        jax.monitoring.unregister_event_listener(self._announce)
         self._bar.stop()
 
     def show(self) -> None:
@@ -314,6 +323,15 @@ class _Display:
         if not self._console.is_terminal and rows and tenth > self._line:
             self._line = tenth
             self._console.print(f"{self._reached()}: {words(rows[-1])}", soft_wrap=True)
+
+    def _announce(self, event: str, **_: Any) -> None:
+        """Say that a later step compiles, before it does."""
+        if event != COMPILING or self._ticks.tick is None:
+            return
+        self._bar.update(self._task, description=_COMPILING)
+        if not self._console.is_terminal:
+            words = f"{self._reached()}: compiling again, for arrays of other sizes"
+            self._console.print(words, soft_wrap=True)
 
     def _share(self) -> float:
         """The fraction done, of steps or of their time, whichever is larger."""

@@ -47,9 +47,8 @@ def expect_known(kind: Any, command: str, arguments: Sequence[str]) -> None:
     for argument in arguments:
         given = argument.split("=")[0].replace("_", "-")
         if (
-            re.match("--[a-zA-Z]", given)
-            and given not in known
-            and given != "--help"
+            re.match("--?[a-zA-Z]", given)
+            and given not in (*known, "-h", "--help")
             and not given.startswith("--tyro")
         ):
             meant = " or ".join(_meant(given, known))

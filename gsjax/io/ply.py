@@ -19,11 +19,12 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Integer
-from plyfile import PlyData, PlyElement, PlyParseError
+from plyfile import PlyData, PlyElement
 
 from gsjax.io.atomic import atomic_write
 from gsjax.io.compressed_ply import PACKED, decompress, find_fault, is_compressed, positions
 from gsjax.io.labels import labels_beside, read_labels, write_labels
+from gsjax.io.parsed_ply import parse_ply
 from gsjax.io.scene_file import AGAIN, SceneError, SceneReport, drawable
 from gsjax.scene.gaussians import FLAT, OPAQUE, SH_SIZES, Gaussians
 from gsjax.scene.origin import far_origin, in_words, in_world
@@ -37,7 +38,6 @@ _REQUIRED = (
 )
 _PLACE = ("x", "y", "z")
 _NORMALS = ("nx", "ny", "nz")
-_MOST_LINES, _LONGEST_LINE = 10_000, 10_000
 _REST_COUNTS = tuple(3 * (size - 1) for size in SH_SIZES)
 _ANTIALIASED = "SplatRenderMode: mip"
 _MODES = re.compile(r"\s*(?:splatrendermode\s*:\s*(\w+)|antialiased\s+([01])|train_flags\b(.*))\s*$", re.I)
@@ -253,38 +253,15 @@ def _parse(path: Path) -> PlyData:
         start = stream.read(4)
     if start[:3] != b"ply" or start[3:] not in (b"\n", b"\r"):
         raise PlyError(path, "a PLY file, which starts with 'ply'", repr(start), "Export the scene as PLY")
-    if (least := _least_size(path)) > (size := path.stat().st_size):
-        found = f"one that cannot be parsed ({size} bytes for rows that take {least} or more)"
-        raise PlyError(path, "a complete PLY file", found, AGAIN)
     try:
-        ply = PlyData.read(str(path))
-    except (PlyParseError, ValueError, UnicodeDecodeError, MemoryError, OverflowError) as error:
-        raise PlyError(
-            path,
-            "a complete PLY file",
-            f"one that cannot be parsed ({error})",
-            AGAIN,
-        ) from error
+        ply = parse_ply(path)
+    except ValueError as error:
+        found = f"one that cannot be parsed ({error})"
+        raise PlyError(path, "a complete PLY file", found, AGAIN) from error
     if "vertex" not in ply:
         names = ", ".join(element.name for element in ply.elements) or "none"
         raise PlyError(path, "an element 'vertex'", f"elements {names}", "Export a scene of Gaussians")
     return ply
-
-
-def _least_size(path: Path) -> int:
-    """Bytes without which a file cannot hold the rows of its header: one for each property. plyfile allocates
-    rows of lists before it reads them."""
-    least, count = 0, 0
-    with open(path, "rb") as stream:
-        for _ in range(_MOST_LINES):
-            words = stream.readline(_LONGEST_LINE).split()
-            if not words or words[0] == b"end_header":
-                break
-            if words[0] == b"element" and len(words) == 3 and words[2].isdigit():
-                count = int(words[2][:18])  # more digits take no fewer bytes
-            elif words[0] == b"property":
-                least += count
-    return least
 
 
 def _numbered(names: tuple[str, ...], prefix: str) -> list[str]:

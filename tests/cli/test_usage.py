@@ -44,6 +44,7 @@ def test_defaults_that_say_something_stay(monkeypatch, capsys):
     [
         ("fit", "--stpes", "did you mean --fit.steps?"),
         ("fit", "--steps", "did you mean --fit.steps?"),
+        ("fit", "-out", "did you mean --out?"),
         ("fit", "--fit.stpes=3", "did you mean --fit.steps?"),
         ("fit", "--sede", "did you mean --seed or --fit.seed?"),
         ("track", "--test_evry", "no such option"),

@@ -124,6 +124,17 @@ def test_points_that_no_camera_sees(moving):
         check_photographs(away)
 
 
+def test_inverted_masks(moving):
+    """What counts is where the points are, or, without points, more than next to nothing."""
+    scene = replace(photographs_of(moving), load_depth=None)
+    for cloud in (cloud_of(photographs_of(moving)), None):
+        row = np.arange(72)[:, None] < (2 if cloud is None else 71)
+        masks = {"right": np.broadcast_to(row, (72, 96)), "none": np.zeros((72, 96), bool)}
+        silent(check_photographs, replace(scene, cloud=cloud, load_mask=lambda i, m=masks: m["right"]))
+        with pytest.warns(DataWarning, match=r"masks hide 100.0% of the .*black is left out: are they"):
+            check_photographs(replace(scene, cloud=cloud, load_mask=lambda i, m=masks: m["none"]))
+
+
 def test_cameras_at_one_place(table):
     viewmats = table.viewmats.copy()
     viewmats[..., :3, 3] = 0

@@ -5,6 +5,7 @@ from typing import Any
 from gsjax.engine.deform.results import SCORES as DEFORM
 from gsjax.engine.distill.results import SCORES as DISTILL
 from gsjax.engine.fit.results import SCORES as FIT
+from gsjax.engine.messages import counted
 from gsjax.engine.parts.results import SCORES as PARTS
 from gsjax.engine.records import Kind
 from gsjax.engine.summary import Metrics, Score
@@ -46,4 +47,4 @@ def data_in_words(dataset: str, data: tuple[Any, ...] | None) -> str:
         return f"{size}, " + ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in data[3])
     (first, last, count), (tracked, held_out) = data[2:]
     by = f", judged by {[*held_out]}" if held_out else ""
-    return f"{size}, {count} frames {first} to {last}, cameras {[*tracked]}{by}"
+    return f"{size}, {counted(count, 'frame')} {first} to {last}, cameras {[*tracked]}{by}"

@@ -31,7 +31,15 @@ from gsjax.engine.locks import releasing_locks
 from gsjax.engine.machine import describe as describe_machine
 from gsjax.engine.messages import Notes, counted, stage
 from gsjax.engine.options import RESUME_MAY_CHANGE, OfDataset, checked
-from gsjax.engine.progress import Progress, Schedule, load_run, means_of, note_if_cut_short, watch
+from gsjax.engine.progress import (
+    Progress,
+    Schedule,
+    load_run,
+    means_of,
+    note_if_cut_short,
+    warn_if_skipped,
+    watch,
+)
 from gsjax.engine.recording import located, open_recording
 from gsjax.engine.teaching.choice import NO_TEACHER, TeacherChoice, TeacherOptions
 from gsjax.methods.deform import PRESETS, Deform, DeformConfig
@@ -133,8 +141,7 @@ def run(options: Options) -> int:
 
 def _warn_of_oddities(progress: Progress, judged: Mapping[str, Any], notes: Notes) -> None:
     """Warns of skipped steps, and of a scene that hardly learned motion or classes."""
-    if progress.skipped:
-        notes.warn(f"{progress.skipped} steps produced non-finite numbers and were skipped")
+    warn_if_skipped(progress, notes)
     tracks = judged["tracks"]
     if tracks is not None and tracks["median_mm"] > _HARDLY * tracks["still_median_mm"]:
         notes.warn("tracks are hardly better than those of a static scene; try more --deform.iterations")

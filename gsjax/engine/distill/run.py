@@ -22,7 +22,15 @@ from gsjax.engine.locks import releasing_locks
 from gsjax.engine.machine import describe as describe_machine
 from gsjax.engine.messages import Notes, counted, stage
 from gsjax.engine.options import RESUME_MAY_CHANGE, Common, Resuming, Seeded, Timed, checked
-from gsjax.engine.progress import Progress, Schedule, load_run, means_of, note_if_cut_short, watch
+from gsjax.engine.progress import (
+    Progress,
+    Schedule,
+    load_run,
+    means_of,
+    note_if_cut_short,
+    warn_if_skipped,
+    watch,
+)
 from gsjax.engine.recording import located
 from gsjax.engine.records import digest
 from gsjax.engine.teaching.cache import FeatureCache
@@ -154,7 +162,6 @@ def _out(options: Options, scene: Path) -> Path:
 
 
 def _note_oddities(scene: FieldScene, progress: Progress, notes: Notes) -> None:
-    if progress.skipped:
-        notes.warn(f"{progress.skipped} steps produced non-finite numbers and were skipped")
+    warn_if_skipped(progress, notes)
     if not len(scene.held_out):
         notes.add("No view is held out: all scores are of training views.")

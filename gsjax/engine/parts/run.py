@@ -18,7 +18,7 @@ from gsjax.engine.fit.run import Options as FitOptions
 from gsjax.engine.fit.run import run as run_fit
 from gsjax.engine.folder import RunFolder, expect_dataset, expect_run, is_run
 from gsjax.engine.locks import releasing_locks
-from gsjax.engine.messages import Notes, stage
+from gsjax.engine.messages import Notes, counted, stage
 from gsjax.engine.options import RESUME_MAY_CHANGE, OfRecording, SamWeights, Seeded, checked
 from gsjax.engine.parts.loop import Loop, resumed
 from gsjax.engine.parts.outputs import finished
@@ -111,7 +111,7 @@ def run(options: Options) -> int:
         if options.resume:
             first, progress = resumed(folder, first, progress)
             followed = int(method.result(problem, first).done.sum())
-            notes.add(f"Resumed after {followed} frames of an earlier run.")
+            notes.add(f"Resumed after {counted(followed, 'frame')} of an earlier run.")
         loop = Loop(method, problem, first, progress, seconds, folder, notes, console)
         loop.follow()
         if progress.stopped is None:

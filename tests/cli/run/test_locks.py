@@ -176,3 +176,10 @@ def test_without_locks_of_files_the_writers_that_are_listed_decide(tmp_path, mon
     with locked(tmp_path):
         assert json.loads((tmp_path / LOCK).read_text())["pid"] == os.getpid()
     assert list(tmp_path.iterdir()) == []
+
+
+def test_without_locks_of_files_one_of_two_that_begin_at_one_instant_is_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr(locks, "_flock", lambda *_, **__: None)
+    monkeypatch.setattr(locks.time, "sleep", lambda _: listed(tmp_path))  # the other has listed itself since
+    assert "found process 1, which" in refusal(tmp_path)
+    assert json.loads((tmp_path / LOCK).read_text())["pid"] == 1

@@ -1,16 +1,28 @@
 """What is noted of a run that ended early, and which resume folders are refused."""
 
 import json
+from io import StringIO
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from rich.console import Console
 
+from gsjax.engine.folder import RunFolder
 from gsjax.engine.messages import Notes
-from gsjax.engine.progress import Progress, Schedule, load_run, means_of, note_if_cut_short, save_run
+from gsjax.engine.progress import (
+    Progress,
+    Schedule,
+    load_run,
+    means_of,
+    note_if_cut_short,
+    save_run,
+    warn_if_skipped,
+    watch,
+)
 from gsjax.io.checkpoints import CheckpointError
 from gsjax.optim.method import Run
+from tests.engine.test_drive import WalkConfig, walked
 
 
 @pytest.mark.parametrize(
@@ -38,3 +50,18 @@ def test_what_a_version_before_saved_is_refused(tmp_path):
         load_run(tmp_path, run, progress)
     save_run(tmp_path, run.having(step=3), progress)
     assert load_run(tmp_path, run, progress)[0].step == 3
+
+
+def test_a_log_says_when_a_later_step_compiles(tmp_path):
+    said, schedule = StringIO(), Schedule("walking", 11, means_of(), lambda row: f"loss {row['loss']:.1f}")
+    ticks = walked(WalkConfig(steps=11, sick=2))  # it grows after 4 and 8 steps
+    progress = watch(ticks, Progress(), schedule, RunFolder(tmp_path / "run"), Console(file=said))
+    lines = [line for line in said.getvalue().splitlines() if "compiling" in line]
+    assert lines == [
+        "walking; compiling, which takes half a minute the first time",
+        "4 of 11 steps: compiling again, for arrays of other sizes",
+        "8 of 11 steps: compiling again, for arrays of other sizes",
+    ]
+    notes = Notes(Console(quiet=True))
+    warn_if_skipped(progress, notes)
+    assert notes.all == ["Warning: 1 step produced non-finite numbers and changed nothing"]

@@ -1,0 +1,49 @@
+"""PLY files of any elements, parsed by plyfile once their headers are known to be reasonable."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from plyfile import PlyData
+else:
+    PlyData = Any
+
+_LONGEST_HEADER = 2**18  # bytes
+
+
+def parse_ply(path: Path) -> PlyData:
+    """The elements of a PLY file.
+
+    Raises:
+        ValueError: it cannot be parsed; the message says why.
+        OSError: it cannot be read.
+    """
+    from plyfile import PlyData, PlyParseError
+
+    least, size = _least_size(path), path.stat().st_size
+    if least > size:
+        raise ValueError(f"{size} bytes for rows that take {least} or more")
+    try:
+        return PlyData.read(str(path))
+    except (PlyParseError, OverflowError, MemoryError) as error:
+        raise ValueError(str(error)) from error
+
+
+def _least_size(path: Path) -> int:
+    """Bytes without which a file cannot hold the rows of its header: one for each property. plyfile allocates
+    rows of lists before it reads them.
+
+    Raises:
+        ValueError: the header has no end, which plyfile would look for byte by byte.
+    """
+    with open(path, "rb") as stream:
+        header, end, _ = stream.read(_LONGEST_HEADER).partition(b"end_header")
+    if not end:
+        raise ValueError(f"no end_header in its first {_LONGEST_HEADER:,} bytes")
+    least, count = 0, 0
+    for words in map(bytes.split, header.splitlines()):
+        if words[:1] == [b"element"] and len(words) == 3 and words[2].isdigit():
+            count = int(words[2][:18])  # more digits take no fewer bytes
+        elif words[:1] == [b"property"]:
+            least += count
+    return least
