@@ -57,6 +57,9 @@ def entry() -> None:
     # JAX's traces are many objects that live on: looking through them again and again, and once more at the
     # exit, takes a second of a short run.
     gc.set_threshold(100_000, 50, 50)
+    # What is wrong with a picture or a video is said by gsjax, which knows the file.
+    os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")
+    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # FFmpeg's quiet
     keep_streams_open()
     try:
         code = main()

@@ -14,11 +14,12 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Shaped
 
-from gsjax.data.errors import DataError, DataWarning
+from gsjax.data.errors import DataError, DataWarning, shortened
 from gsjax.data.photographs import Cloud
 from gsjax.data.text import decoded, fields
 from gsjax.geometry.spherical_harmonics import SH_C0
 from gsjax.io.arrays import load_arrays
+from gsjax.io.brief import brief
 from gsjax.io.parsed_ply import parse_ply
 
 NAMES = ("sparse_pc.ply", "points3D.ply")
@@ -39,6 +40,8 @@ _OVERSHOOT = 1.5  # floats from 0 to 1 may end a little above 1
 _TEXT = (".xyz", ".txt", ".pts", ".csv", ".asc", ".xyzrgb")
 _UNITS = re.compile(r"\([^()]*\)|\[[^][]*\]")
 _COMPRESSED = "binary_compressed"
+_QUOTED = 80  # characters
+_PCD_TYPE = re.compile("<[IUF][1248]")
 
 Columns = Mapping[str, Shaped[np.ndarray, "points"]]
 
@@ -178,14 +181,18 @@ def _read_pcd(path: Path) -> Columns:
     end = content.find(b"\n", start + 1)
     header = content[: end if end >= 0 else len(content)].decode("ascii", "replace")
     words = dict(line.split(maxsplit=1) for line in header.splitlines() if len(line.split()) > 1)
-    names, types = words["FIELDS"].split(), words["TYPE"].split()
-    sizes = [int(size) for size in words["SIZE"].split()]
+    names = words["FIELDS"].split()
+    types = [
+        f"<{kind}{size}" for kind, size in zip(words["TYPE"].split(), words["SIZE"].split(), strict=True)
+    ]
+    if odd := [each for each in types if not _PCD_TYPE.fullmatch(each)]:
+        raise ValueError(f"TYPE and SIZE {brief(shortened(odd), _QUOTED)}")
     counts = [int(count) for count in words.get("COUNT", "1 " * len(names)).split()]
     if min(counts, default=1) < 1:
         raise ValueError(f"COUNT {words['COUNT']}")
     fields = [
-        (f"{name}_{i}", f"<{kind.lower()}{size}", (count,))
-        for i, (name, kind, size, count) in enumerate(zip(names, types, sizes, counts, strict=True))
+        (f"{name}_{i}", kind.lower(), (count,))
+        for i, (name, kind, count) in enumerate(zip(names, types, counts, strict=True))
     ]
     data, layout, points = words["DATA"].strip(), np.dtype(fields), int(words["POINTS"])
     if data == "binary":

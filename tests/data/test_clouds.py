@@ -250,3 +250,12 @@ def test_files_that_are_no_points(tmp_path, content):
         read_cloud(file)
     with pytest.raises(DataError, match=r"expected a point cloud, found no such file"):
         read_cloud(tmp_path)
+
+
+@pytest.mark.parametrize("kind", ["F" + "9" * 5001, "F,F", "V"])
+def test_a_pcd_of_no_type(tmp_path, kind):
+    path = tmp_path / "points.pcd"
+    path.write_text(PCD.format(name="rgb", kind=kind, data="ascii") + "1 2 3 4\n")
+    with pytest.raises(DataError, match=r"TYPE and SIZE <[FV]") as refused:
+        read_cloud(path)
+    assert len(str(refused.value)) < 500
