@@ -6,6 +6,7 @@ from gsjax.io.brief import brief
 
 COMPLETE = "Was the folder copied completely?"
 """The advice where a file is missing that others tell of."""
+_LONGEST = 200  # characters of a name
 
 
 class DataError(ValueError):
@@ -25,11 +26,12 @@ class DataWarning(UserWarning):
 
 
 def shortened(names: Iterable[str], most: int = 3) -> str:
-    """Names joined for a message, shortened to the first few if there are many.
+    """Names joined for a message, shortened to the first few if there are many; the middle of endless ones is
+    left out.
 
     Args:
         names: the names.
         most: how many are listed.
     """
     names = list(names)
-    return ", ".join(names[:most]) + (", ..." if len(names) > most else "")
+    return ", ".join(brief(name, _LONGEST) for name in names[:most]) + (", ..." if len(names) > most else "")

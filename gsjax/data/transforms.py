@@ -131,7 +131,10 @@ def read_transforms(
                 continue
             frames.append(frame.read(root, image, pose, own_split, depth_unit_m))
         points = meta.get("ply_file_path")
-        points = find_cloud(root) if points is None else _beside(root, str(points))
+        if not isinstance(points, str | None):
+            found = f"a {type(points).__name__}"
+            raise DataError(file, "ply_file_path, the name of a file", found, "Correct it, or leave it out.")
+        points = find_cloud(root) if points is None else _beside(root, points)
         if cloud is None and points is not None:
             cloud = read_cloud(points)
     _report_left_out(root, listed, missing, lost, unnamed, len(frames))

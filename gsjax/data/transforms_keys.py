@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from gsjax.data.errors import DataWarning
+from gsjax.data.errors import DataWarning, shortened
 
 SPLITS = ("train", "val", "test")
 DEPTH_UNIT_M = 0.001  # nerfstudio's default
@@ -32,6 +32,7 @@ _READ = {
     *(*DEPTHS, *UNITS, *MODEL_KEYS),
 }
 _WITHOUT_EFFECT = {"applied_transform", "applied_scale", "aabb_scale", "scale", "offset", "rotation"}
+_LISTED = 8  # keys
 _DATA = re.compile(
     r"depth|mask|normal|semantic|segment|label|flow|time|unit|scale|distort|lens|fisheye|skew|shutter|split|path|"
     r"points|cloud|intrinsic|^[kps]\d$|^f_?[xy]$|^(width|height)$",
@@ -56,7 +57,7 @@ def warn_of_unread(root: Path, file: Path, meta: Mapping[str, Any]) -> None:
             if _DATA.search(key) or (isinstance(value, str) and os.path.isfile(root / value)):
                 counts[key] = counts.get(key, 0) + (number > 0)
     if counts:
-        found = ", ".join(f"{key} (of {n} frames)" if n else key for key, n in counts.items())
+        found = shortened((f"{key} (of {n} frames)" if n else key for key, n in counts.items()), _LISTED)
         advice = "give them names that are (docs/data.md), or leave them out"
         warnings.warn(f"{file}: these keys are not read: {found}; {advice}", DataWarning, stacklevel=3)
 

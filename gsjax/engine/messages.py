@@ -12,10 +12,12 @@ from rich.console import Console
 from rich.text import Text
 
 from gsjax.data.errors import DataWarning
+from gsjax.io.brief import brief
 
 FITTING = "fitting the scene to the first frame, and compiling meanwhile: a minute or two the first time"
 COMPILING = "compiling what is left of the update"
 MEASURING = "measuring what updates cost; each setting takes a minute or two to compile the first time"
+_LONGEST = 500  # characters of a path
 _PACKAGE = Path(__file__).parents[1]
 
 
@@ -33,7 +35,7 @@ def stage(console: Console, words: str) -> Iterator[None]:
 def describe(error: BaseException) -> str:
     """The message of an exception as one paragraph; errors of files begin with the path."""
     if isinstance(error, OSError) and error.filename is not None and error.strerror:
-        return f"{error.filename}: {error.strerror[0].lower()}{error.strerror[1:]}"
+        return f"{brief(error.filename, _LONGEST)}: {error.strerror[0].lower()}{error.strerror[1:]}"
     if isinstance(error, FileNotFoundError) and error.errno is not None:  # without a name: of `os.getcwd`
         return "the working directory: expected a folder, found that it was removed; change into another (cd)"
     return " ".join(str(error).split()) or type(error).__name__
