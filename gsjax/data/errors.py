@@ -6,14 +6,14 @@ from gsjax.io.brief import brief
 
 COMPLETE = "Was the folder copied completely?"
 """The advice where a file is missing that others tell of."""
-_LONGEST = 200  # characters of a name
+_LONGEST, _EXPECTED = 200, 800  # characters of a name, and of all that may be expected
 
 
 class DataError(ValueError):
     """A file or folder that cannot be used: its path, what was expected, what was found, what to do."""
 
     def __init__(self, path: object, expected: str, found: str, advice: str):
-        super().__init__(f"{path}: expected {expected}, found {brief(found)}. {advice}")
+        super().__init__(f"{path}: expected {brief(expected, _EXPECTED)}, found {brief(found)}. {advice}")
         self.path = str(path)
 
 
