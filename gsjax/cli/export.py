@@ -71,7 +71,7 @@ def run(options: Options) -> int:
     console = Console(stderr=True, highlight=False)
     with Notes(console) as notes:
         with stage(console, f"reading {options.path}"):
-            scene, _ = open_viewable(options.path, notes)
+            scene, _ = open_viewable(options.path, notes, photographs="view" in written.options)
         rows = _chosen(options.frames, scene.num_frames)
         look: dict[str, Any] = {"antialiased": scene.antialiased, "origin": scene.origin}
         look["labels"] = None if scene.labels is None else np.asarray(scene.labels)

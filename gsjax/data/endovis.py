@@ -206,6 +206,10 @@ def _read_K(
 ) -> Float[np.ndarray, "3 3"]:
     """K of one eye, for frames of `size` that were calibrated at the size `calibrated`."""
     F, C, coeffs = (_numbers(path, values, f"Camera-{eye}-{key}", count) for key, count in _KEYS.items())
+    if min(F) <= 0:
+        raise DataError(
+            path, f"focal lengths above 0 after Camera-{eye}-F:", f"{F}", "Correct them, or give K."
+        )
     K, (width, height) = intrinsics_matrix((F[0], F[1], C[0], C[1])), calibrated
     corners = np.array([[x, y, 1.0] for x in (0, width) for y in (0, height)]) @ np.linalg.inv(K).T
     distorted, _ = cv2.projectPoints(corners, np.zeros(3), np.zeros(3), K, np.array(coeffs))

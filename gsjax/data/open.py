@@ -325,6 +325,13 @@ def _find_poses(images: Path) -> str:
 def _unknown(root: Path, marks: dict[str, str], options: ReadOptions) -> DataError:
     if (missing := colmap.find_missing_file(root)) is not None:
         return DataError(missing, "a file of the reconstruction", "no such file", COMPLETE)
+    from gsjax.io.sequences import scenes_within  # slow to import
+
+    if not any(root.iterdir()):
+        return DataError(root, "a dataset", "an empty folder", "Check the path.")
+    if scenes := scenes_within(root):
+        advice = "Give a file, or a folder of nothing but numbered ones, to gsjax view, info or export."
+        return DataError(root, "a dataset", scenes, advice)
     expected = f"poses of the photographs ({', '.join(layout.mark for layout in _PHOTOGRAPHS)})"
     for folder in (root, root / options.images):
         files = [*folder.iterdir()] if folder.is_dir() else []
@@ -337,7 +344,7 @@ def _unknown(root: Path, marks: dict[str, str], options: ReadOptions) -> DataErr
         by_layout.setdefault(layout, []).append(mark)
     expected = ", ".join(f"{layout} ({' or '.join(several)})" for layout, several in by_layout.items())
     names = sorted(entry.name for entry in root.iterdir())
-    found = shortened(names, 8) if names else "an empty folder"
+    found = shortened(names, 8)
     advice = "Give the folder that holds them."
     if not any(layout.mark in marks for layout in _PHOTOGRAPHS):
         photographs = ", ".join(layout.mark for layout in _PHOTOGRAPHS)

@@ -61,7 +61,8 @@ def load(path: str | os.PathLike) -> Tick:
 def open_scene(path: str | os.PathLike) -> Viewable:
     """The scene of a run of the command line over time; or that of a file of Gaussians, or of a folder of
     numbered ones. `scene.at(frame)` is one frame, for `gsjax.render`, relative to `scene.origin` where
-    the data lie far from 0. What is odd is warned of.
+    the data lie far from 0; `scene.num_frames` counts them, and `scene.labels` has a label of each Gaussian.
+    What is odd is warned of.
 
     Args:
         path: the folder of a run, the file, or the folder of files.

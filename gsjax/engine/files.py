@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from gsjax.data import ReadOptions
-from gsjax.data.errors import DataError
+from gsjax.data.errors import DataError, DataWarning, shortened
 from gsjax.data.origin import relative_to_origin
 from gsjax.engine.recording import Opener, Recording, open_recording
 from gsjax.io.arrays import ArraysError, load_arrays
@@ -21,6 +21,7 @@ from gsjax.io.parsed import parse_yaml
 from gsjax.io.ply import write_ply
 from gsjax.io.scene_file import SceneReport
 from gsjax.io.scenes import read_gaussians
+from gsjax.io.sequences import missing_numbers
 from gsjax.scene.gaussians import Gaussians
 
 _SETTINGS = ("dataset", "cameras", "frames")
@@ -80,7 +81,8 @@ def check_arrays(
             wanted, found = (",".join(map(str, each)) for each in (known, array.shape))
             raise ValueError(f"{file}: {name}: expected the shape [{wanted}], found [{found}]; {again}")
         sizes |= {n: found for n, found in zip(shape, array.shape, strict=True) if isinstance(n, str)}
-        wrong = int((~np.isfinite(array)).sum())
+        with np.errstate(over="ignore"):  # as they will be used
+            wrong = int((~np.isfinite(array.astype(np.float32))).sum())
         if wrong:
             found = f"{wrong} of {array.size} that are not"
             raise ValueError(f"{file}: {name}: expected finite numbers, found {found}; {again}")
@@ -132,6 +134,9 @@ def read_frames(files: Sequence[Path]) -> Iterator[tuple[Gaussians, SceneReport]
         FileNotFoundError, SceneError: as for `read_gaussians`.
         ValueError: a file holds none, or other numbers of Gaussians or harmonics than the first.
     """
+    if missing := missing_numbers(files):
+        some = shortened(map(str, missing), 5)
+        warnings.warn(f"{files[0].parent}: no frame {some} among {len(files)}", DataWarning, stacklevel=2)
     first = None
     for file in files:
         with warnings.catch_warnings():

@@ -18,6 +18,7 @@ from gsjax.io.brief import brief
 from gsjax.io.labels import ENDING
 from gsjax.io.parsed import parse_json, parse_yaml
 from gsjax.io.scenes import is_scene
+from gsjax.io.sequences import scenes_within
 
 _WRITTEN = (
     *("config.yml", "metrics.json", "metrics.jsonl", "report.html", "trajectory.npz", "scene.ply"),
@@ -84,10 +85,11 @@ def expect_run(path: Path, made_by: str = "") -> None:
     """Raises FileNotFoundError if this is not the folder of a run (of the command `made_by`)."""
     expect_folder(path, made_by)
     if not is_run(path):
-        found = "other files" if holds_something(path) else "an empty folder"
+        found, advice = "other files" if holds_something(path) else "an empty folder", "give a run's --out"
+        if scenes := scenes_within(path):
+            found, advice = scenes, "give a file, or a folder of nothing but numbered ones"
         raise FileNotFoundError(
-            f"{_wanted(path, made_by)}, whose config.yml begins with {SIGNATURE!r}, found {found}; give a "
-            "run's --out"
+            f"{_wanted(path, made_by)}, whose config.yml begins with {SIGNATURE!r}, found {found}; {advice}"
         )
 
 

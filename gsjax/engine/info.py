@@ -97,6 +97,11 @@ def _scene_at(path: Path) -> Callable[[], dict[str, str]] | None:
     Raises:
         FileNotFoundError: there is nothing.
     """
+    if path.is_file() and not is_scene(path) and is_run(path.parent):
+        raise ValueError(
+            f"{path}: expected a dataset, a run or a file of Gaussians, found a file of a run; give its "
+            f"folder, {path.parent}"
+        )
     if is_run(path):
         return partial(describe_run, path)
     if files := frame_files(path):

@@ -9,6 +9,7 @@ from typing import Annotated, Any, get_args, get_type_hints
 import tyro
 from tyro.constructors import ConstructorRegistry, StructConstructorSpec, StructFieldSpec, StructTypeInfo
 
+_ADDRESSES = ("http://", "https://", "ftp://", "s3://", "gs://")
 _UNSAID = (None, False, ())  # defaults that the help text explains, or that mean "not given"
 
 
@@ -41,10 +42,14 @@ def expect_known(kind: Any, command: str, arguments: Sequence[str]) -> None:
         arguments: the arguments after the name.
 
     Raises:
-        ValueError: one does not exist; the message names those that may be meant.
+        ValueError: one does not exist; the message names those that may be meant. Or an argument is an
+            address.
     """
-    known = [name for member in get_args(kind) or (kind,) for name in _names(member)]
     for argument in arguments:
+        if argument.startswith(_ADDRESSES):
+            raise ValueError(f"{argument}: expected a path, found an address; download it first")
+    known = [name for member in get_args(kind) or (kind,) for name in _names(member)]
+    for number, argument in enumerate(arguments):
         given = argument.split("=")[0].replace("_", "-")
         if (
             re.match("--?[a-zA-Z]", given)
@@ -53,6 +58,8 @@ def expect_known(kind: Any, command: str, arguments: Sequence[str]) -> None:
         ):
             meant = " or ".join(_meant(given, known))
             hint = f"; did you mean {meant}?" if meant else ";"
+            if len(given) == 2 and number and arguments[number - 1].startswith("--"):
+                hint = f"; if it is a value, write {arguments[number - 1]}={given};"
             raise ValueError(f"{given}: no such option{hint} gsjax {command} --help lists all")
 
 

@@ -42,7 +42,9 @@ _SAME_COLOR = 0.1  # of a coefficient: two steps of the coarsest format
 _AGAIN = "reconstruct it again with this version of gsjax"
 
 
-def open_viewable(path: Path, notes: Notes, now: Whereabouts = AS_IT_WAS) -> tuple[Viewable, Path]:
+def open_viewable(
+    path: Path, notes: Notes, now: Whereabouts = AS_IT_WAS, *, photographs: bool = True
+) -> tuple[Viewable, Path]:
     """The scene at a path, and the folder for screenshots.
 
     Args:
@@ -50,6 +52,7 @@ def open_viewable(path: Path, notes: Notes, now: Whereabouts = AS_IT_WAS) -> tup
             numbered ones, the frames of a scene that moves.
         notes: collects warnings.
         now: the present paths of what a field or a fit refers to.
+        photographs: whether those of a fit or of a deforming run are opened, if they are still there.
 
     Raises:
         FileNotFoundError: there is no such file, or the folder is no run with a scene.
@@ -81,7 +84,7 @@ def open_viewable(path: Path, notes: Notes, now: Whereabouts = AS_IT_WAS) -> tup
     expect_run(path)
     if (path / DEFORMATION).is_file():
         _expect_only(("weights",), now, f"{path} is a run that deforms")
-        return _of_deformation(path, notes, now.weights), path
+        return _of_deformation(path, notes, now.weights, photographs), path
     if not (path / "scene.ply").is_file():
         raise FileNotFoundError(
             f"{path}: expected a run with scene.ply, found none; finish the run with --resume, unless its "
@@ -95,7 +98,7 @@ def open_viewable(path: Path, notes: Notes, now: Whereabouts = AS_IT_WAS) -> tup
                     f"a moving scene cannot be queried; gsjax view {field} shows the scene of its field"
                 )
             return of_run(path, notes), path
-    return _of_fit(path, notes, now), path
+    return _of_fit(path, notes, now, photographs), path
 
 
 def _of_files(path: Path, files: list[Path], notes: Notes) -> Viewable:
@@ -158,7 +161,7 @@ def _field_of_fit(path: Path, notes: Notes, now: Whereabouts) -> FieldRun | None
     return run
 
 
-def _of_fit(path: Path, notes: Notes, now: Whereabouts) -> Viewable:
+def _of_fit(path: Path, notes: Notes, now: Whereabouts, shown: bool) -> Viewable:
     """The scene of a run of `gsjax fit`, with its field, and its photographs if they are still there."""
     field, config = _field_of_fit(path, notes, now), path / "config.yml"
     if field is None:
@@ -172,8 +175,9 @@ def _of_fit(path: Path, notes: Notes, now: Whereabouts) -> Viewable:
         behind = settings["fit"]["background"]
         shots, photographs = None, None
         try:
-            photographs = relative_to_origin(photographs_of_run(settings, now.images), origin)
-            shots = _shots_of(photographs)
+            if shown:
+                photographs = relative_to_origin(photographs_of_run(settings, now.images), origin)
+                shots = _shots_of(photographs)
         except (ValueError, OSError) as error:
             notes.warn(f"its photographs are not shown: {describe(error)}")
     except (ValueError, KeyError, TypeError, AttributeError) as error:
@@ -193,7 +197,7 @@ def _of_fit(path: Path, notes: Notes, now: Whereabouts) -> Viewable:
     )
 
 
-def _of_deformation(path: Path, notes: Notes, weights: Path | None) -> Viewable:
+def _of_deformation(path: Path, notes: Notes, weights: Path | None, shown: bool) -> Viewable:
     """The scene of a run of `gsjax deform` over time, with its photographs where its recording still is; it
     can be queried if its features have a meaning."""
     result = read_deformation(path / DEFORMATION)
@@ -213,7 +217,7 @@ def _of_deformation(path: Path, notes: Notes, weights: Path | None) -> Viewable:
         dict(enumerate(result.names, 1)),
         motion=Motion(len(times), first.num, lambda frame: result.at(times[frame])),
         times=times * result.timeline.seconds,
-        shots=_shots_of_deformation(path, result, notes),
+        shots=_shots_of_deformation(path, result, notes) if shown else None,
         unit="m" if result.timeline.metric else "",
         origin=origin,
         asking=asking,

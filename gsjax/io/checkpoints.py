@@ -28,6 +28,7 @@ from gsjax.io.parsed import parse_json
 _FORMAT = 2  # 1 needed a template
 _HEADER = "__header__"
 _LIBRARIES = ("gsjax", "optax", "equinox", "jaxlie")
+_QUOTED, _LISTED = 40, 200  # characters of a version, and of names
 _ANEW = "start again, or continue with the version that wrote it"
 
 
@@ -72,7 +73,7 @@ def load_checkpoint(path: str | os.PathLike) -> tuple[Any, dict[str, Any]]:
     except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
         raise CheckpointError(
             f"{path}: expected a checkpoint of gsjax {import_module('gsjax').__version__}, found one of "
-            f"gsjax {header.get('version')} that differs ({brief(error)}); {_ANEW}"
+            f"gsjax {brief(header.get('version'), _QUOTED)} that differs ({brief(error)}); {_ANEW}"
         ) from error
 
 
@@ -201,6 +202,8 @@ def _read(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         raise FileNotFoundError(f"{path}: expected a checkpoint, found no file. Check the path")
     try:
         stored = load_arrays(path)
+        if _HEADER not in stored:
+            raise ValueError(f"it holds {brief(', '.join(stored), _LISTED)}, which gsjax.save did not write")
         header = parse_json(str(stored.pop(_HEADER)))
         written, intact = header["format"], header["sha256"] == _checksum(stored)
         if not isinstance(header["metadata"], dict):
@@ -208,7 +211,7 @@ def _read(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     except (ValueError, KeyError, TypeError) as error:
         raise CheckpointError(
             f"{path}: expected a checkpoint, found a file that cannot be read as one ({brief(error)}). "
-            "It may be truncated or damaged; use another one"
+            "It may be of another kind, truncated or damaged; use another one"
         ) from error
     if written != _FORMAT:
         raise CheckpointError(

@@ -8,6 +8,11 @@ if TYPE_CHECKING:
 else:
     PlyData = Any
 
+_SIZES = {  # bytes; a list may be empty, and has a count of one byte or more
+    **dict.fromkeys((b"short", b"ushort", b"int16", b"uint16"), 2),
+    **dict.fromkeys((b"int", b"uint", b"float", b"int32", b"uint32", b"float32"), 4),
+    **dict.fromkeys((b"double", b"float64"), 8),
+}
 _LONGEST_HEADER = 2**18  # bytes
 
 
@@ -22,7 +27,7 @@ def parse_ply(path: Path) -> PlyData:
 
     least, size = _least_size(path), path.stat().st_size
     if least > size:
-        raise ValueError(f"{size} bytes for rows that take {least} or more")
+        raise ValueError(f"{size:,} bytes, where its header promises {least:,} or more")
     try:
         return PlyData.read(str(path))
     except (PlyParseError, OverflowError, MemoryError) as error:
@@ -30,8 +35,8 @@ def parse_ply(path: Path) -> PlyData:
 
 
 def _least_size(path: Path) -> int:
-    """Bytes without which a file cannot hold the rows of its header: one for each property. plyfile allocates
-    rows of lists before it reads them.
+    """Bytes without which a file cannot hold its header and the rows that are promised there. plyfile
+    allocates rows of lists before it reads them.
 
     Raises:
         ValueError: the header has no end, which plyfile would look for byte by byte.
@@ -40,10 +45,12 @@ def _least_size(path: Path) -> int:
         header, end, _ = stream.read(_LONGEST_HEADER).partition(b"end_header")
     if not end:
         raise ValueError(f"no end_header in its first {_LONGEST_HEADER:,} bytes")
-    least, count = 0, 0
+    least, count, text = len(header) + len(end), 0, False
     for words in map(bytes.split, header.splitlines()):
-        if words[:1] == [b"element"] and len(words) == 3 and words[2].isdigit():
+        if words[:2] == [b"format", b"ascii"]:
+            text = True
+        elif words[:1] == [b"element"] and len(words) == 3 and words[2].isdigit():
             count = int(words[2][:18])  # more digits take no fewer bytes
         elif words[:1] == [b"property"]:
-            least += count
+            least += count * (2 if text else _SIZES.get(words[1] if len(words) > 1 else b"", 1))
     return least

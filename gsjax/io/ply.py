@@ -41,6 +41,7 @@ _NORMALS = ("nx", "ny", "nz")
 _REST_COUNTS = tuple(3 * (size - 1) for size in SH_SIZES)
 _ANTIALIASED = "SplatRenderMode: mip"
 _MODES = re.compile(r"\s*(?:splatrendermode\s*:\s*(\w+)|antialiased\s+([01])|train_flags\b(.*))\s*$", re.I)
+_ENOUGH = 10  # Gaussians, for a verdict on all of them
 _LOST = 0.01  # of a Gaussian's size: steps of float32 that are larger lose its place
 
 
@@ -68,8 +69,13 @@ def write_ply(
         antialiased: say in a comment that the scene is to be drawn antialiased.
 
     Raises:
-        ValueError: `labels` is not one integer per Gaussian.
+        ValueError: `labels` is not one integer per Gaussian, or the file's name has another ending than .ply.
     """
+    if Path(path).suffix.lower() not in (".ply", ""):
+        raise ValueError(
+            f"{path}: expected a name that ends in .ply, found {Path(path).suffix}; gsjax.write_gaussians "
+            "writes each format by its ending"
+        )
     if labels is not None:
         labels = np.asarray(labels)
         if labels.shape != (gaussians.num,) or not np.issubdtype(labels.dtype, np.integer):
@@ -244,6 +250,13 @@ def _uncompressed(
         shN=None if shN is None else jnp.asarray(shN.transpose(0, 2, 1)),
         features=jnp.asarray(_stack(vertices, features)) if features else None,
     )
+    if len(logits) >= _ENOUGH and ((logits >= 0) & (logits <= 1)).all() and (log_scales > 0).all():
+        warnings.warn(
+            "opacities lie between 0 and 1, and no scale is negative: they are read as logits and as "
+            "logarithms, as 3DGS writes them; export them so if they are not",
+            UserWarning,
+            stacklevel=3,
+        )
     return gaussians, np.isneginf(logits)
 
 
@@ -282,6 +295,8 @@ def _advice(names: tuple[str, ...]) -> str:
     """Advice for a PLY that lacks properties, depending on what it seems to be."""
     if {"scale_0", "scale_1"} <= set(names) and "scale_2" not in names:
         return "This seems to be a scene of 2D Gaussian splatting, which has no third axis"
+    if {"opacity", "scale_0"} <= set(names):
+        return "It lacks a part of each Gaussian: export them whole, in the 3D Gaussian splatting PLY format"
     if {"x", "y", "z"} <= set(names):
         return (
             "This seems to be a point cloud or a mesh; gsjax fit begins with the cloud of a dataset, and "

@@ -1,5 +1,6 @@
 """Validation of configurations."""
 
+import numbers
 from typing import Any
 
 import numpy as np
@@ -21,6 +22,8 @@ def expect(config: Any, where: str = "", **ranges: tuple[float, float]) -> None:
     """
     for name, (low, high) in ranges.items():
         value = getattr(config, name)
+        if isinstance(value, bool) or not isinstance(value, numbers.Real):
+            raise ValueError(f"{where}{name}: expected a number, found {value!r}")
         if not low <= value <= high:
             least = "more than 0" if low == ABOVE_ZERO[0] else f"at least {low:g}"
             most = "" if high == np.inf else f" and at most {high:g}"

@@ -60,6 +60,22 @@ def test_a_mistyped_option_is_guessed(command, given, meant):
     assert meant in str(refused.value)
 
 
+@pytest.mark.parametrize(
+    ("command", "arguments", "says"),
+    [
+        (
+            "info",
+            ["https://example.com/a.ply"],
+            "example.com/a.ply: expected a path, found an address; download",
+        ),
+        ("export", ["a", "b.html", "--up", "-y"], "-y: no such option; if it is a value, write --up=-y;"),
+    ],
+)
+def test_what_is_no_option(command, arguments, says):
+    with pytest.raises(ValueError, match=says):
+        parse_options(command, arguments, COMMANDS[command])
+
+
 @pytest.mark.parametrize("command", ["fit", "deform", "query", "poses", "distill"])
 def test_every_option_of_a_command_is_known(command, monkeypatch, capsys):
     said = help_of(command, 120, monkeypatch, capsys)

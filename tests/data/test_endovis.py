@@ -202,6 +202,7 @@ def test_a_lens_that_distorts(folder):
 @pytest.mark.parametrize(
     ("old", "new", "says"),
     [
+        ("Camera-0-F: 100.0 102.0", "Camera-0-F: 0 102.0", r"focal lengths above 0 after Camera-0-F:"),
         ("Camera-0-F: 100.0 102.0", "Camera-0-F: 100.0", r"2 numbers after Camera-0-F:, found '100.0'"),
         ("Camera-1-C: 49.5", "Camera-1-C: left", r"2 numbers after Camera-1-C:, found 'left 36.5'"),
         ("Extrinsic-T: -4.5", "Extrinsic-T: nan", r"3 numbers after Extrinsic-T:, found 'nan 0.1 0.05'"),

@@ -36,10 +36,10 @@ def test_invalid_built_in_scenes_are_refused(path, says):
 
 
 def test_folders_that_fit_no_layout(tmp_path):
-    with pytest.raises(DataError, match=r"Panoptic \(train_meta.json\), push-T \(.*an empty folder"):
+    with pytest.raises(DataError, match="expected a dataset, found an empty folder"):
         open_sequence(tmp_path)
     (tmp_path / "notes.txt").write_text("")
-    with pytest.raises(DataError, match=r"found notes.txt"):
+    with pytest.raises(DataError, match=r"Panoptic \(train_meta.json\), push-T \(.*found notes.txt"):
         open_sequence(tmp_path)
     with pytest.raises(DataError, match="found a file"):
         open_sequence(tmp_path / "notes.txt")
@@ -166,7 +166,23 @@ def test_one_file_of_photographs(tmp_path):
     assert open_photographs(tmp_path / "mine.json").num == 1
 
 
+def test_folders_of_scenes(tmp_path):
+    for name in ("f_1.ply", "f_2.ply", "f_3.spz", "f_1_labels.npz", "pic.jpg", "pic.xyz"):
+        (tmp_path / name).touch()
+    said = (
+        r"found 3 files of Gaussians \(f_1.ply, f_2.ply, f_3.spz\) beside pic.jpg, pic.xyz. Give a file, or"
+    )
+    for read in (open_photographs, open_sequence):
+        with pytest.raises(DataError, match=said):
+            read(tmp_path)
+    for number in range(3):
+        (tmp_path / f"{number}.jpg").touch()
+    with pytest.raises(DataError, match="found 4 photographs without poses"):
+        open_photographs(tmp_path)
+
+
 def test_folders_without_photographs(tmp_path):
+    (tmp_path / "notes.md").touch()
     known = r"expected the files of a known layout: nerfstudio \(transforms.json\), COLMAP \(.*LLFF"
     with pytest.raises(DataError, match=known):
         open_photographs(tmp_path)

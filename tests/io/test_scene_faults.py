@@ -103,7 +103,7 @@ def test_files_that_are_cut_off(tmp_path, ending, share):
         ("a.ply", b"ply\nformat binary_little_endian 1.0\nelement vertex 1099511627776\n"
          b"property float x\nend_header\n", "one that cannot be parsed"),
         ("a.ply", b"ply\nformat ascii 1.0\nelement vertex 16777216\nproperty list uchar int l\n"
-         b"end_header\n1 2\n", "86 bytes for rows that take 16777216 or more"),
+         b"end_header\n1 2\n", "86 bytes, where its header promises 33,554,513 or more"),
         ("a.ksplat", b"\0\1\0\0" + struct.pack("<I", 1 << 31) + bytes(4096), "2147483648 sections"),
         ("a.ksplat", b"\0\1\0\0" + struct.pack("<IIII", 1, 1, 1, 1) + bytes(4076)
          + struct.pack("<II", 1, 1 << 31) + bytes(1016), "section 0 with all its data"),

@@ -1,11 +1,13 @@
 """Folders of numbered files of Gaussians."""
 
+from pathlib import Path
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from gsjax.io.scenes import read_gaussians, write_gaussians
-from gsjax.io.sequences import frame_files
+from gsjax.io.sequences import frame_files, missing_numbers
 from tests.io.scenes_to_write import make_scene
 
 
@@ -30,6 +32,14 @@ def test_frames_of_a_folder(tmp_path, names, found):
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).touch()
     assert [file.name for file in frame_files(tmp_path)] == list(found)
+
+
+@pytest.mark.parametrize(
+    ("numbers", "missing"),
+    [((0, 1, 3), [2]), ((0, 10, 30, 40), [20]), ((7, 8, 9), []), ((1, 2, 90), []), ((0, 7, 17), [])],
+)
+def test_numbers_that_are_missing(numbers, missing):
+    assert missing_numbers([Path(f"f_{number:03}.ply") for number in numbers]) == missing
 
 
 def test_no_folder(tmp_path):
