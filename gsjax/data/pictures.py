@@ -5,7 +5,7 @@ import warnings
 from collections.abc import Iterable
 from pathlib import Path
 
-from gsjax.data.errors import DataError, DataWarning
+from gsjax.data.errors import DataError, DataWarning, shortened
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".jpe", ".jfif", ".mpo", ".tif", ".tiff", ".bmp", ".webp", ".avif")
 """File extensions of the pictures that all readers and commands take, in lower case."""
@@ -39,6 +39,7 @@ _HEADS = {
 }
 _WEB = re.compile(rb"RIFF....WEBP|....ftypavi[fs]", re.DOTALL)
 _JPEG, _PNG = b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n"
+_ENDS, _TAIL = (b"\xff\xd9", b"IEND"), 2**17  # bytes, more than a thumbnail has
 _MARKER = re.compile(rb"\xff[^\x00\xff]")
 _AFTER_SCAN = re.compile(rb"\xff[^\x00\xd0-\xd7\xff]")  # neither a stuffed 0xff nor a restart mark
 _START_OF_SCAN, _END_OF_IMAGE = 0xDA, 0xD9
@@ -105,6 +106,33 @@ def refuse_unread(where: Path, expected: str, paths: Iterable[Path], *, others: 
         raise DataError(where, expected, counted, advice)
     message = f"{where}: of {others + len(found)} pictures, {counted} are left out. {advice}"
     warnings.warn(message, DataWarning, stacklevel=3)
+
+
+def warn_of_cut_off(where: object, paths: Iterable[Path]) -> None:
+    """Warn with DataWarning of JPEG and PNG files that end before the picture does, without decoding them.
+
+    Args:
+        where: the folder, for messages.
+        paths: the files; those that are none are passed over.
+    """
+    files = [path for path in paths if path.is_file()]
+    if damaged := [str(path) for path in files if _ends_early(path)]:
+        message = f"{where}: {len(damaged)} of {len(files)} pictures are cut off ({shortened(damaged)})"
+        warnings.warn(f"{message}; fetch them again", DataWarning, stacklevel=3)
+
+
+def _ends_early(path: Path) -> bool:
+    """Whether a picture is cut off; a large file is read whole only if its last bytes have no end mark."""
+    with path.open("rb") as file:
+        head, size = file.read(_TAIL), path.stat().st_size
+        if size <= _TAIL:
+            return is_cut_off(head)
+        file.seek(size - _TAIL)
+        tail = file.read()
+        if not head.startswith((_JPEG, _PNG)) or any(mark in tail for mark in _ENDS):
+            return False
+        file.seek(0)
+        return is_cut_off(file.read())
 
 
 def is_cut_off(content: bytes) -> bool:

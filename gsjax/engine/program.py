@@ -62,13 +62,14 @@ def parse_options(command: str, arguments: list[str], entry: tuple[str, str]) ->
     """
     import tyro
 
-    from gsjax.engine.usage import expect_known, plain_help
+    from gsjax.engine.usage import expect_known, plain_help, without_commas
 
     module, does = entry
     chosen = import_module(module)
     options_for = getattr(chosen, "options_for", lambda given: (chosen.Options, given))
     kind, arguments = options_for(arguments)
     expect_known(kind, command, arguments)
+    arguments = without_commas(kind, arguments)
     indent = "  "  # without it tyro joins the lines into one
     about = f"{does[0].upper()}{does[1:]}." + getattr(chosen, "HELP", "")
     options = tyro.cli(

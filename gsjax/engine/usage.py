@@ -4,12 +4,14 @@ import re
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import fields, is_dataclass, replace
 from difflib import get_close_matches
-from typing import Annotated, Any, get_args, get_type_hints
+from types import UnionType
+from typing import Annotated, Any, Union, get_args, get_origin, get_type_hints
 
 import tyro
 from tyro.constructors import ConstructorRegistry, StructConstructorSpec, StructFieldSpec, StructTypeInfo
 
 _ADDRESSES = ("http://", "https://", "ftp://", "s3://", "gs://")
+_NUMBERS = re.compile(r"[-+.\deE]+(,[-+.\deE]+)+")
 _UNSAID = (None, False, ())  # defaults that the help text explains, or that mean "not given"
 
 
@@ -48,7 +50,7 @@ def expect_known(kind: Any, command: str, arguments: Sequence[str]) -> None:
     for argument in arguments:
         if argument.startswith(_ADDRESSES):
             raise ValueError(f"{argument}: expected a path, found an address; download it first")
-    known = [name for member in get_args(kind) or (kind,) for name in _names(member)]
+    known = [*_options(kind)]
     for number, argument in enumerate(arguments):
         given = argument.split("=")[0].replace("_", "-")
         if (
@@ -83,19 +85,49 @@ def _one_paragraph(text: str | Callable[[], str | None] | None) -> Callable[[], 
     return joined
 
 
-def _names(kind: type, prefix: str = "--") -> Iterator[str]:
-    """The options of a dataclass, those of its groups included."""
+def without_commas(kind: Any, arguments: Sequence[str]) -> list[str]:
+    """A command line in which each number of a list is a word of its own, as in `--read.K 525,525,320,240`.
+
+    Args:
+        kind, arguments: as for `expect_known`.
+    """
+    types, option, found = _options(kind), "", []
+    for argument in arguments:
+        option = argument.replace("_", "-") if argument.startswith("--") else option
+        is_list = get_origin(types.get(option)) is tuple and _NUMBERS.fullmatch(argument)
+        found += argument.split(",") if is_list else [argument]
+    return found
+
+
+def _options(kind: Any) -> dict[str, Any]:
+    """The types of the options of a command by their names."""
+    members = get_args(kind) or (kind,)
+    return {name: of for member in members for name, of in _named(member)}
+
+
+def _named(kind: type, prefix: str = "--") -> Iterator[tuple[str, Any]]:
+    """The options of a dataclass, those of its groups included, with their types."""
     hints = get_type_hints(kind, include_extras=True)
     for field in fields(kind):
         group, *marks = get_args(hints[field.name]) or (hints[field.name],)
         flat = tyro.conf.OmitArgPrefixes in marks or any(getattr(mark, "name", None) == "" for mark in marks)
         name = prefix + field.name.replace("_", "-")
         if is_dataclass(group):
-            yield from _names(group, prefix if flat else f"{name}.")
+            yield from _named(group, prefix if flat else f"{name}.")
         else:
-            yield name
+            yield name, _listed(hints[field.name])
             if group is bool:  # where it is on by default, its option turns it off
-                yield name.replace(prefix, f"{prefix}no-", 1)
+                yield name.replace(prefix, f"{prefix}no-", 1), bool
+
+
+def _listed(hint: Any) -> Any:
+    """The tuple of a type that is one, perhaps annotated or optional; else the type."""
+    inner = (
+        [_listed(each) for each in get_args(hint)]
+        if get_origin(hint) in (Annotated, Union, UnionType)
+        else []
+    )
+    return next((each for each in inner if get_origin(each) is tuple), hint)
 
 
 def _meant(given: str, known: Sequence[str]) -> list[str]:

@@ -8,7 +8,7 @@ import pytest
 
 from gsjax.cli import COMMANDS
 from gsjax.engine.program import parse_options
-from gsjax.engine.usage import expect_known
+from gsjax.engine.usage import expect_known, without_commas
 
 
 def help_of(command, width, monkeypatch, capsys):
@@ -58,6 +58,15 @@ def test_a_mistyped_option_is_guessed(command, given, meant):
         parse_options(command, ["x", given, "10"], COMMANDS[command])
     assert f"{given.split('=')[0].replace('_', '-')}: no such option" in str(refused.value)
     assert meant in str(refused.value)
+
+
+def test_numbers_of_a_list_may_be_separated_by_commas():
+    given = ["x", "--out", "1,2", "--read.K=1,2,3,4", "--read.K", "525,525.5,-3e2,240", "--cameras", "0,2"]
+    expected = ["x", "--out", "1,2", "--read.K=1,2,3,4", "--read.K", "525", "525.5", "-3e2", "240"]
+    kind = import_module(COMMANDS["track"][0]).Options
+    assert without_commas(kind, given) == [*expected, "--cameras", "0", "2"]
+    options = parse_options("track", ["x", "--out", "y", "--read.K", "5,6,7,8"], COMMANDS["track"])
+    assert options.read.K == (5, 6, 7, 8)
 
 
 @pytest.mark.parametrize(

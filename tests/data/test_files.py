@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from gsjax.data import DataError
+from gsjax.data import DataError, DataWarning
 from gsjax.data.files import (
     as_numbers,
     background_behind,
@@ -21,6 +21,7 @@ from gsjax.data.files import (
     read_rgba,
     read_text,
 )
+from gsjax.data.pictures import warn_of_cut_off
 
 WIDTH, HEIGHT = 12, 8
 RAMP = np.arange(WIDTH * HEIGHT * 3, dtype=np.uint16).reshape(HEIGHT, WIDTH, 3)
@@ -113,6 +114,12 @@ def with_thumbnail(content: bytes) -> bytes:
     thumbnail = jpeg(quality=20)
     segment = b"Exif\0\0" + thumbnail
     return content[:2] + b"\xff\xe1" + (len(segment) + 2).to_bytes(2, "big") + segment + content[2:]
+
+
+def large() -> bytes:
+    """A picture of more bytes than are looked at first."""
+    noise = np.random.default_rng(0).integers(0, 256, (400, 400, 3), np.uint8)
+    return cv2.imencode(".jpg", noise)[1].tobytes()
 
 
 WHOLE = {
@@ -276,3 +283,18 @@ def test_pictures_are_decoded_without_touching_filters_of_warnings(tmp_path, mon
     monkeypatch.setattr(warnings, "catch_warnings", lambda: changes.append(1) or catch())
     assert read_image(path, 5, 4).shape == (4, 5, 3)
     assert not changes
+
+
+def test_pictures_that_are_cut_off_are_named_without_decoding_them(tmp_path):
+    contents = {name.replace(" ", ""): content for name, content in WHOLE.items()} | {"large": large()}
+    assert len(contents["large"]) > 2**17
+    files = []
+    for name, content in contents.items():
+        for cut in (False, True):
+            files.append(tmp_path / f"{name}{cut:d}.jpg")
+            files[-1].write_bytes(content[: int(0.9 * len(content))] if cut else content + b"film")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        warn_of_cut_off(tmp_path, [*files[::2], tmp_path / "none"])
+    with pytest.warns(DataWarning, match=rf"{len(contents)} of {len(files)} pictures are cut off \(.*1.jpg"):
+        warn_of_cut_off(tmp_path, files)
