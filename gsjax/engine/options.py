@@ -62,7 +62,7 @@ class Seeded:
     """Options of commands that draw random numbers."""
 
     seed: int | None = None
-    """Random seed; default: 0."""
+    """Random seed, which replaces those of the settings, such as --fit.seed; default: 0."""
 
 
 @dataclass(frozen=True, kw_only=True)
