@@ -11,7 +11,6 @@ from jaxtyping import Int
 from rich.console import Console
 from rich.progress import track
 
-from gsjax.data.errors import shortened
 from gsjax.data.origin import relative_to_origin
 from gsjax.data.photographs import Photographs
 from gsjax.engine.fit.judge import Compared, Judge, write_panel
@@ -26,6 +25,7 @@ from gsjax.engine.scores import mean_scores
 from gsjax.engine.summary import Card, Column, Media, Summary, Table, in_title
 from gsjax.engine.terminal import print_summary
 from gsjax.io.atomic import write_json
+from gsjax.io.brief import shortened
 from gsjax.io.ply import read_ply
 from gsjax.methods.fit import FitConfig
 from gsjax.methods.fit.padding import sizes_of

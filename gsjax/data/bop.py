@@ -23,7 +23,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.optimize import linear_sum_assignment
 
-from gsjax.data.errors import COMPLETE, DataError, DataWarning, shortened
+from gsjax.data.errors import COMPLETE, DataError, DataWarning
 from gsjax.data.files import image_size, read_depth, read_image, read_json
 from gsjax.data.frame_folders import DEFAULT_RATE_HZ, numbered
 from gsjax.data.masks import read_shades
@@ -31,6 +31,7 @@ from gsjax.data.objects import Truth
 from gsjax.data.origin import near_origin
 from gsjax.data.sequence import Sequence
 from gsjax.data.validation import check_intrinsics, check_poses
+from gsjax.io.brief import shortened
 
 CAMERAS, POSES = "scene_camera.json", "scene_gt.json"
 _MM = 0.001

@@ -14,12 +14,12 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Shaped
 
-from gsjax.data.errors import DataError, DataWarning, shortened
+from gsjax.data.errors import DataError, DataWarning
 from gsjax.data.photographs import Cloud
 from gsjax.data.text import decoded, fields
 from gsjax.geometry.spherical_harmonics import SH_C0
 from gsjax.io.arrays import load_arrays
-from gsjax.io.brief import brief
+from gsjax.io.brief import brief, shortened
 from gsjax.io.parsed_ply import parse_ply
 
 NAMES = ("sparse_pc.ply", "points3D.ply")
@@ -183,7 +183,8 @@ def _read_pcd(path: Path) -> Columns:
     words = dict(line.split(maxsplit=1) for line in header.splitlines() if len(line.split()) > 1)
     names = words["FIELDS"].split()
     types = [
-        f"<{kind}{size}" for kind, size in zip(words["TYPE"].split(), words["SIZE"].split(), strict=True)
+        f"<{kind.upper()}{size}"
+        for kind, size in zip(words["TYPE"].split(), words["SIZE"].split(), strict=True)
     ]
     if odd := [each for each in types if not _PCD_TYPE.fullmatch(each)]:
         raise ValueError(f"TYPE and SIZE {brief(shortened(odd), _QUOTED)}")

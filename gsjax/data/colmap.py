@@ -18,7 +18,7 @@ import numpy as np
 
 from gsjax.data.clouds import find_cloud, read_cloud
 from gsjax.data.colmap_files import AGAIN, CameraEntry, ImageEntry, read_cameras, read_images, read_points
-from gsjax.data.errors import DataError, DataWarning, shortened
+from gsjax.data.errors import DataError, DataWarning
 from gsjax.data.files import BLACK, background_behind, picture_size, read_image
 from gsjax.data.lens import scaled_intrinsics
 from gsjax.data.masks import read_shades
@@ -27,6 +27,7 @@ from gsjax.data.origin import near_origin
 from gsjax.data.photographs import Cloud, Photographs
 from gsjax.data.pictures import refuse_unread
 from gsjax.data.through_lenses import Fisheye, through_lenses
+from gsjax.io.brief import shortened
 
 PLACES = ("sparse", "colmap/sparse", ".")
 """Subfolders in which the three files or numbered folders of them may lie, in the order in which they are

@@ -264,7 +264,7 @@ def _check_masks(photographs: Photographs, points: Float[np.ndarray, "m 3"]) -> 
         except (ValueError, OSError):  # which is said when it is used
             return
         if mask is None:
-            return
+            mask = np.ones(photographs.sizes[i][::-1], bool)
         if not len(points):
             left.append(mask.ravel())
             continue
@@ -277,7 +277,7 @@ def _check_masks(photographs: Photographs, points: Float[np.ndarray, "m 3"]) -> 
     if len(counted) and (share := counted.mean()) < _LEAST_LEFT:
         what = "points in view" if len(points) else "pixels"
         message = f"{photographs.name}: masks hide {1 - share:.1%} of the {what}; what is black is left out"
-        warnings.warn(f"{message}: are they inverted?", DataWarning, stacklevel=4)
+        warnings.warn(f"{message}: are they inverted, or meant so?", DataWarning, stacklevel=4)
 
 
 def _check_clock(name: str, sequence: Sequence) -> None:

@@ -9,8 +9,9 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Int
 
-from gsjax.data.errors import DataWarning, shortened
+from gsjax.data.errors import DataWarning
 from gsjax.data.photographs import Photographs
+from gsjax.io.brief import shortened
 
 _SPLITS = ("train", "val", "test")
 _NEAR = 0.01  # of the cameras' spread: poses of one picture by structure from motion differ a little

@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 
-from gsjax.data.errors import DataError, DataWarning, shortened
+from gsjax.data.errors import DataError, DataWarning
 from gsjax.data.files import read_image, read_json, read_text
 from gsjax.data.frame_folders import (
     check_one_size,
@@ -33,6 +33,7 @@ from gsjax.data.lens import intrinsics_matrix, scaled_intrinsics
 from gsjax.data.masks import read_mask
 from gsjax.data.sequence import Sequence
 from gsjax.data.text import fields
+from gsjax.io.brief import shortened
 
 RATE_HZ = 2.0
 LEFT, RIGHT = "left_frames", "right_frames"

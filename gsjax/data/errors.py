@@ -1,12 +1,10 @@
-"""The errors and warnings for data that is unusable or only partly usable, and how they list names."""
-
-from collections.abc import Iterable
+"""The errors and warnings for data that is unusable or only partly usable."""
 
 from gsjax.io.brief import brief
 
 COMPLETE = "Was the folder copied completely?"
 """The advice where a file is missing that others tell of."""
-_LONGEST, _EXPECTED = 200, 800  # characters of a name, and of all that may be expected
+_EXPECTED = 800  # characters of all that may be expected
 
 
 class DataError(ValueError):
@@ -23,15 +21,3 @@ class MissingFile(DataError):
 
 class DataWarning(UserWarning):
     """Data that is used although part of it is missing or unusable."""
-
-
-def shortened(names: Iterable[str], most: int = 3) -> str:
-    """Names joined for a message, shortened to the first few if there are many; the middle of endless ones is
-    left out.
-
-    Args:
-        names: the names.
-        most: how many are listed.
-    """
-    names = list(names)
-    return ", ".join(brief(name, _LONGEST) for name in names[:most]) + (", ..." if len(names) > most else "")

@@ -15,8 +15,9 @@ import numpy as np
 from jaxtyping import Float
 
 from gsjax import extras
-from gsjax.data.errors import DataError, shortened
+from gsjax.data.errors import DataError
 from gsjax.data.files import read_complete
+from gsjax.io.brief import shortened
 
 MOST_VALUES = 2**24
 """Values of all channels together that a file may claim: 64 MiB, many times what depth cameras have."""

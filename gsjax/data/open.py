@@ -15,7 +15,7 @@ from gsjax.data.bop import read_bop
 from gsjax.data.duplicates import without_duplicates
 from gsjax.data.endonerf import is_endonerf, is_unambiguous_endonerf, read_endonerf
 from gsjax.data.endovis import LEFT, is_endovis, read_endovis
-from gsjax.data.errors import COMPLETE, DataError, shortened
+from gsjax.data.errors import COMPLETE, DataError
 from gsjax.data.open3d_rgbd import is_open3d, read_open3d
 from gsjax.data.panoptic import read_panoptic
 from gsjax.data.paris import Split, read_paris
@@ -31,6 +31,7 @@ from gsjax.data.through_lenses import Fisheye
 from gsjax.data.tool_masks import Tool
 from gsjax.data.tum import read_tum
 from gsjax.geometry.cameras import NEAR
+from gsjax.io.brief import shortened
 
 SIMULATED_PREFIX = "simulated:"
 SIMULATED_SCENES = {
@@ -325,20 +326,21 @@ def _find_poses(images: Path) -> str:
 def _unknown(root: Path, marks: dict[str, str], options: ReadOptions) -> DataError:
     if (missing := colmap.find_missing_file(root)) is not None:
         return DataError(missing, "a file of the reconstruction", "no such file", COMPLETE)
-    from gsjax.io.sequences import scenes_within  # slow to import
+    from gsjax.io.sequences import scenes_in_words, scenes_within  # slow to import
 
     if not any(root.iterdir()):
         return DataError(root, "a dataset", "an empty folder", "Check the path.")
-    if scenes := scenes_within(root):
-        advice = "Give a file, or a folder of nothing but numbered ones, to gsjax view, info or export."
-        return DataError(root, "a dataset", scenes, advice)
+    scenes = scenes_within(root)
     expected = f"poses of the photographs ({', '.join(layout.mark for layout in _PHOTOGRAPHS)})"
     for folder in (root, root / options.images):
         files = [*folder.iterdir()] if folder.is_dir() else []
         count = sum(map(is_picture, files))
-        if count:
+        if count and count >= len(scenes):
             return DataError(root, expected, f"{count} photographs without poses", _find_poses(folder))
         refuse_unread(folder, expected, files)
+    if scenes:
+        advice = "Give a file, or a folder of nothing but numbered ones, to gsjax view, info or export."
+        return DataError(root, "a dataset", scenes_in_words(scenes), advice)
     by_layout: dict[str, list[str]] = {}
     for mark, layout in marks.items():
         by_layout.setdefault(layout, []).append(mark)

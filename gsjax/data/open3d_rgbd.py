@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from gsjax.data.errors import DataError, DataWarning, shortened
+from gsjax.data.errors import DataError, DataWarning
 from gsjax.data.files import image_size, read_depth, read_image, read_text
 from gsjax.data.frame_folders import DEFAULT_RATE_HZ, numbered
 from gsjax.data.lens import intrinsics_matrix
@@ -23,6 +23,7 @@ from gsjax.data.origin import near_origin
 from gsjax.data.sequence import Sequence
 from gsjax.data.text import fields
 from gsjax.data.validation import check_poses
+from gsjax.io.brief import shortened
 
 DEPTH_UNIT_M = 0.001
 _IMAGES = ("image", "color", "rgb")

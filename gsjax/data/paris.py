@@ -16,7 +16,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from gsjax.data.errors import COMPLETE, DataError, DataWarning, shortened
+from gsjax.data.errors import COMPLETE, DataError, DataWarning
 from gsjax.data.files import image_size, read_depth, read_image, read_json
 from gsjax.data.names import find_file
 from gsjax.data.objects import Truth
@@ -26,6 +26,7 @@ from gsjax.data.sequence import Sequence
 from gsjax.data.validation import check_intrinsics, check_poses
 from gsjax.geometry.cameras import viewmat_from_opengl
 from gsjax.geometry.joints import Joint
+from gsjax.io.brief import shortened
 
 STATES = ("start", "end")
 DEPTH_UNIT_M = 0.001

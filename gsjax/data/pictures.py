@@ -5,7 +5,8 @@ import warnings
 from collections.abc import Iterable
 from pathlib import Path
 
-from gsjax.data.errors import DataError, DataWarning, shortened
+from gsjax.data.errors import DataError, DataWarning
+from gsjax.io.brief import shortened
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".jpe", ".jfif", ".mpo", ".tif", ".tiff", ".bmp", ".webp", ".avif")
 """File extensions of the pictures that all readers and commands take, in lower case."""
@@ -39,7 +40,8 @@ _HEADS = {
 }
 _WEB = re.compile(rb"RIFF....WEBP|....ftypavi[fs]", re.DOTALL)
 _JPEG, _PNG = b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n"
-_ENDS, _TAIL = (b"\xff\xd9", b"IEND"), 2**17  # bytes, more than a thumbnail has
+_ENDS = {_JPEG: b"\xff\xd9", _PNG: b"IEND"}
+_LARGE, _TAIL = 2**20, 2**16  # bytes; those of a thumbnail are never the last of a large file
 _MARKER = re.compile(rb"\xff[^\x00\xff]")
 _AFTER_SCAN = re.compile(rb"\xff[^\x00\xd0-\xd7\xff]")  # neither a stuffed 0xff nor a restart mark
 _START_OF_SCAN, _END_OF_IMAGE = 0xDA, 0xD9
@@ -117,19 +119,19 @@ def warn_of_cut_off(where: object, paths: Iterable[Path]) -> None:
     """
     files = [path for path in paths if path.is_file()]
     if damaged := [str(path) for path in files if _ends_early(path)]:
-        message = f"{where}: {len(damaged)} of {len(files)} pictures are cut off ({shortened(damaged)})"
-        warnings.warn(f"{message}; fetch them again", DataWarning, stacklevel=3)
+        message = f"{where}: {len(damaged)} of {len(files)} pictures that were checked are cut off"
+        warnings.warn(f"{message} ({shortened(damaged)}); fetch them again", DataWarning, stacklevel=3)
 
 
 def _ends_early(path: Path) -> bool:
-    """Whether a picture is cut off; a large file is read whole only if its last bytes have no end mark."""
+    """Whether a picture is cut off. A large file is read whole only if its last bytes have no end mark."""
     with path.open("rb") as file:
-        head, size = file.read(_TAIL), path.stat().st_size
-        if size <= _TAIL:
-            return is_cut_off(head)
-        file.seek(size - _TAIL)
-        tail = file.read()
-        if not head.startswith((_JPEG, _PNG)) or any(mark in tail for mark in _ENDS):
+        head, size = file.read(len(_PNG)), path.stat().st_size
+        end = next((mark for start, mark in _ENDS.items() if head.startswith(start)), None)
+        if end is None:
+            return False
+        file.seek(max(0, size - _TAIL))
+        if size > _LARGE and end in file.read():
             return False
         file.seek(0)
         return is_cut_off(file.read())

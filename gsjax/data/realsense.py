@@ -22,13 +22,14 @@ from jaxtyping import Float, UInt8
 from scipy.spatial.transform import Rotation
 
 from gsjax.data.association import associate
-from gsjax.data.errors import DataError, DataWarning, shortened
+from gsjax.data.errors import DataError, DataWarning
 from gsjax.data.files import SATURATED_DEPTH
 from gsjax.data.lens import Lens, intrinsics_matrix, undistort
 from gsjax.data.registration import registered
 from gsjax.data.rosbag import Bag, Message
 from gsjax.data.sequence import Sequence
 from gsjax.data.validation import check_quaternions
+from gsjax.io.brief import shortened
 
 MAX_SKEW_S = 0.02
 """Largest time between colour and depth of a frame: at 30 Hz, the nearest is at most 0.017 s away."""

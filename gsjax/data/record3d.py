@@ -19,7 +19,7 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from gsjax import extras
-from gsjax.data.errors import COMPLETE, DataError, DataWarning, shortened
+from gsjax.data.errors import COMPLETE, DataError, DataWarning
 from gsjax.data.exr import read_exr_depth
 from gsjax.data.files import image_size, read_image, read_json
 from gsjax.data.frame_folders import DEFAULT_RATE_HZ, numbered
@@ -30,6 +30,7 @@ from gsjax.data.resizing import nearest_resized
 from gsjax.data.sequence import Sequence
 from gsjax.data.validation import check_quaternions
 from gsjax.geometry.cameras import viewmat_from_opengl
+from gsjax.io.brief import shortened
 
 EXPORT_THIS = 'In Record3D choose Export, "EXR + RGB sequence", and give that folder.'
 _FOLDER = "EXR_RGBD"

@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from gsjax.data.errors import COMPLETE, DataError, DataWarning, shortened
+from gsjax.data.errors import COMPLETE, DataError, DataWarning
 from gsjax.data.files import image_size, read_depth, read_image, read_text
 from gsjax.data.lens import intrinsics_matrix
 from gsjax.data.names import find_file
@@ -29,6 +29,7 @@ from gsjax.data.sequence import Sequence
 from gsjax.data.text import fields
 from gsjax.data.validation import check_poses
 from gsjax.geometry.cameras import intrinsics
+from gsjax.io.brief import shortened
 
 RATE_HZ = 30.0
 WIDTH, HEIGHT = 640, 480

@@ -24,7 +24,7 @@ import numpy as np
 from jaxtyping import Float
 
 from gsjax.data.clouds import find_cloud, read_cloud
-from gsjax.data.errors import DataError, DataWarning, shortened
+from gsjax.data.errors import DataError, DataWarning
 from gsjax.data.files import (
     BLACK,
     WHITE,
@@ -53,6 +53,7 @@ from gsjax.data.transforms_keys import (
 )
 from gsjax.data.validation import check_poses
 from gsjax.geometry.cameras import intrinsics, viewmat_from_opengl
+from gsjax.io.brief import brief, shortened
 
 _MODELS = dict.fromkeys(("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV"), False)
 _MODELS["OPENCV_FISHEYE"] = True
@@ -132,8 +133,8 @@ def read_transforms(
             frames.append(frame.read(root, image, pose, own_split, depth_unit_m))
         points = meta.get("ply_file_path")
         if not isinstance(points, str | None):
-            found = f"a {type(points).__name__}"
-            raise DataError(file, "ply_file_path, the name of a file", found, "Correct it, or leave it out.")
+            expected, advice = "ply_file_path, the name of a file", "Correct it, or leave it out."
+            raise DataError(file, expected, brief(repr(points)), advice)
         points = find_cloud(root) if points is None else _beside(root, points)
         if cloud is None and points is not None:
             cloud = read_cloud(points)

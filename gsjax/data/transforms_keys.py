@@ -7,7 +7,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from gsjax.data.errors import DataWarning, shortened
+from gsjax.data.errors import DataWarning
+from gsjax.io.brief import shortened
 
 SPLITS = ("train", "val", "test")
 DEPTH_UNIT_M = 0.001  # nerfstudio's default

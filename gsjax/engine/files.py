@@ -12,11 +12,11 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from gsjax.data import ReadOptions
-from gsjax.data.errors import DataError, DataWarning, shortened
+from gsjax.data.errors import DataError, DataWarning
 from gsjax.data.origin import relative_to_origin
 from gsjax.engine.recording import Opener, Recording, open_recording
 from gsjax.io.arrays import ArraysError, load_arrays
-from gsjax.io.brief import brief
+from gsjax.io.brief import brief, shortened
 from gsjax.io.parsed import parse_yaml
 from gsjax.io.ply import write_ply
 from gsjax.io.scene_file import SceneReport
@@ -84,7 +84,7 @@ def check_arrays(
         with np.errstate(over="ignore"):  # as they will be used
             wrong = int((~np.isfinite(array.astype(np.float32))).sum())
         if wrong:
-            found = f"{wrong} of {array.size} that are not"
+            found = f"{wrong} of {array.size} that are not, as float32"
             raise ValueError(f"{file}: {name}: expected finite numbers, found {found}; {again}")
     return sizes
 
@@ -136,7 +136,8 @@ def read_frames(files: Sequence[Path]) -> Iterator[tuple[Gaussians, SceneReport]
     """
     if missing := missing_numbers(files):
         some = shortened(map(str, missing), 5)
-        warnings.warn(f"{files[0].parent}: no frame {some} among {len(files)}", DataWarning, stacklevel=2)
+        message = f"{files[0].parent}: no frame {some} among {len(files)}; add it, or renumber the others"
+        warnings.warn(message, DataWarning, stacklevel=2)
     first = None
     for file in files:
         with warnings.catch_warnings():

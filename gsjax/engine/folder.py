@@ -18,7 +18,7 @@ from gsjax.io.brief import brief
 from gsjax.io.labels import ENDING
 from gsjax.io.parsed import parse_json, parse_yaml
 from gsjax.io.scenes import is_scene
-from gsjax.io.sequences import scenes_within
+from gsjax.io.sequences import scenes_in_words, scenes_within
 
 _WRITTEN = (
     *("config.yml", "metrics.json", "metrics.jsonl", "report.html", "trajectory.npz", "scene.ply"),
@@ -66,6 +66,11 @@ def is_run(folder: Path) -> bool:
     return config.is_file() and config.read_bytes().startswith(SIGNATURE.encode())
 
 
+def is_of_run(file: Path) -> bool:
+    """Whether a file is one that a run has written into its folder."""
+    return file.is_file() and is_run(file.parent) and any(fnmatch(file.name, each) for each in _WRITTEN)
+
+
 def is_finished(folder: Path) -> bool:
     """Whether a run that was not stopped has written everything: its report comes last."""
     metrics = folder / "metrics.json"
@@ -87,7 +92,7 @@ def expect_run(path: Path, made_by: str = "") -> None:
     if not is_run(path):
         found, advice = "other files" if holds_something(path) else "an empty folder", "give a run's --out"
         if scenes := scenes_within(path):
-            found, advice = scenes, "give a file, or a folder of nothing but numbered ones"
+            found, advice = scenes_in_words(scenes), "give a file, or a folder of nothing but numbered ones"
         raise FileNotFoundError(
             f"{_wanted(path, made_by)}, whose config.yml begins with {SIGNATURE!r}, found {found}; {advice}"
         )

@@ -18,7 +18,7 @@ from gsjax.data.consistency import check_photographs, check_recording
 from gsjax.data.errors import MissingFile
 from gsjax.data.open import SIMULATED_PREFIX, ReadOptions, is_dataset_file, is_photographs, is_recording
 from gsjax.data.pictures import warn_of_cut_off
-from gsjax.engine.folder import is_run
+from gsjax.engine.folder import is_of_run, is_run
 from gsjax.engine.info_picture import by_camera, by_split, write_picture
 from gsjax.engine.info_run import describe_run
 from gsjax.engine.info_scene import describe_frames, describe_scene, origin_fact
@@ -100,8 +100,9 @@ def _scene_at(path: Path) -> Callable[[], dict[str, str]] | None:
 
     Raises:
         FileNotFoundError: there is nothing.
+        ValueError: it is a file of a run.
     """
-    if path.is_file() and not is_scene(path) and is_run(path.parent):
+    if is_of_run(path) and not is_scene(path):
         raise ValueError(
             f"{path}: expected a dataset, a run or a file of Gaussians, found a file of a run; give its "
             f"folder, {path.parent}"

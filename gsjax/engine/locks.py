@@ -14,6 +14,7 @@ import atexit
 import errno
 import json
 import os
+import random
 import socket
 import time
 from collections.abc import Iterator
@@ -131,11 +132,10 @@ def locked(folder: Path, part: str = "", *, shared: bool = False) -> Iterator[No
     elif held.writer.shared and not shared:
         alone = replace(held.writer, shared=False)
         try:
-            _acquire(held.file, folder, path, alone)
+            _claim(held.file, folder, path, alone)
         except BlockingIOError:
             _flock(held.file, shared=True)  # a refused exchange has given up the shared lock
             raise
-        _list_writers(held.file, [alone])
         held.writer = alone
     if held is not None:
         held.times += 1
@@ -161,12 +161,7 @@ def _taken(folder: Path, path: Path, shared: bool) -> _Held | None:
                 return None
             raise
         try:
-            sure = _acquire(file, folder, path, writer)
-            if _is_at(file, path):
-                _list_writers(file, [*(_others(file, writer) if shared else []), writer])
-                if not sure:  # of two that began at one instant, the one that listed itself last has it
-                    time.sleep(_BETWEEN_S)
-                    _acquire(file, folder, path, writer)
+            if _claim(file, folder, path, writer):
                 break
         except BaseException:
             os.close(file)
@@ -174,6 +169,23 @@ def _taken(folder: Path, path: Path, shared: bool) -> _Held | None:
         os.close(file)  # whoever had it has removed the file meanwhile
     _held[path] = _Held(file, made, writer)
     return _held[path]
+
+
+def _claim(file: int, folder: Path, path: Path, writer: Writer) -> bool:
+    """Lock an open file, and list its writer there; returns False if it is no longer the one at the path.
+
+    Raises:
+        BlockingIOError: others have locked it.
+    """
+    sure = _acquire(file, folder, path, writer)
+    if not _is_at(file, path):
+        return False
+    _enter(file, writer)
+    if not sure:  # of two that began at one instant, the one that listed itself last has it
+        time.sleep(_BETWEEN_S * (1 + random.random()))
+        _acquire(file, folder, path, writer)
+        _enter(file, writer)
+    return True
 
 
 def _opened(folder: Path, path: Path) -> int:
@@ -252,6 +264,11 @@ def _listed(line: bytes) -> Writer:
     if [type(value) for value in astuple(writer)] != [int, str, str, bool] or writer.pid < 1:
         raise ValueError("another value")
     return writer
+
+
+def _enter(file: int, writer: Writer) -> None:
+    """List a writer, beside those with whom it shares the lock."""
+    _list_writers(file, [*(_others(file, writer) if writer.shared else []), writer])
 
 
 def _list_writers(file: int, writers: list[Writer]) -> None:

@@ -16,7 +16,6 @@ from rich.console import Console
 
 from gsjax.data import Photographs, open_photographs, read_colmap
 from gsjax.data.alignment import align_cameras
-from gsjax.data.errors import shortened
 from gsjax.data.stills import write_stills
 from gsjax.data.structure_from_motion import (
     MotionConfig,
@@ -29,6 +28,7 @@ from gsjax.engine.messages import Notes, stage
 from gsjax.engine.options import Common, Overwriting
 from gsjax.engine.terminal import print_facts
 from gsjax.io.atomic import write_json
+from gsjax.io.brief import shortened
 
 REPORT = "poses.json"
 """The results, in the folder that is written; it also marks the folder as written by gsjax."""

@@ -2,6 +2,7 @@
 
 from dataclasses import fields
 from importlib import import_module
+from pathlib import Path
 from shutil import get_terminal_size
 from textwrap import fill
 from typing import Any
@@ -14,6 +15,7 @@ from gsjax.extras import MissingExtra
 # ValueError covers DataError and PlyError, and every check of an argument.
 USER_ERRORS = (ValueError, OSError, MissingExtra)
 _ON_HOST = ("info", "poses", "compare")  # an accelerator would not help them, and need not be there
+_FETCHED = ("http", "https", "ftp", "s3", "gs")
 _COMPILE_ANEW = ("bench", "experiment")  # they measure compile time, and may set up JAX themselves
 
 
@@ -81,7 +83,19 @@ def parse_options(command: str, arguments: list[str], entry: tuple[str, str]) ->
         registry=plain_help(),
     )
     _expect_values(options, arguments)
+    _expect_paths(options)
     return options
+
+
+def _expect_paths(options: Any) -> None:
+    """Raises a ValueError for an address where a path is wanted."""
+    for field in fields(options):
+        value = getattr(options, field.name)
+        if isinstance(value, Path) or field.name in ("dataset", "path"):
+            scheme, colon, rest = str(value).partition(":/")
+            if colon and scheme.lower() in _FETCHED:
+                address = f"{scheme}://{rest.lstrip('/')}"
+                raise ValueError(f"{address}: expected a path, found an address; download it first")
 
 
 def _expect_values(options: Any, arguments: list[str]) -> None:

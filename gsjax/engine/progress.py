@@ -309,8 +309,8 @@ class _Display:
         return self
 
     def __exit__(self, *exception: object) -> None:
-        jax.monitoring.unregister_event_listener(self._announce)
         self._bar.stop()
+        jax.monitoring.unregister_event_listener(self._announce)
 
     def show(self) -> None:
         """Update the bar; a log gets a line for each tenth of the run, once there is something to log."""

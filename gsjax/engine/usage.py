@@ -4,14 +4,15 @@ import re
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import fields, is_dataclass, replace
 from difflib import get_close_matches
+from itertools import pairwise, takewhile
 from types import UnionType
 from typing import Annotated, Any, Union, get_args, get_origin, get_type_hints
 
 import tyro
 from tyro.constructors import ConstructorRegistry, StructConstructorSpec, StructFieldSpec, StructTypeInfo
 
-_ADDRESSES = ("http://", "https://", "ftp://", "s3://", "gs://")
-_NUMBERS = re.compile(r"[-+.\deE]+(,[-+.\deE]+)+")
+_NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
+_NUMBERS = re.compile(rf"{_NUMBER}(?:,{_NUMBER})+")
 _UNSAID = (None, False, ())  # defaults that the help text explains, or that mean "not given"
 
 
@@ -44,24 +45,20 @@ def expect_known(kind: Any, command: str, arguments: Sequence[str]) -> None:
         arguments: the arguments after the name.
 
     Raises:
-        ValueError: one does not exist; the message names those that may be meant. Or an argument is an
-            address.
+        ValueError: one does not exist; the message names those that may be meant.
     """
-    for argument in arguments:
-        if argument.startswith(_ADDRESSES):
-            raise ValueError(f"{argument}: expected a path, found an address; download it first")
-    known = [*_options(kind)]
-    for number, argument in enumerate(arguments):
+    known = _options(kind)
+    for before, argument in pairwise(("", *takewhile(lambda argument: argument != "--", arguments))):
         given = argument.split("=")[0].replace("_", "-")
+        is_value = known.get(before.replace("_", "-"), bool) is not bool and given[:2] != "--"
         if (
             re.match("--?[a-zA-Z]", given)
             and given not in (*known, "-h", "--help")
+            and not is_value
             and not given.startswith("--tyro")
         ):
-            meant = " or ".join(_meant(given, known))
+            meant = " or ".join(_meant(given, [*known]))
             hint = f"; did you mean {meant}?" if meant else ";"
-            if len(given) == 2 and number and arguments[number - 1].startswith("--"):
-                hint = f"; if it is a value, write {arguments[number - 1]}={given};"
             raise ValueError(f"{given}: no such option{hint} gsjax {command} --help lists all")
 
 
@@ -93,9 +90,13 @@ def without_commas(kind: Any, arguments: Sequence[str]) -> list[str]:
     """
     types, option, found = _options(kind), "", []
     for argument in arguments:
-        option = argument.replace("_", "-") if argument.startswith("--") else option
-        is_list = get_origin(types.get(option)) is tuple and _NUMBERS.fullmatch(argument)
-        found += argument.split(",") if is_list else [argument]
+        name, _, value = argument.partition("=")
+        option = name.replace("_", "-") if name.startswith("--") else option
+        is_list = get_origin(types.get(option)) is tuple and {*get_args(types[option])} & {int, float}
+        if is_list and _NUMBERS.fullmatch(value if name.startswith("--") else argument):
+            found += [*([name] if name.startswith("--") else []), *(value or argument).split(",")]
+        else:
+            found.append(argument)
     return found
 
 

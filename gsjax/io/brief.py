@@ -1,6 +1,8 @@
 """What a message quotes of a file or of a library, in bounds: damaged files hold words of any length."""
 
-_MOST = 400
+from collections.abc import Iterable
+
+_MOST, _NAME = 400, 200
 _LEFT_OUT = " ... "
 
 
@@ -19,3 +21,15 @@ def brief(text: object, most: int = _MOST) -> str:
         return words
     half = (most - len(_LEFT_OUT)) // 2
     return words[:half] + _LEFT_OUT + words[-half:]
+
+
+def shortened(names: Iterable[str], most: int = 3) -> str:
+    """Names joined for a message, shortened to the first few if there are many; the middle of endless ones is
+    left out.
+
+    Args:
+        names: the names.
+        most: how many are listed.
+    """
+    names = list(names)
+    return ", ".join(brief(name, _NAME) for name in names[:most]) + (", ..." if len(names) > most else "")

@@ -203,7 +203,8 @@ def _read(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     try:
         stored = load_arrays(path)
         if _HEADER not in stored:
-            raise ValueError(f"it holds {brief(', '.join(stored), _LISTED)}, which gsjax.save did not write")
+            names = brief(", ".join(stored), _LISTED) or "nothing by name"
+            raise ValueError(f"it holds {names}, which gsjax.save did not write")
         header = parse_json(str(stored.pop(_HEADER)))
         written, intact = header["format"], header["sha256"] == _checksum(stored)
         if not isinstance(header["metadata"], dict):

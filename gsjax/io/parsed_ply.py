@@ -1,5 +1,6 @@
 """PLY files of any elements, parsed by plyfile once their headers are known to be reasonable."""
 
+import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,7 +14,8 @@ _SIZES = {  # bytes; a list may be empty, and has a count of one byte or more
     **dict.fromkeys((b"int", b"uint", b"float", b"int32", b"uint32", b"float32"), 4),
     **dict.fromkeys((b"double", b"float64"), 8),
 }
-_LONGEST_HEADER = 2**18  # bytes
+_LONGEST_HEADER = 2**20  # bytes
+_END = re.compile(rb"[\r\n]end_header[ \t]*(?:[\r\n]|$)")
 
 
 def parse_ply(path: Path) -> PlyData:
@@ -42,15 +44,15 @@ def _least_size(path: Path) -> int:
         ValueError: the header has no end, which plyfile would look for byte by byte.
     """
     with open(path, "rb") as stream:
-        header, end, _ = stream.read(_LONGEST_HEADER).partition(b"end_header")
-    if not end:
+        start = stream.read(_LONGEST_HEADER)
+    if (end := _END.search(start)) is None:
         raise ValueError(f"no end_header in its first {_LONGEST_HEADER:,} bytes")
-    least, count, text = len(header) + len(end), 0, False
-    for words in map(bytes.split, header.splitlines()):
+    least, count, text = end.end(), 0, False
+    for words in map(bytes.split, start[: end.start()].splitlines()):
         if words[:2] == [b"format", b"ascii"]:
             text = True
         elif words[:1] == [b"element"] and len(words) == 3 and words[2].isdigit():
             count = int(words[2][:18])  # more digits take no fewer bytes
         elif words[:1] == [b"property"]:
             least += count * (2 if text else _SIZES.get(words[1] if len(words) > 1 else b"", 1))
-    return least
+    return least - text  # the last line may end without a break

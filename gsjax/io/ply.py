@@ -41,7 +41,7 @@ _NORMALS = ("nx", "ny", "nz")
 _REST_COUNTS = tuple(3 * (size - 1) for size in SH_SIZES)
 _ANTIALIASED = "SplatRenderMode: mip"
 _MODES = re.compile(r"\s*(?:splatrendermode\s*:\s*(\w+)|antialiased\s+([01])|train_flags\b(.*))\s*$", re.I)
-_ENOUGH = 10  # Gaussians, for a verdict on all of them
+_ENOUGH, _VARY = 10, 0.05  # Gaussians, for a verdict on all of them; a range of opacities
 _LOST = 0.01  # of a Gaussian's size: steps of float32 that are larger lose its place
 
 
@@ -69,12 +69,13 @@ def write_ply(
         antialiased: say in a comment that the scene is to be drawn antialiased.
 
     Raises:
-        ValueError: `labels` is not one integer per Gaussian, or the file's name has another ending than .ply.
+        ValueError: `labels` is not one integer per Gaussian, or the name has the ending of another format.
     """
-    if Path(path).suffix.lower() not in (".ply", ""):
+    ending = "".join(Path(path).suffixes[-2:]).lower()
+    if ending == ".compressed.ply" or Path(path).suffix.lower() not in (".ply", ""):
         raise ValueError(
-            f"{path}: expected a name that ends in .ply, found {Path(path).suffix}; gsjax.write_gaussians "
-            "writes each format by its ending"
+            f"{path}: expected a name that ends in .ply, found {ending}; gsjax.write_gaussians writes each "
+            "format by its ending"
         )
     if labels is not None:
         labels = np.asarray(labels)
@@ -167,6 +168,7 @@ def read_ply(path: str | os.PathLike) -> tuple[Gaussians, SceneReport]:
         known = _known(path, vertices)
         places = np.stack([vertices[axis] for axis in _PLACE], axis=1).astype(np.float64)
         gaussians, invisible = _uncompressed(vertices, _relative(places, None))
+        _warn_if_activated(path, gaussians)
         format = "PLY of 3DGS" + (", as text" if ply.text else "")
     names, size = vertices.dtype.names or (), _size(gaussians)
     if (origin := far_origin(places, least=size)) is not None:
@@ -202,6 +204,20 @@ def _says_antialiased(comments: Iterable[str]) -> bool | None:
         return None
     mode, flag, flags = said[-1].groups()
     return (mode or "").lower() == "mip" or flag == "1" or "antialiasing" in (flags or "").lower()
+
+
+def _warn_if_activated(path: Path, gaussians: Gaussians) -> None:
+    """Warns where all opacities and sizes look like what logits and logarithms are to become."""
+    log_scales, logits = np.asarray(gaussians.log_scales), np.asarray(gaussians.logit_opacities)
+    finite = np.isfinite(logits) & np.isfinite(log_scales).all(axis=1)
+    logits = logits[finite]
+    if len(logits) < _ENOUGH or np.ptp(logits) < _VARY or log_scales[finite].min() < 0:
+        return
+    if logits.min() >= 0 and logits.max() <= 1:
+        words = (
+            "opacities lie between 0 and 1, and no scale is negative: they are read as logits and logarithms"
+        )
+        warnings.warn(f"{path}: {words}, as 3DGS writes them; if they are not, write them so", stacklevel=3)
 
 
 def _known(path: Path, vertices: np.ndarray) -> set[str]:
@@ -250,13 +266,6 @@ def _uncompressed(
         shN=None if shN is None else jnp.asarray(shN.transpose(0, 2, 1)),
         features=jnp.asarray(_stack(vertices, features)) if features else None,
     )
-    if len(logits) >= _ENOUGH and ((logits >= 0) & (logits <= 1)).all() and (log_scales > 0).all():
-        warnings.warn(
-            "opacities lie between 0 and 1, and no scale is negative: they are read as logits and as "
-            "logarithms, as 3DGS writes them; export them so if they are not",
-            UserWarning,
-            stacklevel=3,
-        )
     return gaussians, np.isneginf(logits)
 
 

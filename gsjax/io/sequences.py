@@ -6,12 +6,11 @@ from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
 
-from gsjax.io.brief import brief
+from gsjax.io.brief import shortened
 from gsjax.io.labels import ENDING
 from gsjax.io.scenes import READ
 
-_PHOTOGRAPHS = (".jpg", ".jpeg", ".png")
-_LISTED, _QUOTED = 3, 100  # names in a message, and characters of each
+_HEADER = 2**16  # bytes
 _BESIDE = (ENDING, ".txt", ".md", ".log")
 _NUMBERED = re.compile(rf"(.*?)(\d+)({'|'.join(map(re.escape, READ))})", re.I | re.S)
 
@@ -42,33 +41,53 @@ def missing_numbers(files: Sequence[Path]) -> list[int]:
     """The numbers that some frames lack, where the others follow each other in even steps.
 
     Args:
-        files: from `frame_files`.
+        files: two or more, from `frame_files`.
     """
     matches = [_NUMBERED.fullmatch(file.name) for file in files]
     numbers = [int(match[2]) for match in matches if match]
     steps = [after - before for before, after in pairwise(numbers)]
     usual = max(1, min(steps, default=1))
-    if any(step % usual for step in steps) or numbers[-1] - numbers[0] > 2 * usual * len(numbers):
+    if any(step % usual for step in steps) or sum(steps) > 2 * usual * len(numbers):
         return []
-    return sorted({*range(numbers[0], numbers[-1], usual)} - {*numbers})
+    return sorted(
+        {
+            number + usual * k
+            for number, step in zip(numbers, steps, strict=False)
+            for k in range(1, step // usual)
+        }
+    )
 
 
-def scenes_within(folder: str | os.PathLike) -> str:
-    """In words, the files of Gaussians in a folder that is no scene by itself, and what they lie beside; ""
-    if there are none, or as many photographs.
+def scenes_within(folder: str | os.PathLike) -> list[Path]:
+    """The files of Gaussians in a folder, for messages about one that is no scene by itself.
 
     Args:
         folder: the folder.
     """
-    files = sorted(file for file in Path(folder).iterdir() if file.is_file() and file.name[0] != ".")
-    scenes = [file.name for file in files if file.name.lower().endswith(READ)]
-    others = [file.name for file in files if not file.name.lower().endswith((*READ, *_BESIDE))]
-    if len(scenes) <= sum(name.lower().endswith(_PHOTOGRAPHS) for name in others):
-        return ""
-    count = "a file" if len(scenes) == 1 else f"{len(scenes)} files"
-    beside = f" beside {_some(others)}" if others else ""
-    return f"{count} of Gaussians ({_some(scenes)}){beside}"
+    return sorted(file for file in Path(folder).iterdir() if file.is_file() and _holds_gaussians(file))
 
 
-def _some(names: list[str]) -> str:
-    return ", ".join(brief(name, _QUOTED) for name in names[:_LISTED]) + ", ..." * (len(names) > _LISTED)
+def scenes_in_words(scenes: Sequence[Path]) -> str:
+    """Files of Gaussians, and what they lie beside.
+
+    Args:
+        scenes: from `scenes_within`, at least one.
+    """
+    files = sorted(file.name for file in scenes[0].parent.iterdir() if file.is_file())
+    names = [file.name for file in scenes]
+    others = [n for n in files if n not in names and n[0] != "." and not n.lower().endswith(_BESIDE)]
+    count = "a file" if len(names) == 1 else f"{len(names)} files"
+    beside = f" beside {shortened(others)}" if others else ""
+    return f"{count} of Gaussians ({shortened(names)}){beside}"
+
+
+def _holds_gaussians(file: Path) -> bool:
+    """Whether a file holds Gaussians, by its ending and, since PLY holds other things too, its header."""
+    name = file.name.lower()
+    if name[0] == "." or not name.endswith(READ):
+        return False
+    if not name.endswith(".ply"):
+        return True
+    with file.open("rb") as stream:
+        header = stream.read(_HEADER).partition(b"end_header")[0]
+    return b" f_dc_0" in header or b" packed_" in header

@@ -1,6 +1,5 @@
 """Validation of configurations."""
 
-import numbers
 from typing import Any
 
 import numpy as np
@@ -18,11 +17,11 @@ def expect(config: Any, where: str = "", **ranges: tuple[float, float]) -> None:
         ranges: smallest and largest value of each field.
 
     Raises:
-        ValueError: a field is outside its range.
+        ValueError: a field is outside its range, or no number.
     """
     for name, (low, high) in ranges.items():
         value = getattr(config, name)
-        if isinstance(value, bool) or not isinstance(value, numbers.Real):
+        if np.shape(value) != () or not np.issubdtype(np.asarray(value).dtype, np.number):
             raise ValueError(f"{where}{name}: expected a number, found {value!r}")
         if not low <= value <= high:
             least = "more than 0" if low == ABOVE_ZERO[0] else f"at least {low:g}"

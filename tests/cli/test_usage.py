@@ -60,11 +60,33 @@ def test_a_mistyped_option_is_guessed(command, given, meant):
     assert meant in str(refused.value)
 
 
+def test_values_that_begin_with_a_dash():
+    assert parse_options("export", ["a", "b.html", "--up", "-y"], COMMANDS["export"]).up == "-y"
+    assert parse_options("info", ["--", "-scene.ply"], COMMANDS["info"]).path == "-scene.ply"
+    assert parse_options("query", ["run", "http://a"], COMMANDS["query"]).text == "http://a"
+
+
 def test_numbers_of_a_list_may_be_separated_by_commas():
     given = ["x", "--out", "1,2", "--read.K=1,2,3,4", "--read.K", "525,525.5,-3e2,240", "--cameras", "0,2"]
-    expected = ["x", "--out", "1,2", "--read.K=1,2,3,4", "--read.K", "525", "525.5", "-3e2", "240"]
+    expected = [
+        "x",
+        "--out",
+        "1,2",
+        "--read.K",
+        "1",
+        "2",
+        "3",
+        "4",
+        "--read.K",
+        "525",
+        "525.5",
+        "-3e2",
+        "240",
+    ]
     kind = import_module(COMMANDS["track"][0]).Options
     assert without_commas(kind, given) == [*expected, "--cameras", "0", "2"]
+    texts = ["x", "y", "--negatives", "1,2"]
+    assert without_commas(import_module(COMMANDS["query"][0]).Options, texts) == texts
     options = parse_options("track", ["x", "--out", "y", "--read.K", "5,6,7,8"], COMMANDS["track"])
     assert options.read.K == (5, 6, 7, 8)
 
@@ -72,12 +94,10 @@ def test_numbers_of_a_list_may_be_separated_by_commas():
 @pytest.mark.parametrize(
     ("command", "arguments", "says"),
     [
-        (
-            "info",
-            ["https://example.com/a.ply"],
-            "example.com/a.ply: expected a path, found an address; download",
-        ),
-        ("export", ["a", "b.html", "--up", "-y"], "-y: no such option; if it is a value, write --up=-y;"),
+        ("info", ["https://a.com/a.ply"], "https://a.com/a.ply: expected a path, found an address; download"),
+        ("export", ["http://a", "b"], "http://a: expected a path, found an address"),
+        ("fit", ["s3://a/b", "--out", "c"], "s3://a/b: expected a path, found an address"),
+        ("fit", ["a", "--resume", "-v"], "-v: no such option; gsjax fit --help"),
     ],
 )
 def test_what_is_no_option(command, arguments, says):

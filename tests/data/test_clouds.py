@@ -70,7 +70,7 @@ PCD = """# .PCD v0.7
 VERSION 0.7
 FIELDS x y z {name}
 SIZE 4 4 4 4
-TYPE F F F {kind}
+TYPE F f F {kind}
 COUNT 1 1 1 1
 WIDTH 2
 HEIGHT 1

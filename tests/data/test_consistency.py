@@ -133,6 +133,8 @@ def test_inverted_masks(moving):
         silent(check_photographs, replace(scene, cloud=cloud, load_mask=lambda i, m=masks: m["right"]))
         with pytest.warns(DataWarning, match=r"masks hide 100.0% of the .*black is left out: are they"):
             check_photographs(replace(scene, cloud=cloud, load_mask=lambda i, m=masks: m["none"]))
+        some = replace(scene, cloud=cloud, load_mask=lambda i, m=masks: None if i == 0 else m["none"])
+        silent(check_photographs, some)  # the first has no mask, so all of it counts
 
 
 def test_cameras_at_one_place(table):

@@ -116,10 +116,10 @@ def with_thumbnail(content: bytes) -> bytes:
     return content[:2] + b"\xff\xe1" + (len(segment) + 2).to_bytes(2, "big") + segment + content[2:]
 
 
-def large() -> bytes:
+def large(ending: str) -> bytes:
     """A picture of more bytes than are looked at first."""
-    noise = np.random.default_rng(0).integers(0, 256, (400, 400, 3), np.uint8)
-    return cv2.imencode(".jpg", noise)[1].tobytes()
+    noise = np.random.default_rng(0).integers(0, 256, (1000, 1000, 3), np.uint8)
+    return cv2.imencode(ending, noise)[1].tobytes()
 
 
 WHOLE = {
@@ -286,8 +286,9 @@ def test_pictures_are_decoded_without_touching_filters_of_warnings(tmp_path, mon
 
 
 def test_pictures_that_are_cut_off_are_named_without_decoding_them(tmp_path):
-    contents = {name.replace(" ", ""): content for name, content in WHOLE.items()} | {"large": large()}
-    assert len(contents["large"]) > 2**17
+    contents = {name.replace(" ", ""): content for name, content in WHOLE.items()}
+    contents |= {"largejpg": with_thumbnail(large(".jpg")), "largepng": large(".png")}
+    assert min(len(contents["largejpg"]), len(contents["largepng"])) > 1.1 * 2**20
     files = []
     for name, content in contents.items():
         for cut in (False, True):
@@ -296,5 +297,8 @@ def test_pictures_that_are_cut_off_are_named_without_decoding_them(tmp_path):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         warn_of_cut_off(tmp_path, [*files[::2], tmp_path / "none"])
-    with pytest.warns(DataWarning, match=rf"{len(contents)} of {len(files)} pictures are cut off \(.*1.jpg"):
+    with pytest.warns(
+        DataWarning,
+        match=rf"{len(contents)} of {len(files)} pictures that were checked are cut off \(.*1.jpg",
+    ):
         warn_of_cut_off(tmp_path, files)

@@ -167,10 +167,10 @@ def test_one_file_of_photographs(tmp_path):
 
 
 def test_folders_of_scenes(tmp_path):
-    for name in ("f_1.ply", "f_2.ply", "f_3.spz", "f_1_labels.npz", "pic.jpg", "pic.xyz"):
-        (tmp_path / name).touch()
+    for name in ("f_1.ply", "f_2.ply", "f_3.spz", "f_1_labels.npz", "pic.jpg", "pic.xyz", "cloud.ply"):
+        (tmp_path / name).write_text("ply\nproperty float f_dc_0\n" if name[0] == "f" else "ply\n")
     said = (
-        r"found 3 files of Gaussians \(f_1.ply, f_2.ply, f_3.spz\) beside pic.jpg, pic.xyz. Give a file, or"
+        r"3 files of Gaussians \(f_1.ply, f_2.ply, f_3.spz\) beside cloud.ply, pic.jpg, pic.xyz. Give a file"
     )
     for read in (open_photographs, open_sequence):
         with pytest.raises(DataError, match=said):
@@ -179,6 +179,11 @@ def test_folders_of_scenes(tmp_path):
         (tmp_path / f"{number}.jpg").touch()
     with pytest.raises(DataError, match="found 4 photographs without poses"):
         open_photographs(tmp_path)
+    clouds = tmp_path / "clouds"
+    clouds.mkdir()
+    (clouds / "points3D.ply").write_text("ply\n")
+    with pytest.raises(DataError, match=r"the files of a known layout: .*found points3D.ply"):
+        open_photographs(clouds)
 
 
 def test_folders_without_photographs(tmp_path):

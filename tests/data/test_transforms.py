@@ -278,7 +278,8 @@ def with_all(**changes):
             r"transforms.json: expected names of frames in train_filenames, .*found 1 that no frame has",
         ),
         (with_all(ply_file_path="gone.ply"), r"gone.ply: expected a point cloud, found no such file"),
-        (with_all(ply_file_path=[5]), r"transforms.json: expected ply_file_path, .*, found a list"),
+        (with_all(ply_file_path=5), r"transforms.json: expected ply_file_path, the name of a file, found 5"),
+        (with_all(ply_file_path=["a"]), r"transforms.json: expected ply_file_path, .* found \['a'\]"),
     ],
 )
 def test_faults_of_a_file(folder, change, says):

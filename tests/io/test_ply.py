@@ -375,40 +375,6 @@ def test_missing_properties_are_listed_with_advice(tmp_path, names, advice):
         read_ply(tmp_path / "scene.ply")
 
 
-def test_opacities_and_sizes_as_they_are_instead_of_logits_and_logarithms(tmp_path):
-    scene = random_gaussians(12)
-    write_ply(tmp_path / "scene.ply", scene)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        read_ply(tmp_path / "scene.ply")
-    activated = (jnp.exp(scene.log_scales), scene.opacities)
-    write_ply(
-        tmp_path / "scene.ply", eqx.tree_at(lambda g: (g.log_scales, g.logit_opacities), scene, activated)
-    )
-    with pytest.warns(UserWarning, match="they are read as logits and as logarithms"):
-        read_ply(tmp_path / "scene.ply")
-
-
-@pytest.mark.parametrize("text", [False, True])
-def test_a_file_that_is_cut_off_tells_what_is_missing(tmp_path, text):
-    path = tmp_path / "scene.ply"
-    write_ply(tmp_path / "other.ply", random_gaussians(20, 1))
-    PlyData(PlyData.read(tmp_path / "other.ply").elements, text=text).write(path)
-    read_ply(path)
-    whole = path.read_bytes()
-    path.write_bytes(whole[:1500])
-    promised = len(whole.split(b"end_header")[0]) + 10 + 20 * 26 * (2 if text else 4)
-    with pytest.raises(PlyError, match=rf"\(1,500 bytes, where its header promises {promised:,} or more\)"):
-        read_ply(path)
-
-
-def test_another_ending_is_refused(tmp_path):
-    with pytest.raises(
-        ValueError, match=r"scene.spz: expected a name that ends in .ply, found .spz; gsjax.write"
-    ):
-        write_ply(tmp_path / "scene.spz", random_gaussians(2))
-
-
 def test_a_missing_vertex_element_is_reported(tmp_path):
     stream = io.BytesIO()
     PlyData([PlyElement.describe(np.zeros(1, [("a", "f4")]), "thing")]).write(stream)

@@ -15,13 +15,13 @@ from jaxtyping import Array, Float
 from rich.console import Console
 from rich.progress import track
 
-from gsjax.data.errors import shortened
 from gsjax.data.photographs import Photographs
 from gsjax.engine.distill.saved import FieldRun, short_names
 from gsjax.engine.messages import Notes, describe
 from gsjax.engine.query import SCENE_CAPTIONS, Queryable, Question, Selection, write_mask
 from gsjax.geometry.cameras import Camera, camera_centers
 from gsjax.geometry.spherical_harmonics import evaluate_sh
+from gsjax.io.brief import shortened
 from gsjax.io.pictures import write_png
 from gsjax.methods.distill import FeatureField, frozen_views, pixel_features
 from gsjax.methods.query import Prompt, encoded_prompt

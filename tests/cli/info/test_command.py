@@ -133,6 +133,23 @@ def test_a_run_is_told_by_its_end_its_data_its_scores_and_its_scene(kind, capfd,
     assert "one that cannot be parsed" in warned
 
 
+def test_a_file_of_a_run_is_told(capfd, tmp_path):
+    run = write_run(tmp_path / "run", "deform", 20.0, dataset="data/room")
+    assert main(["info", str(run / "metrics.json")]) == 2
+    assert f"found a file of a run; give its folder, {run}" in " ".join(capfd.readouterr().err.split())
+    (run / "transforms.json").write_text('{"frames": []}')  # a dataset that happens to lie there
+    assert main(["info", str(run / "transforms.json")]) == 2
+    assert "expected frames, a non-empty list" in " ".join(capfd.readouterr().err.split())
+
+
+def test_pictures_that_are_cut_off_are_told(photographs, capfd, tmp_path):
+    shutil.copytree(photographs, tmp_path / "cut")
+    picture = tmp_path / "cut/images/02.png"
+    picture.write_bytes(picture.read_bytes()[:-40])
+    assert main(["info", str(tmp_path / "cut")]) == 0
+    assert "1 of 9 pictures that were checked are cut off (" in " ".join(capfd.readouterr().err.split())
+
+
 def test_a_run_that_is_not_finished_is_told(capfd, tmp_path):
     run = write_run(tmp_path / "run", "deform", 20.0, dataset="data/room")
     assert "gsjax deform, still going on, or killed; run it again" in told(run, capfd)[0]  # without a report

@@ -43,6 +43,13 @@ def test_a_fit_keeps_its_antialiasing(export, fitted, tmp_path):
     assert "the scene is antialiased" in said
 
 
+def test_photographs_that_are_gone_are_missed_by_a_page_alone(export, fitted, tmp_path):
+    settings = (fitted / "config.yml").read_text()
+    (fitted / "config.yml").write_text(re.sub("(?m)^data(set)?: .*", r"data\1: /gone/away", settings))
+    assert "its photographs are not shown: " in export(fitted, tmp_path / "scene.html")[1]
+    assert "warning" not in export(fitted, tmp_path / "scene.spz")[1]
+
+
 def test_a_tracked_scene_is_its_first_frame(export, tracked, tmp_path):
     code, said = export(tracked, tmp_path / "scene.sog")
     assert code == 0

@@ -52,6 +52,10 @@ def test_numbered_files_are_a_scene_for_every_command(export, tracked, tmp_path,
     assert (code, "30 Gaussians, a page of 4 frames" in said) == (0, True), said
     text = (tmp_path / "frames.html").read_text()
     assert '"up": [0.0, -1.0, 0.0]' in text
+    (folder / "f2.ply").rename(folder / "g")
+    code, said = export(folder, tmp_path / "gap.html")
+    assert (code, f"warning: {folder}: no frame 2 among 3; add it, or renumber" in said) == (0, True), said
+    (folder / "g").rename(folder / "f2.ply")
     code, said = export(folder, folder / "f#.ply", "--overwrite")
     assert (code, "expected another file than the one that is read" in said) == (2, True), said
     write_ply(folder / "f4.ply", some(7))

@@ -1,6 +1,6 @@
 """What messages list."""
 
-from gsjax.data.errors import shortened
+from gsjax.io.brief import shortened
 
 
 def test_a_list_of_names_is_short():
