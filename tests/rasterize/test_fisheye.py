@@ -167,7 +167,8 @@ def test_each_camera_has_its_own_lens(weights):
     together = image(scene | pair | {"fisheye": lenses})[0]
     for i in range(2):
         alone = image(scene | {"fisheye": lenses[i : i + 1]})[0]
-        np.testing.assert_allclose(together[i], alone[0], atol=1e-6)
+        # Two programs: XLA may round in another order (3e-6 of the depth with its default optimisation).
+        np.testing.assert_allclose(together[i], alone[0], rtol=1e-5, atol=1e-6)
     assert np.abs(together[0] - together[1]).max() > 0.05
 
 
