@@ -41,7 +41,7 @@ _TEXT = (".xyz", ".txt", ".pts", ".csv", ".asc", ".xyzrgb")
 _UNITS = re.compile(r"\([^()]*\)|\[[^][]*\]")
 _COMPRESSED = "binary_compressed"
 _QUOTED = 80  # characters
-_PCD_TYPE = re.compile("<[IUF][1248]")
+_PCD_TYPE = re.compile("<[iuf][1248]", re.I)
 
 Columns = Mapping[str, Shaped[np.ndarray, "points"]]
 
@@ -182,10 +182,8 @@ def _read_pcd(path: Path) -> Columns:
     header = content[: end if end >= 0 else len(content)].decode("ascii", "replace")
     words = dict(line.split(maxsplit=1) for line in header.splitlines() if len(line.split()) > 1)
     names = words["FIELDS"].split()
-    types = [
-        f"<{kind.upper()}{size}"
-        for kind, size in zip(words["TYPE"].split(), words["SIZE"].split(), strict=True)
-    ]
+    kinds, sizes = words["TYPE"].split(), words["SIZE"].split()
+    types = [f"<{kind}{size}" for kind, size in zip(kinds, sizes, strict=True)]
     if odd := [each for each in types if not _PCD_TYPE.fullmatch(each)]:
         raise ValueError(f"TYPE and SIZE {brief(shortened(odd), _QUOTED)}")
     counts = [int(count) for count in words.get("COUNT", "1 " * len(names)).split()]

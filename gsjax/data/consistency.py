@@ -245,14 +245,21 @@ def _check_directions(photographs: Photographs, points: Float[np.ndarray, "m 3"]
     points = points[:: max(1, len(points) // _POINTS)]
     some, blind = _spread(photographs.num, 64), 0
     for i in some:
-        local = points @ photographs.viewmats[i, :3, :3].T + photographs.viewmats[i, :3, 3]
-        lens = None if photographs.fisheye is None else photographs.fisheye[i]
-        pixels, _ = pixels_at(local, photographs.Ks[i], lens)
-        blind += not ((pixels >= 0) & (pixels < photographs.sizes[i])).all(1).any()
+        blind += not len(_in_view(photographs, i, points))
     if 2 * blind > len(some):
         found = f"{blind} of {len(some)} photographs look away from all points that come with the poses"
         advice = "give points and poses in one frame, and in the axes that the layout expects"
         warnings.warn(f"{photographs.name}: {found}; {advice}", DataWarning, stacklevel=4)
+
+
+def _in_view(
+    photographs: Photographs, i: int, points: Float[np.ndarray, "m 3"]
+) -> Float[np.ndarray, "seen 2"]:
+    """The pixels of a photograph at which its points in view lie."""
+    local = points @ photographs.viewmats[i, :3, :3].T + photographs.viewmats[i, :3, 3]
+    lens = None if photographs.fisheye is None else photographs.fisheye[i]
+    pixels, _ = pixels_at(local, photographs.Ks[i], lens)
+    return pixels[((pixels >= 0) & (pixels < photographs.sizes[i])).all(1)]
 
 
 def _check_masks(photographs: Photographs, points: Float[np.ndarray, "m 3"]) -> None:
@@ -268,10 +275,7 @@ def _check_masks(photographs: Photographs, points: Float[np.ndarray, "m 3"]) -> 
         if not len(points):
             left.append(mask.ravel())
             continue
-        local = points @ photographs.viewmats[i, :3, :3].T + photographs.viewmats[i, :3, 3]
-        lens = None if photographs.fisheye is None else photographs.fisheye[i]
-        pixels, _ = pixels_at(local, photographs.Ks[i], lens)
-        pixels = pixels[((pixels >= 0) & (pixels < photographs.sizes[i])).all(1)].astype(int)
+        pixels = _in_view(photographs, i, points).astype(int)
         left.append(mask[pixels[:, 1], pixels[:, 0]])
     counted = np.concatenate(left)
     if len(counted) and (share := counted.mean()) < _LEAST_LEFT:

@@ -4,6 +4,7 @@ import re
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import fields, is_dataclass, replace
 from difflib import get_close_matches
+from functools import cache
 from itertools import pairwise, takewhile
 from types import UnionType
 from typing import Annotated, Any, Union, get_args, get_origin, get_type_hints
@@ -100,6 +101,7 @@ def without_commas(kind: Any, arguments: Sequence[str]) -> list[str]:
     return found
 
 
+@cache
 def _options(kind: Any) -> dict[str, Any]:
     """The types of the options of a command by their names."""
     members = get_args(kind) or (kind,)

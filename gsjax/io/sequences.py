@@ -49,13 +49,7 @@ def missing_numbers(files: Sequence[Path]) -> list[int]:
     usual = max(1, min(steps, default=1))
     if any(step % usual for step in steps) or sum(steps) > 2 * usual * len(numbers):
         return []
-    return sorted(
-        {
-            number + usual * k
-            for number, step in zip(numbers, steps, strict=False)
-            for k in range(1, step // usual)
-        }
-    )
+    return [n + usual * k for n, step in zip(numbers, steps, strict=False) for k in range(1, step // usual)]
 
 
 def scenes_within(folder: str | os.PathLike) -> list[Path]:
