@@ -106,6 +106,17 @@ def test_a_type_with_other_fields_than_then_is_named(tmp_path):
         load_checkpoint(path)
 
 
+def test_what_it_says_of_itself_is_quoted_in_bounds(tmp_path):
+    save_checkpoint(tmp_path / "a.npz", {"n": 1})
+    with_header(tmp_path / "a.npz", lambda h: h.update(version=[0] * 10_000, tree={"of": "nothing"}))
+    with pytest.raises(CheckpointError, match=r"found one of gsjax \[0, 0, .* that differs") as refused:
+        load_checkpoint(tmp_path / "a.npz")
+    assert len(str(refused.value)) < 1000
+    np.savez(tmp_path / "c.npz", means=np.zeros(3))
+    with pytest.raises(CheckpointError, match=r"it holds means, which gsjax.save did not write"):
+        load_checkpoint(tmp_path / "c.npz")
+
+
 def test_one_of_the_version_before_is_refused_in_a_sentence(tmp_path):
     path = tmp_path / "a.npz"
     save_checkpoint(path, jnp.ones(2))

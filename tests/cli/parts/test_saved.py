@@ -37,6 +37,11 @@ def with_nan(array):
         ("R", lambda R: R[:2], "R: expected the shape [4,3,3,3], found [2,3,3,3]"),
         ("R", lambda R: np.full_like(R, np.nan), "R: expected finite numbers, found 108 of 108 that are not"),
         ("t", with_nan, "t: expected finite numbers, found 9 of 36 that are not"),
+        (
+            "t",
+            lambda t: np.full(t.shape, 1e300),
+            "t: expected finite numbers, found 36 of 36 that are not, as float32",
+        ),
         ("t", lambda t: t[:, 0], "t: expected the shape [4,3,3], found [4,3]"),
         ("weights", lambda w: w[:, :2], "centres: expected the shape [2,3], found [3,3]"),
         ("weights", lambda w: w[:, 0], "weights: expected the shape [N,P], found [200]"),
