@@ -1,5 +1,5 @@
 """The one loop over steps. It alone owns compiler options, the donation of buffers, overflow, compile time,
-random keys, headroom, and when Ctrl-C may interrupt.
+random keys, headroom, the guard against divergence, and when Ctrl-C may interrupt.
 
     ticks = drive(method, problem, run)
     for now in ticks:
@@ -7,8 +7,9 @@ random keys, headroom, and when Ctrl-C may interrupt.
     ticks.result
 """
 
+import operator
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from time import perf_counter
 from typing import Any
@@ -18,7 +19,9 @@ import jax.numpy as jnp
 
 from gsjax.engine.interrupts import raise_if_interrupted, shielded
 from gsjax.optim.compiler import compile_seconds, host_options
+from gsjax.optim.guard import begun, paced, window_of
 from gsjax.optim.method import Method, Run
+from gsjax.optim.step import keep_if
 from gsjax.optim.traces import jit_once
 from gsjax.rasterize.plan import HEADROOM
 
@@ -100,6 +103,7 @@ class Drive(Iterator[Tick]):
     ):
         self.method, self.problem, self.run, self.tick = method, problem, run, None
         total = method.total(problem)
+        self._window = window_of(total)
         self._progress = (lambda step: step / total if total else 1.0) if progress is None else progress
         self._headroom = headroom
         self._advance = _compiled(method)
@@ -111,6 +115,7 @@ class Drive(Iterator[Tick]):
     def __next__(self) -> Tick:
         raise_if_interrupted()
         if (progress := self._progress(self.run.step)) >= 1:
+            shielded(self.settle)
             raise StopIteration
         return shielded(self._one_step, progress)
 
@@ -119,18 +124,33 @@ class Drive(Iterator[Tick]):
         """The present result, also before the first step."""
         return self.method.result(self.problem, self.run) if self.tick is None else self.tick.result
 
+    def settle(self) -> None:
+        """End at the best parameters, if the latest are worse. Done by itself where the progress ends."""
+        guard = self.run.guard
+        if guard is None:
+            return
+        settled, params = guard.settled(self.run.params)
+        if settled is not guard:
+            self.run = self.run.having(params=params, guard=settled)
+            self.tick = None if self.tick is None else replace(self.tick, run=self.run)
+
     def _one_step(self, progress: float) -> Tick:
         clock, method, problem = Clock(), self.method, self.problem
-        self.run = method.between(problem, self.run, progress)
+        self.run = _guarded(self.run, method.between(problem, self.run, progress))
         while True:
             run, step = self.run, jnp.asarray(self.run.step)
             batch, names = method.batch(problem, run, progress)
-            params, state, info = self._advance(run.params, run.state, batch, step, self._key)
-            self.run = run.having(params=params, state=state)
-            if not bool(info["overflow"]):
+            inputs = run.params, run.state, run.guard.pace
+            params, state, pace, info = self._advance(*inputs, batch, step, self._key)
+            self.run = run.having(params=params, state=state, guard=replace(run.guard, pace=pace))
+            overflow, skipped, loss = jax.device_get([info[name] for name in ("overflow", "skipped", "loss")])
+            if not overflow:
                 break
             self.run = self.run.grown(names, info["needed"], self._headroom)
-        self.run = self.run.having(step=run.step + 1)
+        guard, params = self.run.guard, self.run.params
+        if not skipped:
+            guard, params = guard.watched(float(loss), params, self._window)
+        self.run = self.run.having(params=params, guard=guard, step=run.step + 1)
         self.tick = announced(Tick(method, problem, self.run, info, *clock.read(), progress))
         return self.tick
 
@@ -157,13 +177,27 @@ def drive(
     return Drive(method, problem, run, progress, headroom)
 
 
+def _guarded(before: Run, run: Run) -> Run:
+    """The run with a guard, which begins anew where losses can no longer be compared: with other parameters,
+    other constants, or a plan for pictures of another size."""
+    old, new = (jax.tree.leaves((one.params, one.kept)) for one in (before, run))
+    is_same = len(old) == len(new) and all(map(operator.is_, old, new)) and set(run.plans) <= set(before.plans)
+    if run.guard is not None and is_same:
+        return run
+    return run.having(guard=begun(run.params, run.guard))
+
+
 @lru_cache(maxsize=4)
 def _compiled(method: Method) -> Callable:
     """The jitted update of a method, cached so that a second problem like the first starts at once."""
     update = method.step.update
 
-    def advance(params, state, batch, step, key):
+    def advance(params, state, pace, batch, step, key):
         jax.monitoring.record_event(COMPILING)  # Python runs only while JAX traces
-        return update(params, state, batch, step=step, key=jax.random.fold_in(key, step))
+        key = jax.random.fold_in(key, step)
+        new, new_state, info = update(params, state, batch, step=step, key=key)
+        new, pace, is_finite = paced(new, params, pace)
+        new_state = keep_if(is_finite, new_state, state)
+        return new, new_state, pace, info | {"skipped": info["skipped"] | ~is_finite}
 
     return jit_once(advance, method, compiler_options=host_options(), donate_argnums=(0, 1))

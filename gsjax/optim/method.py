@@ -15,6 +15,7 @@ from typing import Any, Protocol, TypeVar, runtime_checkable
 import equinox as eqx
 from jaxtyping import PyTree
 
+from gsjax.optim.guard import Guard
 from gsjax.optim.step import Step
 
 
@@ -28,6 +29,7 @@ class Run(eqx.Module):
         plans: capacities by name; see `gsjax.rasterize.plan`.
         kept: inputs of the steps that only `between` replaces, such as a graph, nodes or past poses; None for
             a method that has none.
+        guard: what the driver's guard has seen; None before the first step.
     """
 
     params: PyTree
@@ -35,6 +37,7 @@ class Run(eqx.Module):
     step: int = 0
     plans: dict[str, Any] = eqx.field(default_factory=dict)
     kept: PyTree = None
+    guard: Guard | None = None
 
     def having(self, **changes: Any) -> "Run":
         """A copy with some fields replaced."""

@@ -1,0 +1,185 @@
+"""The driver's guard, on descents small enough to see through. Each fails where `guard` does nothing."""
+
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from gsjax.engine.drive import drive
+from gsjax.io.checkpoints import load_checkpoint, save_checkpoint
+from gsjax.optim.guard import LEAST_WINDOW, begun, paced
+from gsjax.optim.method import Run
+from gsjax.optim.step import Step
+
+SIZE = 4
+
+
+@dataclass(frozen=True)
+class DescentConfig:
+    steps: int = 1000
+    seed: int = 0
+    noise: float = 0.0  # standard deviation of the losses, relative
+    steep_after: int = 10_000  # the step after which the slope is many times as steep
+    infinite_at: int = -1  # the step that leaves the finite
+    jumps_at: int = -1  # the step that is a hundred times too long
+    anew_at: int = -1  # the step before which all parameters are replaced
+
+
+@dataclass(frozen=True)
+class Descent:
+    """Descent on |x|^2 towards 1e-3, with what may go wrong."""
+
+    config: DescentConfig = DescentConfig()
+
+    @property
+    def step(self) -> Step:
+        def update(params, state, batch, *, step, key):
+            config = self.config
+            rate = jnp.where(step > config.steep_after, 3.5, 0.02)  # beyond 2, it diverges
+            change = jnp.where(step == config.jumps_at, 100.0, 1.0) * -rate * params
+            params = params + jnp.where(step == config.infinite_at, jnp.inf, change)
+            loss = jnp.square(params).sum() + 1e-3
+            loss *= 1 + config.noise * jax.random.normal(key)
+            false = jnp.asarray(False)
+            info = {"loss": loss, "skipped": false, "overflow": false, "needed": jnp.int32(0)}
+            return params, state + 1, info
+
+        return Step(lambda params: jnp.int32(0), update)
+
+    def start(self) -> tuple[None, Run]:
+        params = jnp.ones(SIZE)
+        return None, Run(params, self.step.init(params))
+
+    def total(self, problem) -> int:
+        return self.config.steps
+
+    def between(self, problem, run: Run, progress: float) -> Run:
+        return run.having(params=3 * jnp.ones(SIZE)) if run.step == self.config.anew_at else run
+
+    def batch(self, problem, run: Run, progress: float):
+        return None, ()
+
+    def result(self, problem, run: Run) -> np.ndarray:
+        return np.asarray(run.params)
+
+
+def descended(**config):
+    method = Descent(DescentConfig(**config))
+    ticks = drive(method, *method.start())
+    infos = [now.info for now in ticks]
+    return ticks, infos
+
+
+def loss_of(ticks) -> float:
+    return float(np.square(ticks.result).sum() + 1e-3)
+
+
+def test_a_descent_that_goes_well_is_left_alone_to_the_bit():
+    ticks, _ = descended(steps=450)
+    params, step = jnp.ones(SIZE), jax.jit(lambda params: params + -0.02 * params)
+    for _ in range(450):
+        params = step(params)
+    np.testing.assert_array_equal(ticks.result, params)
+    assert ticks.run.guard.returns == 0
+    assert int(ticks.run.guard.pace.limited) == 0
+
+
+def test_what_diverges_goes_back_to_its_best_with_smaller_steps():
+    """Steps beyond the edge of stability; half of them are not."""
+    ticks, infos = descended(steep_after=430)
+    assert max(float(info["loss"]) for info in infos[430:]) > 1  # it was lost
+    assert loss_of(ticks) < 1.001e-3
+    assert ticks.run.guard.returns >= 1
+    assert float(ticks.run.guard.pace.share) <= 0.5
+
+
+def test_a_run_ends_with_its_best_not_its_last():
+    """It diverges in its last forty steps, too late for a window."""
+    ticks, infos = descended(steps=600, steep_after=560)
+    assert float(infos[-1]["loss"]) > 1.5e-3
+    assert loss_of(ticks) < 1.001e-3
+    assert ticks.run.guard.returns == 1
+
+
+def test_to_settle_twice_is_to_settle_once():
+    ticks, _ = descended(steps=600, steep_after=560)
+    before = ticks.run
+    ticks.settle()
+    assert ticks.run is before
+    assert ticks.tick.run is before
+
+
+def test_a_step_that_leaves_the_finite_is_refused_and_reported():
+    ticks, infos = descended(infinite_at=300)
+    assert [i for i, info in enumerate(infos) if info["skipped"]] == [300]
+    assert np.isfinite(ticks.result).all()
+    assert int(ticks.run.state) == 999  # nor is its state kept
+    assert loss_of(ticks) < 1.001e-3
+
+
+def test_a_jump_is_limited_to_ten_usual_steps_and_counted():
+    ticks, _ = descended(jumps_at=60, steps=61)
+    before, _ = descended(steps=60)
+    usual = float(before.run.guard.pace.usual[0])
+    np.testing.assert_allclose(np.abs(ticks.result - before.result), 10 * usual, rtol=1e-5)
+    assert int(ticks.run.guard.pace.limited) == 1
+
+
+@pytest.mark.parametrize("at", [200, 433, 500, 501, 750])
+def test_a_run_that_is_resumed_is_the_same_to_the_bit(tmp_path, at):
+    whole, _ = descended(steep_after=430)
+    method = Descent(DescentConfig(steep_after=430))
+    ticks = drive(method, *method.start())
+    while next(ticks).step < at:
+        pass
+    save_checkpoint(tmp_path / "run.npz", ticks.run)
+    again = drive(method, None, load_checkpoint(tmp_path / "run.npz")[0])
+    for _ in again:
+        pass
+    np.testing.assert_array_equal(again.result, whole.result)
+    assert again.run.guard.returns == whole.run.guard.returns
+
+
+def test_new_parameters_begin_anew():
+    """A loss that rises because parameters were replaced is not lost."""
+    ticks, infos = descended(anew_at=500, steps=800)
+    assert float(infos[500]["loss"]) > 30
+    assert ticks.run.guard.returns == 0
+    assert ticks.run.guard.steps == 300
+
+
+@given(seed=st.integers(0, 2**31 - 1), noise=st.sampled_from([0.03, 0.3]))
+def test_noise_alone_is_no_loss(seed, noise):
+    """Twenty windows without a trend: the least of twenty means is below the others by chance alone."""
+    losses = 1 + noise * np.random.default_rng(seed).normal(size=20 * LEAST_WINDOW)
+    params = jnp.zeros(SIZE)
+    guard = begun(params)
+    for loss in losses:
+        guard, _ = guard.watched(float(loss), params, LEAST_WINDOW)
+    assert guard.returns == 0
+
+
+def test_arrays_are_limited_one_by_one_and_integers_pass():
+    old = {"a": jnp.zeros(3), "b": jnp.zeros(2), "count": jnp.int32(1)}
+    pace = begun(old).pace
+    usual = {"a": old["a"] + 0.1, "b": old["b"] + 1e-4, "count": jnp.int32(2)}
+    for _ in range(20):
+        new, pace, is_finite = paced(usual, old, pace)
+        assert bool(is_finite)
+        jax.tree.map(np.testing.assert_array_equal, new, usual)
+    new, pace, _ = paced({"a": old["a"] + 0.5, "b": old["b"] - 1.0, "count": jnp.int32(3)}, old, pace)
+    np.testing.assert_array_equal(new["a"], np.float32(0.5))
+    np.testing.assert_allclose(new["b"], -1e-3, rtol=1e-5)
+    assert int(new["count"]) == 3
+    assert int(pace.limited) == 1
+
+
+def test_half_precision_and_double_keep_their_types():
+    for dtype in (jnp.float16, jnp.bfloat16):
+        old = jnp.ones(3, dtype)
+        new, _, _ = paced(old + 1, old, begun(old).pace)
+        assert new.dtype == dtype
