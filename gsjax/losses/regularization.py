@@ -1,7 +1,8 @@
 """Losses that do not depend on data."""
 
+import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 
 def total_variation(
@@ -36,3 +37,36 @@ def second_differences(planes: Float[Array, "p t w c"]) -> Float[Array, ""]:
     if planes.shape[1] < 3:
         return jnp.zeros((), planes.dtype)
     return jnp.square(jnp.diff(planes, n=2, axis=1)).mean()
+
+
+def local_strain(
+    rest: Float[Array, "M 3"],
+    moved: Float[Array, "M 3"],
+    turns: Float[Array, "M 3 3"],
+    neighbors: Int[Array, "M k"],
+) -> Float[Array, "M k"]:
+    """Squared strain between each point and its neighbours: how much the vector between them changes beyond
+    the given rotation, relative to its length at rest (as-rigid-as-possible, Sorkine and Alexa 2007, eq. 1,
+    with rotations of the field, as in SC-GS, Huang et al. 2024). 0 for neighbours in the same place.
+
+    Args:
+        rest, moved: points before and after the deformation; there is no gradient by `rest`.
+        turns: rotation of each point's surroundings.
+        neighbors: rows of the points around each.
+    """
+    rest = jax.lax.stop_gradient(rest)
+    apart = rest[neighbors] - rest[:, None]
+    turned = jnp.einsum("mij,mkj->mki", turns, apart, precision="highest")
+    left = moved[neighbors] - moved[:, None] - turned
+    squared = jnp.square(apart).sum(-1)
+    return jnp.where(squared > 0, jnp.square(left).sum(-1) / jnp.where(squared > 0, squared, 1.0), 0.0)
+
+
+def pseudo_huber(squared: Float[Array, "*n"], tolerance: float) -> Float[Array, "*n"]:
+    """A penalty of a length that grows with its square below a tolerance and linearly above; smooth.
+
+    Args:
+        squared: the length, squared.
+        tolerance: length at which the penalty becomes linear.
+    """
+    return jnp.sqrt(squared + tolerance**2) - tolerance

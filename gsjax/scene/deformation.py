@@ -239,13 +239,24 @@ def deform_by_nodes(
         time: 0 to 1.
         nodes: control nodes among these Gaussians.
     """
-    return deform(gaussians, _by_nodes(gaussians, field, time, nodes))
+    return deform(gaussians, blended_offsets(node_offsets(gaussians, field, time, nodes), nodes))
 
 
-def _by_nodes(gaussians: Gaussians, field: DeformationField, time: Float[Array, ""], nodes: Nodes) -> Offsets:
-    """Offsets of the Gaussians that `nodes` blends."""
+def node_offsets(
+    gaussians: Gaussians, field: DeformationField, time: Float[Array, ""], nodes: Nodes
+) -> Offsets:
+    """Offsets of the nodes. Arguments as for `deform_by_nodes`."""
     features = None if gaussians.features is None else gaussians.features[nodes.rows]
-    offsets = field(gaussians.means[nodes.rows], time, features)
+    return field(gaussians.means[nodes.rows], time, features)
+
+
+def blended_offsets(offsets: Offsets, nodes: Nodes) -> Offsets:
+    """Offsets of all Gaussians.
+
+    Args:
+        offsets: offsets of the nodes.
+        nodes: control nodes.
+    """
 
     def blended(values):
         flat = values.reshape(len(values), -1)
@@ -279,7 +290,9 @@ def features_at(
         changes = jax.vmap(lambda time: field(some.means, time, some.features).features)(times)
     else:
         blends = nodes._replace(indices=nodes.indices[rows], weights=nodes.weights[rows])
-        changes = jax.vmap(lambda time: _by_nodes(gaussians, field, time, blends).features)(times)
+        changes = jax.vmap(
+            lambda time: blended_offsets(node_offsets(gaussians, field, time, blends), blends).features
+        )(times)
     return still + changes
 
 

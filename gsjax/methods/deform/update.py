@@ -10,22 +10,34 @@ import optax
 from jaxtyping import Array, Float, Int
 
 from gsjax.geometry.cameras import Camera, perturbed
+from gsjax.geometry.rotations import multiply_quats, normalize_quats, quats_to_matrices
 from gsjax.losses.extra import ExtraLosses, extra_terms, named_losses
 from gsjax.losses.photometric import photometric_loss, weighted_mean
-from gsjax.losses.regularization import plane_variation, second_differences
+from gsjax.losses.regularization import local_strain, plane_variation, pseudo_huber, second_differences
 from gsjax.methods.deform.config import DeformConfig
 from gsjax.methods.deform.graph import FrameGraph, graph_loss
 from gsjax.optim.step import Step, gradient_step, per_field_adam
 from gsjax.rasterize.plan import Plan
-from gsjax.scene.deformation import DeformationField, Nodes, deform_by_nodes, deform_rows, features_at
+from gsjax.scene.deformation import (
+    DeformationField,
+    Nodes,
+    Offsets,
+    blended_offsets,
+    deform,
+    deform_by_nodes,
+    deform_rows,
+    features_at,
+    node_offsets,
+)
 from gsjax.scene.frame import Frame
 from gsjax.scene.gaussians import Gaussians
 from gsjax.scene.render import render
 from gsjax.scene.time_encodings import HexPlane
 
-LOSSES = ("rgb", "depth", "feature", "node", "structure", "spatial", "temporal", "planes")
+LOSSES = ("rgb", "depth", "feature", "node", "structure", "spatial", "temporal", "planes", "rigid")
 """Names in `info` of the losses, which are recorded during a run."""
 _FINAL_RATE = 0.1
+_TOLERANCE = 0.1  # strain above which it is no longer punished by its square
 _WEIGHT_DECAY = 1e-5  # of AdamW (SurstSplat, section 3)
 
 
@@ -116,14 +128,21 @@ def deform_loss(config: DeformConfig, extra_losses: ExtraLosses = ()) -> Callabl
         frame, radius = batch.frame, batch.radius
         assert frame.masks is not None
         assert frame.time is not None
-        there, camera = scene.at(jnp.asarray(frame.time), batch.moving), _refined_camera(scene, batch)
+        time, camera, terms = jnp.asarray(frame.time), _refined_camera(scene, batch), {}
+        if scene.field is not None and isinstance(batch.moving, Nodes):
+            offsets = node_offsets(scene.gaussians, scene.field, time, batch.moving)
+            there = deform(scene.gaussians, blended_offsets(offsets, batch.moving))
+            if weights.rigidity:
+                terms["rigid"] = weights.rigidity * _strain(scene.gaussians, offsets, batch.moving)
+        else:
+            there = scene.at(time, batch.moving)
         drawn = render(there, camera, batch.plan)
         target = frame.colors
         # Pixels that do not count are the photograph's: they add neither a gradient nor an edge.
         image = jnp.where(frame.masks[..., None], drawn.colors, target)
         counts = frame.masks.astype(image.dtype)
         area = jnp.maximum(counts.mean(), 1e-6)
-        terms = {"rgb": photometric_loss(image, target, weights.dssim) / area}
+        terms["rgb"] = photometric_loss(image, target, weights.dssim) / area
         if weights.depth and frame.depths is not None:
             known = counts * (frame.depths > 0) * jax.lax.stop_gradient(drawn.alphas > 0.5)
             off = jnp.abs(drawn.depths - jnp.where(frame.depths > 0, frame.depths, 0.0))
@@ -153,6 +172,17 @@ def deform_loss(config: DeformConfig, extra_losses: ExtraLosses = ()) -> Callabl
         return sum(terms.values()), terms | info
 
     return loss
+
+
+def _strain(gaussians: Gaussians, offsets: Offsets, nodes: Nodes) -> Float[Array, ""]:
+    """How much nodes move or grow otherwise than those around them."""
+    rest = jax.tree.map(lambda leaf: leaf[nodes.rows], gaussians)
+    moved, neighbors = deform(rest, offsets), nodes.indices[nodes.rows]
+    back = normalize_quats(rest.quats) * jnp.array([1.0, -1.0, -1.0, -1.0])
+    turns = quats_to_matrices(multiply_quats(moved.quats, back))
+    strains = local_strain(rest.means, moved.means, turns, neighbors)
+    growths = jnp.square(offsets.log_scales[neighbors] - offsets.log_scales[:, None]).sum(-1)
+    return (pseudo_huber(strains, _TOLERANCE) + pseudo_huber(growths, _TOLERANCE)).mean()
 
 
 def _refined_camera(scene: DeformingScene, batch: Batch) -> Camera:
