@@ -7,6 +7,7 @@ scene_gt.json              optional; by frame, for each instance: obj_id, cam_R_
 rgb/FRAME.png              or .jpg; or gray/
 depth/FRAME.png            uint16, 0 = invalid, optional
 mask_visib/FRAME_I.png     what is visible of instance I of the frame's list in scene_gt.json, optional
+../../models_eval/         models of the objects, optional; see `gsjax.data.bop_files`
 
 Only instances of a frame have numbers, so each is followed from frame to frame: that of an object of which
 there is one by the object's number, those of an object of which there are several by their places in the
@@ -15,7 +16,6 @@ world, with the least sum of squared distances.
 
 import os
 import warnings
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -23,8 +23,9 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.optimize import linear_sum_assignment
 
+from gsjax.data.bop_files import MM, by_number, read_models
 from gsjax.data.errors import COMPLETE, DataError, DataWarning
-from gsjax.data.files import image_size, read_depth, read_image, read_json
+from gsjax.data.files import image_size, read_depth, read_image
 from gsjax.data.frame_folders import DEFAULT_RATE_HZ, numbered
 from gsjax.data.masks import read_shades
 from gsjax.data.objects import Truth
@@ -34,7 +35,6 @@ from gsjax.data.validation import check_intrinsics, check_poses
 from gsjax.io.brief import shortened
 
 CAMERAS, POSES = "scene_camera.json", "scene_gt.json"
-_MM = 0.001
 _STANDING = "camera"
 
 
@@ -77,10 +77,10 @@ def read_bop(path: str | Path, *, world: str | None = None, depth_unit_m: float 
     """
     root = Path(path)
     _check_is_one_scene(root)
-    views = _by_frame(root / CAMERAS, _view)
+    views = by_number(root / CAMERAS, _view)
     images = numbered(root / "rgb") or numbered(root / "gray")
     depths, annotated = numbered(root / "depth"), (root / POSES).exists()
-    instances = _by_frame(root / POSES, _instances) if annotated else {}
+    instances = by_number(root / POSES, _instances) if annotated else {}
     _check(root / POSES, {n: [i.pose for i in some] for n, some in instances.items()}, "Correct that entry.")
     viewmats = _viewmats(root, views, instances, world)
     parts = {"a camera": views, "an image": images, "depth": depths or None}
@@ -147,23 +147,6 @@ def _check_is_one_scene(root: Path) -> None:
     raise DataError(root, "one scene of the BOP layout", found, advice)
 
 
-def _by_frame(path: Path, parse: Callable[[Any], Any]) -> dict[int, Any]:
-    """What a file says of each frame, by its number."""
-    described = read_json(path)
-    key = "its outermost level"
-    try:
-        frames = {}
-        for key in described:
-            if int(key) in frames:
-                raise ValueError(f"a second entry of frame {int(key)}")
-            frames[int(key)] = parse(described[key])
-    except (AttributeError, TypeError, KeyError, IndexError, ValueError, OverflowError) as error:
-        expected = "entries of this layout, by frame number"
-        found = f"something else ({type(error).__name__}: {error}) in {key!r}"
-        raise DataError(path, expected, found, "Correct that entry, or fetch the file again.") from None
-    return frames
-
-
 def _view(entry: dict[str, Any]) -> _View:
     K = np.array(entry["cam_K"], np.float64).reshape(3, 3)
     K[:2, 2] += 0.5  # from pixel centres at integers
@@ -171,7 +154,7 @@ def _view(entry: dict[str, Any]) -> _View:
     if not 0 < scale < np.inf:
         raise ValueError(f"depth_scale is {scale}")
     known = entry.get("cam_R_w2c") is not None
-    return _View(K, _MM * scale, _pose(entry, "cam_R_w2c", "cam_t_w2c") if known else None)
+    return _View(K, MM * scale, _pose(entry, "cam_R_w2c", "cam_t_w2c") if known else None)
 
 
 def _instances(entries: list[dict[str, Any]]) -> list[_Instance]:
@@ -181,7 +164,7 @@ def _instances(entries: list[dict[str, Any]]) -> list[_Instance]:
 def _pose(entry: dict[str, Any], rotation: str, translation: str) -> Float[np.ndarray, "4 4"]:
     pose = np.eye(4)
     pose[:3, :3] = np.array(entry[rotation], np.float64).reshape(3, 3)
-    pose[:3, 3] = _MM * np.array(entry[translation], np.float64).reshape(3)
+    pose[:3, 3] = MM * np.array(entry[translation], np.float64).reshape(3)
     return pose
 
 
@@ -265,12 +248,14 @@ class _Followed(NamedTuple):
     Attributes:
         labels: the label of each instance of each frame.
         names: the name of each label.
+        numbers: the object's number, by label.
         poses: object to world, by label, then by position of the frame.
         frames: number of frames.
     """
 
     labels: list[list[int]]
     names: dict[int, str]
+    numbers: dict[int, int]
     poses: dict[int, dict[int, np.ndarray]]
     frames: int
 
@@ -286,18 +271,19 @@ class _Followed(NamedTuple):
             for number in {instance.number for instance in some}:
                 mine = [i for i, instance in enumerate(some) if instance.number == number]
                 _extend(tracks.setdefault(number, []), t, mine, worlds)
-        labels, names, poses = [[0] * len(some) for some in frames], {}, {}
+        labels, names, numbers, poses = [[0] * len(some) for some in frames], {}, {}, {}
         for number in sorted(tracks):
             for k, track in enumerate(tracks[number]):
                 label = len(names) + 1
+                numbers[label] = number
                 names[label] = f"obj_{number:06d}" + (f"_{k + 1}" if len(tracks[number]) > 1 else "")
                 poses[label] = {t: worlds[t][i] for t, i in track.items()}
                 for t, i in track.items():
                     labels[t][i] = label
-        return cls(labels, names, poses, len(frames))
+        return cls(labels, names, numbers, poses, len(frames))
 
     def truth(self, root: Path) -> Truth | None:
-        """The poses of those that are in all frames; None if there is none."""
+        """The poses of those that are in all frames, and their models; None if there is none."""
         always = [label for label, poses in self.poses.items() if len(poses) == self.frames]
         if left_out := [self.names[label] for label in self.names if label not in always]:
             some = (
@@ -308,7 +294,13 @@ class _Followed(NamedTuple):
         if not always:
             return None
         poses = [[self.poses[label][t] for label in always] for t in range(self.frames)]
-        return Truth(tuple(self.names[label] for label in always), np.array(always), np.array(poses))
+        known = read_models(root.resolve().parent.parent, {self.numbers[label] for label in always})
+        return Truth(
+            names=tuple(self.names[label] for label in always),
+            label_ids=np.array(always),
+            poses=np.array(poses),
+            models=tuple(known.get(self.numbers[label]) for label in always) if known else (),
+        )
 
 
 def _extend(tracks: list[dict[int, int]], t: int, places: list[int], worlds: list[list[np.ndarray]]) -> None:

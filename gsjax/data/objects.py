@@ -13,6 +13,30 @@ from gsjax.geometry.joints import Joint
 
 
 @dataclass(frozen=True, eq=False)
+class ObjectModel:
+    """The model of an object in the frame of its true poses, for scoring only.
+
+    Attributes:
+        source: the file that it comes from, as it is reported.
+        points: vertices, metres, [V,3].
+        diameter: the largest distance between two vertices, metres.
+        symmetries: motions that leave the model as it was, the identity first, [S,4,4].
+
+    Raises:
+        ValueError: shapes are not as above.
+    """
+
+    source: str
+    points: Float[np.ndarray, "..."]
+    diameter: float
+    symmetries: Float[np.ndarray, "..."]
+
+    def __post_init__(self):
+        check_shape("points", self.points, (len(self.points), 3))
+        check_shape("symmetries", self.symmetries, (len(self.symmetries), 4, 4))
+
+
+@dataclass(frozen=True, eq=False)
 class Truth:
     """Ground truth of the objects of a sequence, for scoring only.
 
@@ -24,6 +48,7 @@ class Truth:
         joints: the joint of each object, None for one that moves freely; empty if joints are unknown.
         tracks: trajectories of material points on deformable surfaces, [T,V,3] float64, metres, world; None
             if unknown. Deformable things have no pose and are not among the objects.
+        models: the model of each object, None for one without; empty if there are none.
 
     Raises:
         ValueError: shapes disagree, or a pose is not a rigid motion.
@@ -35,11 +60,14 @@ class Truth:
     robot: int | None = None
     joints: tuple[Joint | None, ...] = ()
     tracks: Float[np.ndarray, "..."] | None = None
+    models: tuple[ObjectModel | None, ...] = ()
 
     def __post_init__(self):
         check_shape("label_ids", self.label_ids, (len(self.names),))
         if self.joints:
             check_shape("joints", np.zeros(len(self.joints)), (len(self.names),))
+        if self.models:
+            check_shape("models", np.zeros(len(self.models)), (len(self.names),))
         for name, joint in zip(self.names, self.joints, strict=False):
             if joint is not None:
                 check_shape(f"values of the joint of {name}", joint.values, (len(self.poses),))

@@ -36,7 +36,7 @@ def near_origin(read: Callable[Given, Data]) -> Callable[Given, Data]:
             data = read(*args, **options)
         except ValueError as error:
             where = str(args[0] if args else next(iter(options.values())))
-            if where in str(error):
+            if isinstance(error, DataError) or where in str(error):
                 raise
             raise ValueError(f"{where}: {error}") from error
         centers = np.linalg.solve(data.viewmats, np.array([0.0, 0.0, 0.0, 1.0])[:, None])[..., :3, 0]

@@ -190,3 +190,71 @@ def test_folders_that_are_no_scene(folder):
     (folder.root / "scene_camera_rgb.json").unlink()
     with pytest.raises(DataError, match=r"found no scene_camera.json"):
         read_bop(folder.root)
+
+
+CORNERS_MM = np.array([[30, 20, 10], [-30, 20, 10], [0, -20, 10], [0, 0, -30.0]])
+HALF_TURN = [-1, 0, 0, 0, 0, -1, 0, 0, 0, 0, 1, 4, 0, 0, 0, 1]
+
+
+def write_models(dataset, numbers, entry):
+    """models_eval of objects that have the same four vertices and the same entry."""
+    folder = dataset / "models_eval"
+    folder.mkdir()
+    (folder / "models_info.json").write_text(json.dumps({str(number): entry for number in (12, 13, 99)}))
+    header = ["ply", "format ascii 1.0", "element vertex 4", *(f"property float {axis}" for axis in "xyz")]
+    header += ["element face 1", "property list uchar int vertex_indices", "end_header"]
+    rows = [" ".join(map(str, corner)) for corner in CORNERS_MM]
+    for number in numbers:
+        (folder / f"obj_{number:06d}.ply").write_text("\n".join([*header, *rows, "3 0 1 2", ""]))
+    return folder
+
+
+def test_models_of_objects_are_read_in_metres(folder, tmp_path):
+    assert open_sequence(folder.root).truth.models == ()
+    continuous = {"axis": [0, 0, 2], "offset": [10, 0, 0]}
+    write_models(tmp_path, (12, 14), {"diameter": 80.0, "symmetries_discrete": [HALF_TURN], "min_x": -30})
+    model, *others = open_sequence(folder.root).truth.models
+    assert others == [None, None, None]  # no vertices, no entry, neither
+    assert (model.source, model.diameter) == ("models_eval/obj_000012.ply", pytest.approx(0.08))
+    np.testing.assert_allclose(model.points, CORNERS_MM / 1000, atol=1e-9)
+    np.testing.assert_array_equal(model.symmetries[0], np.eye(4))
+    np.testing.assert_allclose(model.symmetries[1:, :3, 3], [[0, 0, 0.004]])
+    described = {"diameter": 80, "symmetries_discrete": [HALF_TURN], "symmetries_continuous": [continuous]}
+    (tmp_path / "models_eval/models_info.json").write_text(json.dumps({"12": described}))
+    symmetries = open_sequence(folder.root).truth.models[0].symmetries
+    assert len(symmetries) == 2 * 315  # every turn, alone and after the discrete one
+    np.testing.assert_allclose(symmetries[0], np.eye(4), atol=1e-12)
+    on_the_axis = np.array([0.01, 0, 0.5, 1])
+    alone, after = symmetries[::2], symmetries[1::2]
+    np.testing.assert_allclose(alone @ on_the_axis, np.tile(on_the_axis, (315, 1)), atol=1e-12)
+    np.testing.assert_allclose(after[100], alone[100] @ after[0], atol=1e-12)
+    turned = np.degrees(np.arctan2(alone[:, 1, 0], alone[:, 0, 0])) % 360
+    np.testing.assert_allclose(turned, 360 / 315 * np.arange(315), atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("entry", "found"),
+    [
+        ({}, "KeyError: 'diameter'"),
+        ({"diameter": 0}, "diameter is 0"),
+        ({"diameter": 1, "symmetries_discrete": [[1, 2]]}, "cannot reshape"),
+        ({"diameter": 1, "symmetries_discrete": [(2 * np.eye(4)).tolist()]}, "symmetry of place 0"),
+        ({"diameter": 1, "symmetries_continuous": [{"axis": [0, 0, 0]}]}, r"axis is \[0. 0. 0.\]"),
+    ],
+)
+def test_malformed_models_are_named(folder, tmp_path, entry, found):
+    write_models(tmp_path, (12,), entry)
+    with pytest.raises(DataError, match=rf"models_info.json.*object number.*{found}"):
+        read_bop(folder.root)
+
+
+def test_a_model_without_vertices_is_named(folder, tmp_path):
+    models = write_models(tmp_path, (12,), {"diameter": 80})
+    file = models / "obj_000012.ply"
+    header = ["ply", "format ascii 1.0", "element vertex 0", *(f"property float {axis}" for axis in "xyz")]
+    file.write_text("\n".join([*header, "end_header", ""]))
+    with pytest.raises(DataError, match=r"obj_000012\.ply.*a model with vertices"):
+        read_bop(folder.root)
+    file.write_text("solid")
+    with pytest.raises(DataError, match=r"obj_000012\.ply"):
+        read_bop(folder.root)

@@ -32,6 +32,16 @@ def _worst_error(found: Metrics) -> float | None:
     return max(errors, default=None)
 
 
+def _lowest_auc(found: Metrics) -> float | None:
+    """The area under the curve of ADD-S of the worst object that moved far enough to tell, in per cent."""
+    areas = [
+        100 * scored["pose"]["add_s_auc"]
+        for scored in found["objects"].values()
+        if scored.get("pose") and scored["moved_mm"] is not None and scored["moved_mm"] > MOVED_MM
+    ]
+    return min(areas, default=None)
+
+
 def _lowest_iou(found: Metrics) -> float | None:
     return min((value for value in found["iou"].values() if value is not None), default=None)
 
@@ -39,6 +49,7 @@ def _lowest_iou(found: Metrics) -> float | None:
 SCORES = (
     Score("update rate", "update_hz", "Hz", 2, "more", at("update_hz"), "machine"),
     Score("mean centroid error, worst object", "centroid_error_mm", "mm", 2, "less", _worst_error),
+    Score("lowest ADD-S AUC", "add_s_auc", "%", 1, "more", _lowest_auc),
     Score("lowest label IoU", "iou", "", 3, "more", _lowest_iou),
     Score("PSNR", "psnr", "dB", 2, "more", at("tracked", "psnr")),
     Score("PSNR held out", "psnr_held_out", "dB", 2, "more", at("held_out", "psnr")),
@@ -55,6 +66,8 @@ _OBJECTS = (
     Column("turned", "turned_deg", "°", 1),
     Column("travelled", "travelled_mm", "mm", 1),
     Column("lost", "frames_lost", "frames"),
+    Column("ADD-S AUC", "add_s_auc", "%", 1, wide=True),
+    Column("within 5 cm 5°", "recall_5cm_5deg", "%", 1, wide=True),
     Column("IoU", "iou", "", 3),
     Column("IoU held out", "iou_held_out", "", 3, wide=True),
     Column("mask", "mask_pixels", "pixels", wide=True),
@@ -63,7 +76,8 @@ _OBJECTS = (
 _OBJECT_NOTE = (
     "Errors are means over frames and Gaussians, against where the true motion would have carried each. IoU "
     "pools pixels over frames and cameras. 'Moved' is the truth's, 'travelled' the tracker's. "
-    "Pixels are those of the first mask."
+    "Pixels are those of the first mask. 'ADD-S AUC' (up to 10 cm) and 'within 5 cm 5°' (of frames) are "
+    "scores of pose benchmarks, from the true pose of the first frame on."
 )
 _HOLES = (
     "What an object hid from all cameras in the first frame was never measured: there is a hole once it "
@@ -117,12 +131,19 @@ def _object_rows(found: Metrics) -> list[dict[str, Any]]:
     return [
         {
             **scored,
+            **{key: 100 * value for key, value in _shown_pose(scored).items()},
             "name": name,
             "iou": found["iou"].get(name),
             "iou_held_out": found["iou_held_out"].get(name),
         }
         for name, scored in found["objects"].items()
     ]
+
+
+def _shown_pose(scored: Metrics) -> dict[str, float]:
+    """The scores of an object's poses that the table shows, 0 to 1; none for runs that did not score them."""
+    pose = scored.get("pose") or {}
+    return {key: pose[key] for key in ("add_s_auc", "recall_5cm_5deg") if key in pose}
 
 
 def _subtitle(found: Metrics) -> str:

@@ -3,11 +3,12 @@
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Int
 
 from gsjax.engine.recording import FirstMask, Recording, label_names
 from gsjax.engine.scores import Scores, camera_metrics, motion_metrics, true_labels_at
 from gsjax.engine.track.loop import Tracking
+from gsjax.engine.track.poses import pose_metrics
 from gsjax.methods.track.budget import Chosen
 from gsjax.metrics.tracking import ObjectScore, score_tracks
 
@@ -39,15 +40,19 @@ def labels_of_groups(tracking: Tracking, values: np.ndarray | None) -> np.ndarra
 def score_motion(tracking: Tracking, recording: Recording) -> dict[int, ObjectScore]:
     """How well the motion of each object of the truth was followed, by its mask value; empty without truth,
     depth or masks."""
-    sequence = recording.tracked
-    truth = sequence.truth
-    if truth is None or not (sequence.has_masks and sequence.has_depth) or tracking.num_frames < 2:
+    truth, labels = recording.tracked.truth, _true_labels(tracking, recording)
+    if truth is None or labels is None or tracking.num_frames < 2:
         return {}  # errors are relative to the first frame
-    means, poses = tracking.means(), truth.poses[: tracking.num_frames]
-    labels = true_labels_at(sequence, 0, means[0])
-    if labels is None:
-        return {}
-    return score_tracks(means, labels, {int(k): poses[:, i] for i, k in enumerate(truth.label_ids)})
+    poses = {int(k): truth.poses[: tracking.num_frames, i] for i, k in enumerate(truth.label_ids)}
+    return score_tracks(tracking.means(), labels, poses)
+
+
+def _true_labels(tracking: Tracking, recording: Recording) -> Int[np.ndarray, "N"] | None:
+    """The true label of each Gaussian of the first frame; None without masks or depth."""
+    sequence = recording.tracked
+    if not (sequence.has_masks and sequence.has_depth):
+        return None
+    return true_labels_at(sequence, 0, tracking.means()[0])
 
 
 def metrics(
@@ -72,6 +77,8 @@ def metrics(
     names = object_names(tracking, recording, values)
     ids, label_ids = labels_of_groups(tracking, values), np.asarray(tracking.scene.label_ids)
     groups, means = np.asarray(tracking.scene.labels), tracking.means()
+    true_labels = _true_labels(tracking, recording)
+    poses = {} if values is None else pose_metrics(tracking, recording.tracked, values, true_labels)
     objects = {}
     for label, name in names.items():
         members = np.isin(groups, np.flatnonzero(ids == label))
@@ -90,6 +97,7 @@ def metrics(
             "frames_lost": int(lost_over_frames(tracking, values, label).sum()) if is_tracked else None,
             "turn_unknown_from": turn_unknown_from(tracking, values, label),
             **motion_metrics(motion.get(label) if is_tracked else None),
+            "pose": poses.get(label),
         }
     followed = {
         name: motion[label].centroid_errors_mm

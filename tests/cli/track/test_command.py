@@ -80,6 +80,17 @@ def test_a_run_from_end_to_end(pristine, tmp_path, gsjax_track, opened):
     assert can["moved_mm"] > 15
     assert can["centroid_error_mm"] < 0.5 * can["moved_mm"]
     assert found["objects"]["robot"]["centroid_error_mm"] is None
+    assert found["objects"]["robot"]["pose"] is None
+    # What stands still has no error in any pose; the can's is about that of its points.
+    block = found["objects"]["block"]["pose"]
+    assert block["add_s_mm"] - 1e-9 <= block["add_mm"] < 2
+    assert min(block[name] for name in ("add_auc", "add_s_auc", "recall_5cm_5deg")) > 0.97
+    pose = can["pose"]
+    assert pose["model"] == "Gaussians of the first frame"
+    assert (pose["mssd_recall"], pose["mspd_recall"]) == (None, None)
+    assert pose["add_s_mm"] - 1e-9 <= pose["add_mm"] < 2 * can["point_error_mm"]
+    assert 1 - pose["add_mm"] / 100 <= pose["add_auc"] <= 1
+    assert "ADD-S" in said
     assert 0 < found["iou"]["robot"] <= 1
     assert 0 < found["iou_held_out"]["robot"] <= 1
     assert {name: scored["tracked"] for name, scored in found["cameras"].items()} == {
