@@ -17,7 +17,6 @@ one another. tests/engine/test_laws.py checks every step of the package.
 """
 
 from collections.abc import Callable, Mapping
-from functools import partial
 from types import MappingProxyType
 from typing import Any, NamedTuple, Protocol
 
@@ -26,6 +25,8 @@ import jax
 import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Bool, PyTree
+
+_MOST = 10.0  # roots of the second moment: a gradient's most effect on the first
 
 
 class Init(Protocol):
@@ -89,13 +90,46 @@ def keep_if(condition: Bool[Array, ""], new: PyTree, old: PyTree) -> PyTree:
     return jax.tree.map(lambda a, b: jnp.where(condition, a, b), new, old)
 
 
+def steady_adam(
+    rate: Any, b1: float = 0.9, b2: float = 0.999, eps: float = 1e-15, decay: float = 0.0
+) -> optax.GradientTransformation:
+    """Adam in which a single gradient moves a parameter by no more than about ten learning rates.
+
+    In plain Adam it is 31, however large or small the gradient, if those before were much smaller: the first
+    moment then is (1 - b1) g, the second (1 - b2) g^2, and the first fades slowly. So one frame that is drawn
+    wrongly throws what all frames share. Here the first moment takes at most ten roots of the second, which
+    limits no gradient that comes in one step of a hundred or more often. The state is that of `optax.adam`.
+
+    Args:
+        rate: learning rate, or a schedule.
+        b1, b2: decay of the first and the second moment.
+        eps: added to the root of the second moment.
+        decay: weight decay of AdamW.
+    """
+
+    def update(gradients, state, params=None):
+        count = optax.safe_increment(state.count)
+        nu = optax.tree.update_moment_per_elem_norm(gradients, state.nu, b2, 2)
+        roots = jax.tree.map(jnp.sqrt, optax.tree.bias_correction(nu, b2, count))
+        limited = jax.tree.map(lambda g, root: jnp.clip(g, -_MOST * root, _MOST * root), gradients, roots)
+        mu = optax.tree.update_moment(limited, state.mu, b1, 1)
+        means = optax.tree.bias_correction(mu, b1, count)
+        moves = jax.tree.map(lambda mean, root: mean / (root + eps), means, roots)
+        return moves, optax.ScaleByAdamState(count, mu, nu)
+
+    scale = optax.GradientTransformation(optax.scale_by_adam().init, update)
+    decays = [optax.add_decayed_weights(decay)] if decay else []
+    return optax.chain(scale, *decays, optax.scale_by_learning_rate(rate))
+
+
 def per_field_adam(
     rates: dict[str, Any],
     default: float = 0.0,
     others: Mapping[str, optax.GradientTransformation] = MappingProxyType({}),
     decay: float = 0.0,
 ) -> optax.GradientTransformation:
-    """Adam (eps 1e-15, as in 3DGS) with a learning rate for each field of a module or of nested modules.
+    """`steady_adam` (eps 1e-15, as in 3DGS) with a learning rate for each field of a module or of nested
+    modules.
 
     Args:
         rates: learning rates by field name.
@@ -106,8 +140,7 @@ def per_field_adam(
     Raises:
         ValueError: from the optimizer's init, if the module lacks one of the fields.
     """
-    adam = partial(optax.adamw, weight_decay=decay) if decay else optax.adam
-    transforms = {name: adam(rate, eps=1e-15) for name, rate in rates.items()} | dict(others)
+    transforms = {name: steady_adam(rate, decay=decay) for name, rate in rates.items()} | dict(others)
 
     def label(params):
         fields = _fields(params)
@@ -121,7 +154,7 @@ def per_field_adam(
 
         return jax.tree_util.tree_map_with_path(of, params)
 
-    rest = optax.adam(default) if default else optax.set_to_zero()
+    rest = steady_adam(default, eps=1e-8) if default else optax.set_to_zero()
     return optax.multi_transform(transforms | {"rest": rest}, label)
 
 

@@ -1,12 +1,13 @@
-"""Losses that do not depend on data: smooth planes, and uniform motion over time."""
+"""Losses that do not depend on data: smooth planes, uniform motion over time, and strains."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax.test_util import check_grads
+from scipy.spatial.transform import Rotation
 
-from gsjax.losses.regularization import plane_variation, second_differences
+from gsjax.losses.regularization import local_strain, plane_variation, pseudo_huber, second_differences
 
 
 def planes(seed=0, times=5):
@@ -38,3 +39,47 @@ class TestPlanes:
     @pytest.mark.parametrize("loss", [plane_variation, second_differences])
     def test_slopes(self, loss):
         check_grads(jax.jit(loss), (planes(),), order=1)
+
+
+NEIGHBORS = jnp.array([[0, 1, 2], [1, 0, 3], [2, 3, 0], [3, 2, 1]])
+
+
+def points(seed=0):
+    return np.random.default_rng(seed).normal(size=(4, 3))
+
+
+def strains(rest, moved, turns):
+    return local_strain(*map(jnp.asarray, (rest, moved, turns)), NEIGHBORS)
+
+
+@pytest.mark.usefixtures("x64")
+class TestStrain:
+    def test_a_rigid_motion_has_none(self):
+        turn = Rotation.from_rotvec([0.3, -1.0, 2.0]).as_matrix()
+        rest = points()
+        found = strains(rest, rest @ turn.T + [1.0, 2.0, 3.0], np.tile(turn, (4, 1, 1)))
+        np.testing.assert_allclose(found, 0, atol=1e-28)
+
+    @pytest.mark.parametrize("unit", [1e-6, 1.0, 1e6])
+    def test_that_of_growth_is_its_share_in_any_unit(self, unit):
+        rest = unit * points()
+        found = strains(rest, 1.2 * rest, np.tile(np.eye(3), (4, 1, 1)))
+        expected = np.where(NEIGHBORS == np.arange(4)[:, None], 0, 0.2**2)
+        np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-20)
+
+    def test_gradients_are_central_differences_also_of_points_in_one_place(self):
+        rest = points()
+        rest[3] = rest[1]
+        turns = Rotation.from_rotvec(points(1)).as_matrix()
+
+        def penalty(moved, turns):
+            return pseudo_huber(strains(rest, moved, turns), 0.1).sum()
+
+        check_grads(penalty, (rest + 0.1 * points(2), turns), order=1, modes=("fwd", "rev"))
+        assert not np.any(jax.grad(lambda rest: strains(rest, points(1), turns).sum())(rest))
+
+    def test_the_penalty_is_a_square_at_first_and_then_a_line(self):
+        lengths = np.array([0.0, 1e-4, 1e3])
+        np.testing.assert_allclose(
+            pseudo_huber(jnp.square(lengths), 0.1), [0, 1e-8 / 0.2, 1e3 - 0.1], rtol=1e-4, atol=1e-15
+        )

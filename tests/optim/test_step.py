@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from functools import partial
 
 import equinox as eqx
 import jax
@@ -12,7 +13,7 @@ import pytest
 from jaxtyping import Array, Float
 
 from gsjax import host_options
-from gsjax.optim.step import all_finite, gradient_step, keep_if, per_field_adam
+from gsjax.optim.step import all_finite, gradient_step, keep_if, per_field_adam, steady_adam
 
 
 class Params(eqx.Module):
@@ -159,6 +160,41 @@ def test_each_field_moves_at_its_own_rate_and_the_rest_at_the_default(params):
 def test_a_rate_for_a_field_that_is_not_there_is_refused(params):
     with pytest.raises(ValueError, match="has no field 'means'"):
         per_field_adam({"means": 0.1}).init(params)
+
+
+def moved_by(optimizer, gradients):
+    """How far a sequence of gradients moves a parameter in all, and the state after it."""
+
+    def body(state, gradient):
+        move, state = optimizer.update(gradient, state, jnp.zeros(()))
+        return state, move
+
+    state, moves = jax.lax.scan(body, optimizer.init(jnp.zeros(())), gradients)
+    return np.asarray(moves), state
+
+
+@pytest.mark.parametrize("decay", [0.0, 1e-2])
+def test_the_steady_adam_is_adam_where_no_gradient_stands_out(decay):
+    gradients = jax.random.normal(jax.random.key(0), (500,))
+    ours, state = moved_by(steady_adam(1e-2, decay=decay), gradients)
+    plain, other = moved_by(optax.adamw(1e-2, eps=1e-15, weight_decay=decay), gradients)
+    np.testing.assert_allclose(ours, plain, rtol=1e-5, atol=1e-8)
+    jax.tree.map(partial(np.testing.assert_allclose, rtol=1e-6), state[0], other[0])
+
+
+@pytest.mark.parametrize("size", [1e-3, 1.0, 1e9])
+def test_one_gradient_moves_a_parameter_by_ten_rates_and_by_31_in_adam(size):
+    quiet = 1e-6 * (-1.0) ** jnp.arange(3000)
+    gradients = jnp.concatenate([quiet, jnp.array([size]), jnp.zeros(300)])
+    after = {of: moved_by(of(1.0, eps=1e-15), gradients)[0][3000:].sum() for of in (steady_adam, optax.adam)}
+    assert -after[optax.adam] == pytest.approx(31, rel=0.01)
+    assert -after[steady_adam] == pytest.approx(10, rel=0.01)
+
+
+def test_what_is_seen_in_one_step_of_a_hundred_is_not_limited():
+    gradients = jnp.where(jnp.arange(5000) % 97 == 0, 1.0, 0.0)
+    ours, plain = (moved_by(of(1.0, eps=1e-15), gradients)[0] for of in (steady_adam, optax.adam))
+    np.testing.assert_allclose(ours, plain, rtol=1e-5)
 
 
 def test_all_finite_looks_into_every_leaf_and_keep_if_chooses_whole_trees():
