@@ -64,7 +64,7 @@ class TestStrain:
     def test_that_of_growth_is_its_share_in_any_unit(self, unit):
         rest = unit * points()
         found = strains(rest, 1.2 * rest, np.tile(np.eye(3), (4, 1, 1)))
-        expected = np.where(NEIGHBORS == np.arange(4)[:, None], 0, 0.2**2)
+        expected = np.where(np.arange(4)[:, None] == NEIGHBORS, 0, 0.2**2)
         np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-20)
 
     def test_gradients_are_central_differences_also_of_points_in_one_place(self):
