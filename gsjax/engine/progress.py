@@ -45,6 +45,8 @@ class Progress:
         seconds: time of all steps, without compiling.
         compile_seconds: time of tracing and compiling.
         skipped: number of steps up to the last row that changed nothing, because a number was not finite.
+        shortened: number of steps that were shortened, because they were many times as long as usual.
+        returns: number of returns to the best parameters, because the loss was lost.
         stopped: what ended the run early, or None.
         pace: recent steps per second; 0 before any is known.
     """
@@ -55,6 +57,8 @@ class Progress:
     seconds: float = 0.0
     compile_seconds: float = 0.0
     skipped: int = 0
+    shortened: int = 0
+    returns: int = 0
     stopped: BaseException | None = None
     pace: float = field(default=0.0, init=False)
 
@@ -73,11 +77,21 @@ class Progress:
         scalars = {name: value for name, value in tick.info.items() if getattr(value, "shape", None) == ()}
         self.recent.append(scalars)
 
+    @property
+    def mishaps(self) -> dict[str, int]:
+        """What went wrong and was mended, for metrics.json: numbers of steps that were skipped or shortened,
+        and of returns."""
+        return {name: getattr(self, name) for name in ("skipped", "shortened", "returns")}
+
     def metadata(self) -> dict[str, Any]:
         """The metadata of a checkpoint."""
         recent = [{name: float(a) for name, a in info.items()} for info in jax.device_get(self.recent)]
-        kept = ("rows", "seconds", "compile_seconds", "skipped")
-        return {name: getattr(self, name) for name in kept} | {"about": dict(self.about), "recent": recent}
+        kept = ("rows", "seconds", "compile_seconds")
+        return (
+            {name: getattr(self, name) for name in kept}
+            | self.mishaps
+            | {"about": dict(self.about), "recent": recent}
+        )
 
     def found(self, steps: int, begun: float) -> dict[str, Any]:
         """The part of metrics.json about the progress.
@@ -89,7 +103,7 @@ class Progress:
         return {
             **ended(self.stopped),
             "steps": steps,
-            "skipped": self.skipped,
+            **self.mishaps,
             "seconds": {
                 "steps": self.seconds,
                 "compile": self.compile_seconds,
@@ -146,7 +160,8 @@ def watch(
     enough: Callable[[Tick, Mapping[str, Any]], bool] | None = None,
     listeners: tuple[Callable[[Mapping[str, Any]], None], ...] = (),
 ) -> Progress:
-    """Run until all steps are done, the time is up, Ctrl-C or an error; `ticks.run` is then the newest run.
+    """Run until all steps are done, the time is up, Ctrl-C or an error. `ticks.run` is then the newest run,
+    or the best if that is worse.
 
     Args:
         ticks: the method, from `drive`.
@@ -186,6 +201,9 @@ def watch(
                 raise  # a failed step has consumed the run; --resume has an earlier one
             progress.stopped = stopped
         save(last=True)
+    ticks.settle()
+    if (guard := ticks.run.guard) is not None:
+        progress.shortened, progress.returns = int(guard.pace.limited), guard.returns
     return progress
 
 
@@ -204,10 +222,15 @@ def note_if_cut_short(progress: Progress, schedule: Schedule, steps: int, notes:
         notes.add(f"Stopped by --minutes after {steps:,} of {schedule.total:,} steps.")
 
 
-def warn_if_skipped(progress: Progress, notes: Notes) -> None:
-    """Warn of steps that changed nothing, because a number was not finite."""
+def warn_of_mishaps(progress: Progress, notes: Notes) -> None:
+    """Warn of steps that changed nothing, because a number was not finite, and of losses that were lost."""
     if progress.skipped:
         notes.warn(f"{counted(progress.skipped, 'step')} produced non-finite numbers and changed nothing")
+    if progress.returns:
+        notes.warn(
+            f"the loss was lost {counted(progress.returns, 'time')}, and the run went back to the best it "
+            "had, with smaller steps; if the result is poor, try lower learning rates"
+        )
 
 
 def save_run(folder: Path, run: Run, progress: Progress) -> None:

@@ -37,7 +37,7 @@ from gsjax.engine.progress import (
     load_run,
     means_of,
     note_if_cut_short,
-    warn_if_skipped,
+    warn_of_mishaps,
     watch,
 )
 from gsjax.engine.recording import located, open_recording
@@ -141,7 +141,7 @@ def run(options: Options) -> int:
 
 def _warn_of_oddities(progress: Progress, judged: Mapping[str, Any], notes: Notes) -> None:
     """Warns of skipped steps, and of a scene that hardly learned motion or classes."""
-    warn_if_skipped(progress, notes)
+    warn_of_mishaps(progress, notes)
     tracks = judged["tracks"]
     if tracks is not None and tracks["median_mm"] > _HARDLY * tracks["still_median_mm"]:
         notes.warn("tracks are hardly better than those of a static scene; try more --deform.iterations")

@@ -28,7 +28,7 @@ from gsjax.engine.progress import (
     load_run,
     means_of,
     note_if_cut_short,
-    warn_if_skipped,
+    warn_of_mishaps,
     watch,
 )
 from gsjax.engine.recording import located
@@ -162,6 +162,6 @@ def _out(options: Options, scene: Path) -> Path:
 
 
 def _note_oddities(scene: FieldScene, progress: Progress, notes: Notes) -> None:
-    warn_if_skipped(progress, notes)
+    warn_of_mishaps(progress, notes)
     if not len(scene.held_out):
         notes.add("No view is held out: all scores are of training views.")

@@ -28,7 +28,7 @@ from gsjax.engine.machine import describe as describe_machine
 from gsjax.engine.messages import Notes, counted
 from gsjax.engine.options import RESUME_MAY_CHANGE, OfDataset, checked, expect_positive
 from gsjax.engine.photographs import choose_photographs, read_frames, smaller, split
-from gsjax.engine.progress import Progress, load_run, warn_if_skipped, watch
+from gsjax.engine.progress import Progress, load_run, warn_of_mishaps, watch
 from gsjax.engine.recording import located
 from gsjax.io.atomic import write_npz
 from gsjax.methods.fit import Fit, FitConfig, Model, Problem, refined_frames
@@ -144,7 +144,7 @@ def run(options: Options) -> int:
             "dataset": photographs.name,
             **ended(stopped),
             "steps": run.step,
-            "skipped": progress.skipped,
+            **progress.mishaps,
             "num_gaussians": gaussians.num,
             "sh_degree": gaussians.sh_degree,
             "photographs": {
@@ -245,7 +245,7 @@ def _note_oddities(
     finished: bool,
     notes: Notes,
 ) -> None:
-    warn_if_skipped(progress, notes)
+    warn_of_mishaps(progress, notes)
     compiling, given = progress.compile_seconds, 60 * (options.minutes or np.inf)
     if compiling > given / 3:
         kept = jax.config.jax_enable_compilation_cache and jax.config.jax_compilation_cache_dir

@@ -97,7 +97,7 @@ def finished(
         "pieces": int(start.masks.max()),
         "joined": kept.joined,
         "divided": kept.divided,
-        "skipped": progress.skipped,
+        **progress.mishaps,
         "ari": against_truth.get("ari"),
         "true_parts": against_truth.get("true_parts"),
         "missed": against_truth.get("missed"),

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
+from gsjax.engine.drive import drive
 from gsjax.engine.folder import RunFolder
 from gsjax.engine.messages import Notes
 from gsjax.engine.progress import (
@@ -17,12 +18,13 @@ from gsjax.engine.progress import (
     means_of,
     note_if_cut_short,
     save_run,
-    warn_if_skipped,
+    warn_of_mishaps,
     watch,
 )
 from gsjax.io.checkpoints import CheckpointError
 from gsjax.optim.method import Run
 from tests.engine.test_drive import WalkConfig, walked
+from tests.optim.test_guard import Descent, DescentConfig
 
 
 @pytest.mark.parametrize(
@@ -63,5 +65,17 @@ def test_a_log_says_when_a_later_step_compiles(tmp_path):
         "8 of 11 steps: compiling again, for arrays of other sizes",
     ]
     notes = Notes(Console(quiet=True))
-    warn_if_skipped(progress, notes)
+    warn_of_mishaps(progress, notes)
     assert notes.all == ["Warning: 1 step produced non-finite numbers and changed nothing"]
+
+
+def test_a_loss_that_is_lost_is_mended_counted_and_told(tmp_path):
+    method = Descent(DescentConfig(steep_after=430))
+    schedule = Schedule("descending", 1000, means_of(), lambda row: f"loss {row['loss']:.1f}")
+    ticks = drive(method, *method.start())
+    progress = watch(ticks, Progress(), schedule, RunFolder(tmp_path / "run"), Console(quiet=True))
+    assert progress.returns == ticks.run.guard.returns >= 1
+    assert progress.found(1000, 0.0)["returns"] == progress.returns
+    notes = Notes(Console(quiet=True))
+    warn_of_mishaps(progress, notes)
+    assert "went back to the best it had" in notes.all[-1]
