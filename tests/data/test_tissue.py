@@ -219,6 +219,27 @@ def test_it_is_opened_by_name():
         assert sequence.depth(2, 1).shape == (32, 40)
 
 
+def test_a_stronger_pull_moves_it_as_much_farther(scene):
+    """Beside the breath, which stays."""
+    far = tissue(pull=2.0, frames=15, width=40, height=32).truth.tracks[14]
+    none = tissue(pull=0.0, frames=15, width=40, height=32).truth.tracks[14]
+    np.testing.assert_allclose(far - none, 2 * (scene.truth.tracks[14] - none), atol=1e-9)
+
+
+def test_patterns_differ_in_looks_alone():
+    looks = ("noise", "checker", "stripes", "label", "vessels")
+    scenes = [tissue(pattern=name, frames=1, width=40, height=32) for name in looks]
+    assert len({scene.image(0, 0).tobytes() for scene in scenes}) == 5
+    assert len({scene.depth(0, 0).tobytes() for scene in scenes}) == 1
+    np.testing.assert_array_equal(scenes[-1].image(0, 0), tissue(frames=1, width=40, height=32).image(0, 0))
+
+
+@pytest.mark.parametrize("wrong, match", [({"pull": 4.0}, "pull"), ({"pattern": "tartan"}, "pattern")])
+def test_other_pulls_and_patterns_are_refused(as_users_run, wrong, match):
+    with pytest.raises(ValueError, match=f"{match}: expected"):
+        tissue(**wrong)
+
+
 @pytest.mark.parametrize("name", ["frames", "width", "height"])
 def test_counts_must_be_positive(name):
     with pytest.raises(ValueError, match=f"{name} must be at least 1, got 0"):

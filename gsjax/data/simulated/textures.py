@@ -11,6 +11,8 @@ from scipy.ndimage import map_coordinates
 GAMMA = 2.2
 _CELLS = 64  # edge of the periodic noise block
 
+Pattern = Literal["noise", "checker", "stripes", "label", "vessels"]
+
 
 @dataclass(frozen=True)
 class Texture:
@@ -26,7 +28,7 @@ class Texture:
         grain: strength of the overlaid fine noise, 0 to 1.
     """
 
-    kind: Literal["noise", "checker", "stripes", "label", "vessels"]
+    kind: Pattern
     colors: tuple[tuple[float, float, float], tuple[float, float, float]]
     scale: float
     seed: int = 0

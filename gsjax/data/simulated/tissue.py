@@ -1,6 +1,7 @@
 """A sheet of tissue that breathes and is pulled by a tool, seen by a stereo endoscope that hardly moves."""
 
 from dataclasses import dataclass
+from typing import get_args
 
 import numpy as np
 from jaxtyping import Float
@@ -11,7 +12,7 @@ from gsjax.data.simulated.primitives import Primitive
 from gsjax.data.simulated.raycaster import Light, Scene
 from gsjax.data.simulated.sheet import Sheet
 from gsjax.data.simulated.simulation import check_counts, simulated_sequence
-from gsjax.data.simulated.textures import Texture
+from gsjax.data.simulated.textures import Pattern, Texture
 from gsjax.geometry.cameras import intrinsics, look_at
 
 RATE_HZ = 15.0
@@ -47,7 +48,14 @@ class _Motion:
 
 
 def tissue(
-    seed: int = 0, frames: int = 40, width: int = 320, height: int = 256, *, still: bool = False
+    seed: int = 0,
+    frames: int = 40,
+    width: int = 320,
+    height: int = 256,
+    *,
+    still: bool = False,
+    pull: float = 1.0,
+    pattern: Pattern = "vessels",
 ) -> Sequence:
     """Tissue that breathes and is pulled by a tool: stereo RGB-D, masks, flow, exact tracks; 15 Hz.
 
@@ -66,19 +74,25 @@ def tissue(
         width: pixels.
         height: pixels.
         still: nothing moves.
+        pull: how far the tool pulls, relative to the above; 0 to 3.
+        pattern: what the tissue looks like.
 
     Raises:
-        ValueError: a count is below 1.
+        ValueError: a count is below 1, the pull is not 0 to 3, or there is no such pattern.
     """
     check_counts(frames=frames, width=width, height=height)
+    if not 0 <= pull <= 3:
+        raise ValueError(f"pull: expected 0 to 3, found {pull}")
+    if pattern not in get_args(Pattern):
+        raise ValueError(f"pattern: expected one of {', '.join(get_args(Pattern))}, found {pattern!r}")
     moments = np.zeros(frames) if still else np.arange(frames, dtype=np.float64)
-    motion = _draw_motion(seed)
+    motion = _draw_motion(seed, pull)
     bumps = _bumps(motion, moments)
     poses = np.stack(
         [np.broadcast_to(np.eye(4), (frames, 4, 4)), _tool_poses(motion, moments, bumps)], axis=1
     )
     scene = Scene(
-        primitives=_solids(seed),
+        primitives=_solids(seed, pattern),
         labels=np.array([_TISSUE, _TOOL]),
         poses=poses,
         light=Light(
@@ -98,14 +112,14 @@ def tissue(
     return simulated_sequence(f"tissue_seed{seed}", scene, times, {"tool": _TOOL}, tracks=tracks)
 
 
-def _draw_motion(seed: int) -> _Motion:
+def _draw_motion(seed: int, pull: float) -> _Motion:
     rng = np.random.default_rng(seed)
     side = rng.choice([-1.0, 1.0])
     hill, hollow = rng.uniform(-0.030, 0.030, 2), rng.uniform(-0.035, 0.035, 2)
     azimuth = rng.uniform(0.15, 0.85)
     toward = np.array([side * np.cos(azimuth), np.sin(azimuth), 0.0])
     grasped = rng.uniform([-0.010, -0.010], [0.010, 0.006])
-    length = rng.uniform(0.014, 0.018)
+    length = pull * rng.uniform(0.014, 0.018)
     return _Motion(
         relief=np.array([[*hill, 0.030, 0.0, 0.0, 0.010], [*hollow, 0.026, 0.0, 0.0, -0.007]]),
         breath=np.array([*hill, 0.045, 0.0006, 0.0010, 0.003]),
@@ -160,10 +174,10 @@ def _grid() -> Float[np.ndarray, "3 n"]:
     return np.stack([x.ravel(), y.ravel(), np.zeros(x.size)])
 
 
-def _solids(seed: int) -> tuple[Primitive, ...]:
+def _solids(seed: int, pattern: Pattern) -> tuple[Primitive, ...]:
     """The tissue, then the parts of the tool."""
     s = 20 * seed
-    flesh = Texture("vessels", ((0.90, 0.62, 0.60), (0.50, 0.12, 0.17)), 0.030, seed=s + 1, grain=0.35)
+    flesh = Texture(pattern, ((0.90, 0.62, 0.60), (0.50, 0.12, 0.17)), 0.030, seed=s + 1, grain=0.35)
     steel = Texture("stripes", ((0.34, 0.36, 0.40), (0.55, 0.58, 0.62)), 0.006, seed=s + 2)
     bright = Texture("noise", ((0.70, 0.72, 0.76), (0.86, 0.87, 0.90)), 0.004, seed=s + 3)
     wrist = 2 * _JAW[2]
