@@ -234,7 +234,7 @@ def test_patterns_differ_in_looks_alone():
     np.testing.assert_array_equal(scenes[-1].image(0, 0), tissue(frames=1, width=40, height=32).image(0, 0))
 
 
-@pytest.mark.parametrize("wrong, match", [({"pull": 4.0}, "pull"), ({"pattern": "tartan"}, "pattern")])
+@pytest.mark.parametrize(("wrong", "match"), [({"pull": 4.0}, "pull"), ({"pattern": "tartan"}, "pattern")])
 def test_other_pulls_and_patterns_are_refused(as_users_run, wrong, match):
     with pytest.raises(ValueError, match=f"{match}: expected"):
         tissue(**wrong)
