@@ -19,9 +19,8 @@ import jax.numpy as jnp
 
 from gsjax.engine.interrupts import raise_if_interrupted, shielded
 from gsjax.optim.compiler import compile_seconds, host_options
-from gsjax.optim.guard import begun, paced, window_of
+from gsjax.optim.guard import begun, shortened, window_of
 from gsjax.optim.method import Method, Run
-from gsjax.optim.step import keep_if
 from gsjax.optim.traces import jit_once
 from gsjax.rasterize.plan import HEADROOM
 
@@ -140,14 +139,14 @@ class Drive(Iterator[Tick]):
         while True:
             run, step = self.run, jnp.asarray(self.run.step)
             batch, names = method.batch(problem, run, progress)
-            inputs = run.params, run.state, run.guard.pace
-            params, state, pace, info = self._advance(*inputs, batch, step, self._key)
-            self.run = run.having(params=params, state=state, guard=replace(run.guard, pace=pace))
+            inputs = run.params, run.state, run.guard.share
+            params, state, info = self._advance(*inputs, batch, step, self._key)
+            self.run = run.having(params=params, state=state)
             overflow, skipped, loss = jax.device_get([info[name] for name in ("overflow", "skipped", "loss")])
             if not overflow:
                 break
             self.run = self.run.grown(names, info["needed"], self._headroom)
-        guard, params = self.run.guard, self.run.params
+        guard = self.run.guard
         if not skipped:
             guard, params = guard.watched(float(loss), params, self._window)
         self.run = self.run.having(params=params, guard=guard, step=run.step + 1)
@@ -186,7 +185,7 @@ def _guarded(before: Run, run: Run) -> Run:
     )
     if run.guard is not None and is_same:
         return run
-    return run.having(guard=begun(run.params, run.guard))
+    return run.having(guard=begun(run.guard))
 
 
 @lru_cache(maxsize=4)
@@ -194,12 +193,9 @@ def _compiled(method: Method) -> Callable:
     """The jitted update of a method, cached so that a second problem like the first starts at once."""
     update = method.step.update
 
-    def advance(params, state, pace, batch, step, key):
+    def advance(params, state, share, batch, step, key):
         jax.monitoring.record_event(COMPILING)  # Python runs only while JAX traces
-        key = jax.random.fold_in(key, step)
-        new, new_state, info = update(params, state, batch, step=step, key=key)
-        new, pace, is_finite = paced(new, params, pace)
-        new_state = keep_if(is_finite, new_state, state)
-        return new, new_state, pace, info | {"skipped": info["skipped"] | ~is_finite}
+        new, state, info = update(params, state, batch, step=step, key=jax.random.fold_in(key, step))
+        return shortened(new, params, share), state, info
 
     return jit_once(advance, method, compiler_options=host_options(), donate_argnums=(0, 1))

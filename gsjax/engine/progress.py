@@ -45,7 +45,6 @@ class Progress:
         seconds: time of all steps, without compiling.
         compile_seconds: time of tracing and compiling.
         skipped: number of steps up to the last row that changed nothing, because a number was not finite.
-        shortened: number of steps that were shortened, because they were many times as long as usual.
         returns: number of returns to the best parameters, because the loss was lost.
         stopped: what ended the run early, or None.
         pace: recent steps per second; 0 before any is known.
@@ -57,7 +56,6 @@ class Progress:
     seconds: float = 0.0
     compile_seconds: float = 0.0
     skipped: int = 0
-    shortened: int = 0
     returns: int = 0
     stopped: BaseException | None = None
     pace: float = field(default=0.0, init=False)
@@ -79,9 +77,8 @@ class Progress:
 
     @property
     def mishaps(self) -> dict[str, int]:
-        """What went wrong and was mended, for metrics.json: numbers of steps that were skipped or shortened,
-        and of returns."""
-        return {name: getattr(self, name) for name in ("skipped", "shortened", "returns")}
+        """What went wrong and was mended, for metrics.json: numbers of skipped steps and of returns."""
+        return {"skipped": self.skipped, "returns": self.returns}
 
     def metadata(self) -> dict[str, Any]:
         """The metadata of a checkpoint."""
@@ -203,7 +200,7 @@ def watch(
         save(last=True)
     ticks.settle()
     if (guard := ticks.run.guard) is not None:
-        progress.shortened, progress.returns = int(guard.pace.limited), guard.returns
+        progress.returns = guard.returns
     return progress
 
 

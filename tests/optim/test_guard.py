@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from gsjax.engine.drive import drive
 from gsjax.io.checkpoints import load_checkpoint, save_checkpoint
-from gsjax.optim.guard import LEAST_WINDOW, begun, paced
+from gsjax.optim.guard import LEAST_WINDOW, begun, shortened
 from gsjax.optim.method import Run
 from gsjax.optim.step import Step
 
@@ -24,8 +24,7 @@ class DescentConfig:
     seed: int = 0
     noise: float = 0.0  # standard deviation of the losses, relative
     steep_after: int = 10_000  # the step after which the slope is many times as steep
-    infinite_at: int = -1  # the step that leaves the finite
-    jumps_at: int = -1  # the step that is a hundred times too long
+    nan_after: int = 10_000  # the step after which nothing is finite
     anew_at: int = -1  # the step before which all parameters are replaced
 
 
@@ -40,8 +39,7 @@ class Descent:
         def update(params, state, batch, *, step, key):
             config = self.config
             rate = jnp.where(step > config.steep_after, 3.5, 0.02)  # beyond 2, it diverges
-            change = jnp.where(step == config.jumps_at, 100.0, 1.0) * -rate * params
-            params = params + jnp.where(step == config.infinite_at, jnp.inf, change)
+            params = params - rate * jnp.where(step > config.nan_after, jnp.nan, params)
             loss = jnp.square(params).sum() + 1e-3
             loss *= 1 + config.noise * jax.random.normal(key)
             false = jnp.asarray(False)
@@ -85,7 +83,6 @@ def test_a_descent_that_goes_well_is_left_alone_to_the_bit():
         params = step(params)
     np.testing.assert_array_equal(ticks.result, params)
     assert ticks.run.guard.returns == 0
-    assert int(ticks.run.guard.pace.limited) == 0
 
 
 def test_what_diverges_goes_back_to_its_best_with_smaller_steps():
@@ -94,7 +91,7 @@ def test_what_diverges_goes_back_to_its_best_with_smaller_steps():
     assert max(float(info["loss"]) for info in infos[430:]) > 1  # it was lost
     assert loss_of(ticks) < 1.001e-3
     assert ticks.run.guard.returns >= 1
-    assert float(ticks.run.guard.pace.share) <= 0.5
+    assert float(ticks.run.guard.share) <= 0.5
 
 
 def test_a_run_ends_with_its_best_not_its_last():
@@ -113,20 +110,11 @@ def test_to_settle_twice_is_to_settle_once():
     assert ticks.tick.run is before
 
 
-def test_a_step_that_leaves_the_finite_is_refused_and_reported():
-    ticks, infos = descended(infinite_at=300)
-    assert [i for i, info in enumerate(infos) if info["skipped"]] == [300]
-    assert np.isfinite(ticks.result).all()
-    assert int(ticks.run.state) == 999  # nor is its state kept
+def test_what_leaves_the_finite_unsaid_comes_back():
+    """By a step that does not check itself."""
+    ticks, infos = descended(nan_after=777, steps=800)
+    assert np.isnan(float(infos[-1]["loss"]))
     assert loss_of(ticks) < 1.001e-3
-
-
-def test_a_jump_is_limited_to_ten_usual_steps_and_counted():
-    ticks, _ = descended(jumps_at=60, steps=61)
-    before, _ = descended(steps=60)
-    usual = float(before.run.guard.pace.usual[0])
-    np.testing.assert_allclose(np.abs(ticks.result - before.result), 10 * usual, rtol=1e-5)
-    assert int(ticks.run.guard.pace.limited) == 1
 
 
 @pytest.mark.parametrize("at", [200, 433, 500, 501, 750])
@@ -157,29 +145,17 @@ def test_noise_alone_is_no_loss(seed, noise):
     """Twenty windows without a trend: the least of twenty means is below the others by chance alone."""
     losses = 1 + noise * np.random.default_rng(seed).normal(size=20 * LEAST_WINDOW)
     params = jnp.zeros(SIZE)
-    guard = begun(params)
+    guard = begun()
     for loss in losses:
         guard, _ = guard.watched(float(loss), params, LEAST_WINDOW)
     assert guard.returns == 0
 
 
-def test_arrays_are_limited_one_by_one_and_integers_pass():
-    old = {"a": jnp.zeros(3), "b": jnp.zeros(2), "count": jnp.int32(1)}
-    pace = begun(old).pace
-    usual = {"a": old["a"] + 0.1, "b": old["b"] + 1e-4, "count": jnp.int32(2)}
-    for _ in range(20):
-        new, pace, is_finite = paced(usual, old, pace)
-        assert bool(is_finite)
-        jax.tree.map(np.testing.assert_array_equal, new, usual)
-    new, pace, _ = paced({"a": old["a"] + 0.5, "b": old["b"] - 1.0, "count": jnp.int32(3)}, old, pace)
-    np.testing.assert_array_equal(new["a"], np.float32(0.5))
-    np.testing.assert_allclose(new["b"], -1e-3, rtol=1e-5)
-    assert int(new["count"]) == 3
-    assert int(pace.limited) == 1
-
-
-def test_half_precision_and_double_keep_their_types():
-    for dtype in (jnp.float16, jnp.bfloat16):
-        old = jnp.ones(3, dtype)
-        new, _, _ = paced(old + 1, old, begun(old).pace)
-        assert new.dtype == dtype
+def test_half_a_step_is_half_of_each_array_and_integers_pass():
+    old = {"a": jnp.zeros(3), "half": jnp.ones(2, jnp.bfloat16), "count": jnp.int32(1)}
+    new = {"a": old["a"] + 3, "half": old["half"] + 1, "count": jnp.int32(2)}
+    expected = {"a": old["a"] + 1.5, "half": old["half"] + 0.5, "count": new["count"]}
+    for share, result in ((0.5, expected), (1.0, new)):
+        found = shortened(new, old, jnp.float32(share))
+        jax.tree.map(np.testing.assert_array_equal, found, result)
+        assert found["half"].dtype == jnp.bfloat16
