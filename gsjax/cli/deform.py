@@ -6,7 +6,8 @@ from gsjax.methods.deform import PRESETS
 
 HELP = (
     " As in `gsjax deform DATASET --out RUN`. Masks show where tools are, which are left out unless --tools "
-    "draw. Depth is the data's, else matched between two eyes; without either the scene begins on a plane. "
+    "draw. Depth is the data's, else matched between two eyes; without either the scene begins within its "
+    "visual hull, if the camera goes around it, or on a plane. The data's split is kept. "
     "One camera is learned from (--cameras; by default the first), one judges (--eval-cameras; the next)."
 )
 

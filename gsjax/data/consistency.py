@@ -287,9 +287,9 @@ def _check_masks(photographs: Photographs, points: Float[np.ndarray, "m 3"]) -> 
 def _check_clock(name: str, sequence: Sequence) -> None:
     """Warns of a few steps of time that are many times longer than the others."""
     steps = np.diff(sequence.times)
-    if len(steps) < 3:
+    if (steps > 0).sum() < 3:
         return
-    usual = float(np.median(steps))
+    usual = float(np.median(steps[steps > 0]))
     jumps = np.flatnonzero(steps > _JUMP * usual)
     if 0 < len(jumps) <= max(1, _FEW * len(steps)):
         t = int(jumps[np.argmax(steps[jumps])])

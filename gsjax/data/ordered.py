@@ -30,8 +30,9 @@ def _by_numbers(name: str) -> list[tuple[int, str]]:
 
 
 def sequence_of(photographs: Photographs) -> Sequence:
-    """The photographs as frames of camera 0, in order of their times or, without times, of their names.
-    Pixels that masks exclude are labelled as tool. Lengths stay in the photographs' unit.
+    """The photographs as frames of camera 0, in order of their times or, without times, of their names. They
+    may share times, as those of D-NeRF's splits do. Pixels that masks exclude are labelled as tool. Lengths
+    stay in the photographs' unit.
 
     Raises:
         DataError: the photographs differ in size, or are kept as fisheyes took them.
@@ -78,4 +79,7 @@ def sequence_of(photographs: Photographs) -> Sequence:
         near=photographs.near,
         origin=photographs.origin,
         locate=locate and (lambda kind, t, c: locate(kind, order[t])),
+        shared_times=True,
+        splits=None if photographs.splits is None else tuple(photographs.splits[i] for i in order),
+        background=photographs.background,
     )

@@ -264,6 +264,8 @@ def photographs_of(sequence: Sequence) -> Photographs:
         load_labels=(lambda i: sequence.mask(*views[i])) if sequence.has_masks else None,
         label_names=sequence.names_of_labels,
         times=np.repeat(sequence.times, cameras) if frames > 1 else None,
+        splits=None if sequence.splits is None else tuple(sequence.splits[t] for t, _ in views),
+        background=sequence.background,
         near=sequence.near,
         origin=sequence.origin,
         layout=sequence.layout,

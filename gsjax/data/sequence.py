@@ -34,7 +34,7 @@ class Sequence:
         camera_ids: the data's own camera numbers, C of them.
         width: pixels, of every camera.
         height: pixels.
-        times: seconds, increasing, [T] float64.
+        times: seconds, increasing, [T] float64; if `shared_times`, neighbours may be equal.
         frame_ids: the data's own frame numbers, T of them.
         Ks: intrinsics in pixels, pixel centres at +0.5, [T,C,3,3] float64.
         viewmats: world to camera, OpenCV axes, metres, [T,C,4,4] float64.
@@ -54,6 +54,9 @@ class Sequence:
             files, [3] float64; None if they are as in the files.
         layout: name of the layout of its files, such as "TUM RGB-D"; empty where it was not opened by its
             folder.
+        shared_times: whether frames may share a time, as photographs of a moving scene do.
+        splits: "train", "val" or "test" for each frame; None if the data has no splits.
+        background: RGB, 0 to 1, composited behind transparent images; None if none is transparent.
 
     Raises:
         ValueError: shapes disagree, a pose is not a rigid motion, or times do not increase.
@@ -79,6 +82,9 @@ class Sequence:
     locate: Callable[[str, int, int], str] | None = field(default=None, repr=False)
     origin: Float[np.ndarray, "..."] | None = None
     layout: str = ""
+    shared_times: bool = False
+    splits: tuple[str, ...] | None = None
+    background: tuple[float, float, float] | None = None
 
     def __post_init__(self):
         for name in ("times", "Ks", "viewmats"):
@@ -89,12 +95,14 @@ class Sequence:
         if len(set(self.camera_ids)) != cameras:
             raise ValueError(f"camera_ids must differ from each other, got {self.camera_ids}")
         check_shape("times", self.times, (frames,))
-        check_times(self.times)
+        check_times(self.times, shared=self.shared_times)
         check_shape("frame_ids", np.asarray(self.frame_ids), (frames,))
         check_shape("Ks", self.Ks, (frames, cameras, 3, 3))
         check_shape("viewmats", self.viewmats, (frames, cameras, 4, 4))
         if self.origin is not None:
             check_shape("origin", self.origin, (3,))
+        if self.splits is not None:
+            check_shape("splits", np.asarray(self.splits), (frames,))
         check_intrinsics(self.Ks, self._camera_in_frame)
         check_poses("viewmat", self.viewmats, self._camera_in_frame, _POSE_ADVICE)
         if self.truth is not None:
@@ -254,6 +262,7 @@ class Sequence:
             load_flow=load_flow and (lambda t, u, c: load_flow(ts[t], ts[u], cs[c])),
             locate=locate and (lambda kind, t, c: locate(kind, ts[t], cs[c])),
             truth=truth,
+            splits=None if self.splits is None else tuple(self.splits[t] for t in ts),
         )
 
     def scaled(self, scale: float) -> "Sequence":

@@ -91,18 +91,25 @@ def check_intrinsics(Ks: Float[np.ndarray, "frames cameras 3 3"], where: Callabl
         )
 
 
-def check_times(times: Float[np.ndarray, "frames"]) -> None:
-    """Raises ValueError unless there is at least one time and all are finite and increase."""
+def check_times(times: Float[np.ndarray, "frames"], *, shared: bool = False) -> None:
+    """Raises ValueError unless there is at least one time and all are finite and increase.
+
+    Args:
+        times: seconds.
+        shared: whether neighbours may be equal.
+    """
     if len(times) == 0:
         raise ValueError("a sequence needs at least one frame, got none. Choose other frames.")
     bad = ~np.isfinite(times)
-    bad[1:] |= ~(np.diff(times) > 0)
+    steps = np.diff(times)
+    bad[1:] |= ~(steps >= 0 if shared else steps > 0)
     if bad.any():
         frame = int(np.argmax(bad))
         before = f" after {times[frame - 1]} s" if frame else ""
+        order, advice = ("not decrease", "") if shared else ("increase", " and drop duplicates")
         raise ValueError(
-            f"times must be finite and increase, but frame {frame} is at {times[frame]} s{before}. "
-            "Sort the frames and drop duplicates."
+            f"times must be finite and {order}, but frame {frame} is at {times[frame]} s{before}. "
+            f"Sort the frames{advice}."
         )
 
 

@@ -122,19 +122,30 @@ def split(photographs: Photographs, every: int) -> tuple[Int[np.ndarray, "a"], I
     Raises:
         ValueError: no photograph is left to fit.
     """
-    indices = np.arange(photographs.num)
-    splits = None if photographs.splits is None else np.array(photographs.splits)
-    if splits is not None and (splits != "train").any():
-        held_out = np.isin(splits, "test" if (splits == "test").any() else "val")
-        chosen = indices[splits == "train"]
-    else:
+    found = data_split(photographs.splits)
+    if found is None:
+        indices = np.arange(photographs.num)
         held_out = (indices % every == 0) & (photographs.num > 1) if every else np.zeros(len(indices), bool)
-        chosen = indices[~held_out]
-    if not len(chosen):
+        found = indices[~held_out], indices[held_out]
+    if not len(found[0]):
         raise ValueError(
             f"{photographs.name}: expected photographs to fit, found all {photographs.num} held out"
         )
-    return chosen, indices[held_out]
+    return found
+
+
+def data_split(splits: tuple[str, ...] | None) -> tuple[Int[np.ndarray, "a"], Int[np.ndarray, "b"]] | None:
+    """Indices of what the data means for training and of what it holds out: "test" or, without it, "val".
+    None if it holds out nothing.
+
+    Args:
+        splits: "train", "val" or "test" for each photograph or frame; None if the data has no splits.
+    """
+    if splits is None or set(splits) <= {"train"}:
+        return None
+    named = np.array(splits)
+    held_out = "test" if (named == "test").any() else "val"
+    return np.flatnonzero(named == "train"), np.flatnonzero(named == held_out)
 
 
 def read_frames(photographs: Photographs, console: Console) -> list[Frame]:

@@ -26,7 +26,7 @@ MIN_VIDEO_HZ = 1.0
 
 def frame_rate(times: Float[np.ndarray, "t"]) -> float:
     """Frames per second of a video, near the recording's own."""
-    steps = np.diff(times)
+    steps = np.diff(np.unique(times))  # photographs may share a time
     return float(np.clip(1 / np.median(steps), MIN_VIDEO_HZ, MAX_VIDEO_HZ)) if len(steps) else MIN_VIDEO_HZ
 
 

@@ -2,8 +2,8 @@
 takes smaller steps from there; and a run ends with the best that it had.
 
 The loss is the mean of a window of steps, and each comparison allows for the standard error that the losses
-of the best window have, as a step sees one photograph of many. A stretch is the time during which losses can be compared: it begins anew when
-parameters or constants are replaced, such as by densification.
+of the best window have, as a step sees one photograph of many. A stretch is the time during which losses can
+be compared: it begins anew when parameters or constants are replaced, such as by densification.
 
 That a step is finite is the step's own promise (`gsjax.optim.step`), as is that none is far longer than usual
 (`steady_adam`).

@@ -14,7 +14,8 @@ from rich.progress import track
 from gsjax.data import Sequence
 from gsjax.data.tool_masks import TISSUE, is_tool
 from gsjax.engine.deform.teacher import Labels, Taught, as_photographs, taught_by_classes, taught_by_features
-from gsjax.engine.messages import Notes
+from gsjax.engine.messages import Notes, counted
+from gsjax.engine.photographs import data_split
 from gsjax.engine.teaching.cache import FeatureCache
 from gsjax.engine.teaching.choice import NO_TEACHER, TeacherChoice
 from gsjax.engine.teaching.teaching import Teaching
@@ -158,7 +159,8 @@ def deform_data(
 
     Args:
         sequence: the recording; camera 0 is the training camera.
-        every: hold out frame i where (i - 1) mod `every` is 0, as is done with EndoNeRF; 0: none.
+        every: without a split in the data, hold out frame i where (i - 1) mod `every` is 0, as is done with
+            EndoNeRF; 0: none.
         tools: whether tools, recognised by the names of mask values, are left out.
         choice: the teacher; checked. "auto": the masks' classes, if there are two or more among pixels that
             count. "none": no teacher.
@@ -168,13 +170,12 @@ def deform_data(
         console: shows the progress.
 
     Raises:
-        ValueError: there are too many classes, or too few for "classes"; features do not fit; or no frame has
-            a mask.
+        ValueError: there are too many classes, or too few for "classes"; features do not fit; or no training
+            frame is left, or has a mask.
         DataError, FileNotFoundError: a file is invalid or missing.
     """
+    train, test = _split(sequence, every, notes)
     count = sequence.num_frames
-    test = [i for i in range(count) if every and (i - 1) % every == 0] if count > 1 else []
-    train = [i for i in range(count) if i not in test]
     if count < 2:
         notes.warn(f"{sequence.name} has one frame: nothing deforms, and nothing is held out")
     with_masks = range(count) if sequence.has_masks else range(0)
@@ -205,6 +206,28 @@ def deform_data(
     else:
         return data
     return replace(data, taught=taught)
+
+
+def _split(sequence: Sequence, every: int, notes: Notes) -> tuple[list[int], list[int]]:
+    """Indices of training frames and of held-out ones: by the data's split, as `gsjax fit` has it, else every
+    n-th.
+
+    Raises:
+        ValueError: no frame is left to learn from.
+    """
+    count, found = sequence.num_frames, data_split(sequence.splits)
+    if found is None:
+        test = [i for i in range(count) if every and (i - 1) % every == 0] if count > 1 else []
+        return [i for i in range(count) if i not in test], test
+    train, test = (some.tolist() for some in found)
+    if not train:
+        raise ValueError(f"{sequence.name}: expected frames of its split train, found none; see --frames")
+    unused = count - len(train) - len(test)
+    notes.add(
+        f"The data's own split is used: {counted(len(train), 'frame')} of train learned, {len(test)} held out"
+        + (f", {unused} of val left out of both." if unused else ".")
+    )
+    return train, test
 
 
 def _counted_names(

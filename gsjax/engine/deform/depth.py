@@ -7,19 +7,24 @@ import numpy as np
 
 from gsjax.data import Sequence
 from gsjax.engine.messages import Notes
+from gsjax.geometry.extent import extent_of
+from gsjax.methods.deform import goes_around
 from gsjax.perception.stereo import stereo_depth
 
-Depth = Literal["auto", "data", "stereo", "plane"]
-DepthSource = Literal["data", "stereo", "plane"]
+Depth = Literal["auto", "data", "stereo", "hull", "plane"]
+DepthSource = Literal["data", "stereo", "hull", "plane"]
+METRIC: tuple[DepthSource, ...] = ("data", "stereo")
+"""Sources by which lengths are in the unit of the data, metres."""
 
 
 def with_depth(sequence: Sequence, wanted: Depth, plane: float, notes: Notes) -> tuple[Sequence, DepthSource]:
     """The recording with depth of camera 0, and its source: the recording's own, else matched with camera 1,
-    else none: the scene then begins on a plane. Lengths are metres if the data's are, except on a plane.
+    else none: the scene then begins within its visual hull if the camera goes around it, else on a plane.
+    Lengths are metres if the data's are, where there is depth.
 
     Args:
         sequence: camera 0 is learned from.
-        wanted: the source; "auto" takes the first of the three that exists.
+        wanted: the source; "auto" takes the first that exists.
         plane: distance of the plane from the first camera, in the unit of the poses.
         notes: receives the source.
 
@@ -37,10 +42,21 @@ def with_depth(sequence: Sequence, wanted: Depth, plane: float, notes: Notes) ->
             f"--depth stereo: {sequence.name} has one camera, {sequence.camera_ids[0]}; expected a second "
             "one to its right, as EndoNeRF's folders have in right/ (docs/data.md)"
         )
+    if wanted == "hull" and extent_of(sequence.viewmats[:, 0]).is_point:
+        raise ValueError(
+            f"--depth hull: {sequence.name} is seen from one place; expected a camera that goes around the "
+            "scene; leave it at auto"
+        )
     if wanted == "data" or (wanted == "auto" and sequence.has_depth):
         return sequence, "data"
     if wanted == "stereo" or (wanted == "auto" and two):
         return _of_two_eyes(sequence, notes)
+    if wanted == "hull" or (wanted == "auto" and goes_around(sequence.viewmats[:, 0])):
+        notes.add(
+            "There is no depth: the scene starts as random points within its visual hull, which is what most "
+            "frames show before the background. Its depth is learned from images alone, and is not scored."
+        )
+        return _without_depth(sequence), "hull"
     return _of_a_plane(sequence, plane, notes)
 
 
@@ -74,7 +90,7 @@ def _of_two_eyes(sequence: Sequence, notes: Notes) -> tuple[Sequence, DepthSourc
 
 
 def _of_a_plane(sequence: Sequence, plane: float, notes: Notes) -> tuple[Sequence, DepthSource]:
-    """The first camera alone, without what is known in metres, because the scene has another unit."""
+    """The first camera alone, and how far away the plane is."""
     notes.add(
         f"There is no depth: the scene starts on a plane {plane:g} in front of the first camera. Its depth "
         "has no metric unit, is learned from images alone, and is not scored."
@@ -92,6 +108,11 @@ def _of_a_plane(sequence: Sequence, plane: float, notes: Notes) -> tuple[Sequenc
             f"{sequence.name}: the camera moves by {moved:.3g}, and the distance of the scene is not known; "
             f"pass it, roughly, with --deform.plane-depth (now {plane:g}), in the unit of the poses"
         )
+    return _without_depth(sequence), "plane"
+
+
+def _without_depth(sequence: Sequence) -> Sequence:
+    """The first camera alone, without what is known in metres, because the scene may have another unit."""
     alone = sequence.select(cameras=[sequence.camera_ids[0]])
     names = alone.names_of_labels  # some of which may be truth's
-    return replace(alone, load_depth=None, truth=None, label_names=names), "plane"
+    return replace(alone, load_depth=None, truth=None, label_names=names)

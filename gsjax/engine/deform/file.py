@@ -20,7 +20,10 @@ _AGAIN = "reconstruct it again with this version of gsjax"
 
 
 def write_deformation(
-    path: str | os.PathLike, result: DeformResult, origin: Float[np.ndarray, "3"] | None = None
+    path: str | os.PathLike,
+    result: DeformResult,
+    origin: Float[np.ndarray, "3"] | None = None,
+    background: tuple[float, float, float] | None = None,
 ) -> None:
     """Write a deforming scene to `path`, a checkpoint (`gsjax.io.checkpoints`); atomic.
 
@@ -28,8 +31,10 @@ def write_deformation(
         path: the file; its suffix is `.npz` by custom.
         result: the scene.
         origin: what it is relative to, where the recording lies far from 0; kept beside it.
+        background: RGB, 0 to 1, behind the scene, if it was learned before one; kept beside it.
     """
-    save_checkpoint(path, result, {} if origin is None else {"origin": origin.tolist()})
+    beside = {"origin": None if origin is None else origin.tolist(), "background": background}
+    save_checkpoint(path, result, {name: value for name, value in beside.items() if value is not None})
 
 
 def origin_of(path: str | os.PathLike) -> Float[np.ndarray, "3"] | None:
@@ -41,6 +46,20 @@ def origin_of(path: str | os.PathLike) -> Float[np.ndarray, "3"] | None:
     """
     origin = load_metadata(path).get("origin")
     return None if origin is None else as_numbers(Path(path), "origin", origin, (3,))
+
+
+def background_of(path: str | os.PathLike) -> tuple[float, float, float] | None:
+    """RGB, 0 to 1, behind the scene that `write_deformation` wrote; None where that is black.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: it is damaged.
+    """
+    background = load_metadata(path).get("background")
+    if background is None:
+        return None
+    red, green, blue = as_numbers(Path(path), "background", background, (3,)).tolist()
+    return red, green, blue
 
 
 def read_deformation(path: str | os.PathLike) -> DeformResult:

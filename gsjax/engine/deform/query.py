@@ -51,6 +51,7 @@ class _Seen(NamedTuple):
         gaussians: the scene in it.
         camera: its camera.
         plan: that it was drawn with.
+        background: RGB behind it; None is black.
         colors: rendered, 0 to 1.
         features: rendered, on the device.
         there: where something of the scene is drawn.
@@ -61,6 +62,7 @@ class _Seen(NamedTuple):
     gaussians: Gaussians
     camera: Camera
     plan: Plan
+    background: Float[Array, "1 3"] | None
     colors: Float[np.ndarray, "h w 3"]
     features: Float[Array, "h w c"]
     there: Bool[np.ndarray, "h w"]
@@ -75,6 +77,7 @@ class QueryableScene(Queryable):
         result: DeformResult,
         weights: Path | None = None,
         origin: Float[np.ndarray, "3"] | None = None,
+        background: tuple[float, float, float] | None = None,
     ):
         """
         Args:
@@ -82,6 +85,7 @@ class QueryableScene(Queryable):
             result: its scene.
             weights: folder of CLIP's weights (default: where they were).
             origin: what the scene is relative to.
+            background: RGB, 0 to 1, behind it in pictures (default: black).
 
         Raises:
             ValueError: the scene has no features with a meaning.
@@ -94,6 +98,7 @@ class QueryableScene(Queryable):
                 "--features"
             )
         self.result, self.meaning, self._weights = result, meaning, weights
+        self.background = None if background is None else jnp.array([background], jnp.float32)
         super().__init__(
             path,
             meaning.source.kind,
@@ -162,7 +167,7 @@ class QueryableScene(Queryable):
         pixels: dict[str, int] = {}
         prompt, threshold = found.prompt, found.threshold.value
         with VideoWriter(folder / "video.mp4", _frame_rate(result)) as video:
-            for seen in _frames(result, console):
+            for seen in _frames(result, self.background, console):
                 assert seen.gaussians.features is not None
                 selected = prompt.scores(seen.gaussians.features) > threshold
                 both = {f"frame {seen.number}": to_uint8(seen.colors)}
@@ -234,7 +239,7 @@ def label_everything(
             "query_seconds": seconds,
             "classes": {name: int((labels == label).sum()) for label, name in enumerate(result.names, 1)},
             "colors": colors,
-            "shares": _draw_labels(new, result, scene.pictured(question, frame), console),
+            "shares": _draw_labels(new, scene, scene.pictured(question, frame), console),
             "notes": notes.all,
         }
         write_json(new / "query.json", info)
@@ -242,15 +247,14 @@ def label_everything(
 
 
 def _draw_labels(
-    folder: Path, result: DeformResult, pictured: Sequence[int], console: Console
+    folder: Path, scene: QueryableScene, pictured: Sequence[int], console: Console
 ) -> dict[str, dict[str, float]]:
     """Writes label maps masks/FRAME.png and frames/FRAME.png of some frames, and video.mp4 of all: the scene
     beside what each pixel most likely is. Returns, by frame, the share of the picture that each name has."""
-    assert result.meaning is not None
-    codebook = jnp.asarray(result.meaning.codebook, jnp.float32)
+    result, codebook = scene.result, jnp.asarray(scene.meaning.codebook, jnp.float32)
     shares: dict[str, dict[str, float]] = {}
     with VideoWriter(folder / "video.mp4", _frame_rate(result)) as video:
-        for seen in _frames(result, console):
+        for seen in _frames(result, scene.background, console):
             likely = np.asarray(probabilities_of(seen.features, codebook))
             labels = np.where(seen.there, 1 + most_likely(likely), 0)
             colors = to_uint8(seen.colors)
@@ -272,19 +276,22 @@ def _frame_rate(result: DeformResult) -> float:
     return frame_rate(result.timeline.times * result.timeline.seconds)
 
 
-def _frames(result: DeformResult, console: Console) -> Iterator[_Seen]:
+def _frames(
+    result: DeformResult, background: Float[Array, "1 3"] | None, console: Console
+) -> Iterator[_Seen]:
     """All frames, one after the other."""
     plan = None
     for t in track(range(len(result.timeline.times)), "drawing", console=console, transient=True):
         gaussians, camera = result.at(result.timeline.times[t]), result.camera(t)
-        drawn, plan = render_with_room(gaussians, camera, plan)
+        drawn, plan = render_with_room(gaussians, camera, plan, backgrounds=background)
         assert drawn.features is not None
         there = np.asarray(drawn.alphas[0]) > _OPAQUE
-        scene, number = (gaussians, camera, plan), int(result.timeline.frame_ids[t])
+        scene, number = (gaussians, camera, plan, background), int(result.timeline.frame_ids[t])
         yield _Seen(t, number, *scene, np.asarray(drawn.colors[0]), drawn.features[0], there)
 
 
 def _picture(gaussians: Gaussians, seen: _Seen) -> np.ndarray:
     """Colours of a scene that stands as another does; drawn as that was, with features, for compiling takes
     longer than drawing these."""
-    return to_uint8(np.asarray(render_with_room(gaussians, seen.camera, seen.plan)[0].colors[0]))
+    drawn, _ = render_with_room(gaussians, seen.camera, seen.plan, backgrounds=seen.background)
+    return to_uint8(np.asarray(drawn.colors[0]))

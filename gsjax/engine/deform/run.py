@@ -18,7 +18,7 @@ from gsjax.data.open import is_photographs, is_recording, open_photographs
 from gsjax.data.ordered import open_as_sequence
 from gsjax.engine.budget import Budget, note_if_few
 from gsjax.engine.deform.data import Tools, deform_data
-from gsjax.engine.deform.depth import Depth, DepthSource, with_depth
+from gsjax.engine.deform.depth import METRIC, Depth, DepthSource, with_depth
 from gsjax.engine.deform.file import NAME, write_deformation
 from gsjax.engine.deform.poses import as_refined
 from gsjax.engine.deform.results import summarize
@@ -62,8 +62,9 @@ class Options(TeacherOptions, OfDataset):
     tool_values: Annotated[tuple[int, ...], tyro.conf.arg(metavar="VALUE")] = ()
     """Mask values that are tools, whatever their names."""
     depth: Depth = "auto"
-    """Source of the depth: data (files), stereo (matching the training camera with the next one) or plane (no
-    depth: the scene starts as a plane, and lengths have no unit). auto: the first that is available."""
+    """Source of the depth: data (files), stereo (matching the training camera with the next one), or none:
+    hull (the scene starts as random points within what most frames show, as suits a camera that goes around
+    it) or plane (it starts as a plane, and lengths have no unit). auto: the first that is available."""
     deform: DeformConfig = field(default_factory=lambda: PRESETS["surst"])
     """Settings of the scene and its training."""
 
@@ -93,10 +94,16 @@ def run(options: Options) -> int:
             only += ": colours alone are learned, without meaning or graph"
             notes.add(f"{only}.")
             console.print(f"{only}; for gsjax query and ask: --tools draw, or --features", soft_wrap=True)
-        method, metric = Deform(options.deform), source != "plane"
+        method, metric = Deform(options.deform), source in METRIC
         with stage(console, "placing the first Gaussians"):
-            timeline = data.timeline(metric)
-            problem, run = method.start(data.frames, data.lesson, first=data.first, timeline=timeline)
+            problem, run = method.start(
+                data.frames,
+                data.lesson,
+                first=data.first,
+                timeline=data.timeline(metric),
+                background=sequence.background,
+                hull=source == "hull",
+            )
         progress = Progress({"frames, depth, masks, poses and features": data.digest()})
         if options.resume:
             run, progress = load_run(folder.resume, run, progress)
@@ -110,7 +117,7 @@ def run(options: Options) -> int:
         watch(ticks, progress, schedule, folder, console, budget=budget)
         run, result = ticks.run, ticks.result
         data, refined = as_refined(folder, problem, run.params, data, notes)
-        write_deformation(folder.path / NAME, result, sequence.origin)
+        write_deformation(folder.path / NAME, result, sequence.origin, sequence.background)
         write_scene(folder.scene, jax.device_get(result.at(0.0)), origin=sequence.origin)
         with stage(console, "scoring held-out frames"):
             judged = judge(folder, result, run.plans[PLAN], data, options.tools, budget)

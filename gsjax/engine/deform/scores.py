@@ -1,7 +1,7 @@
 """Scores of a deforming scene: held-out frames and their neighbours in time, the other eye, classes, and
 tracks if the ground truth has any."""
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from functools import partial
 from time import perf_counter
@@ -72,26 +72,27 @@ def judge(
         budget: the time that is left; of more frames than it allows, some are scored.
     """
     memory = peak_memory_mb()  # of learning, before anything is scored
-    scene, moving = result.scene, result.moving
+    scene, moving, background = result.scene, result.moving, data.sequence.background
+    drawn_at = partial(draw, scene, moving, plan=plan, background=background)
     which = data.test or data.train[:: max(1, len(data.train) // _SHOWN)][:_SHOWN]
     rows: list[dict[str, Any]] = []
     overlap = LabelOverlap()
     for t in which if budget is None else budget.affordable(which):
         frame = data.frame(t, 0, tools)
-        drawn = draw(scene, moving, frame, plan)
+        drawn = drawn_at(frame)
         number = data.sequence.frame_ids[t]
         path = folder.path / "test" / f"{number:06d}.png"
         path.parent.mkdir(parents=True, exist_ok=True)
         write_png(path, to_uint8(drawn.colors))
         row = {"frame": number, **_of_frame(drawn, frame), **_of_classes(drawn, frame, data, t, overlap)}
         neighbor = t + 1 if t + 1 < data.sequence.num_frames else t - 1
-        if neighbor >= 0:
+        if neighbor >= 0 and data.sequence.splits is None:  # frames of a split are seldom a film
             beside = data.frame(neighbor, 0, tools)
-            pair = [(drawn.colors, frame), (draw(scene, moving, beside, plan).colors, beside)]
+            pair = [(drawn.colors, frame), (drawn_at(beside).colors, beside)]
             row |= over_time(pair if neighbor > t else pair[::-1])
         if _other_counts(data, t, tools):
             other = data.frame(t, 1, tools)
-            there = draw(scene, moving, other, plan).colors
+            there = drawn_at(other).colors
             row["psnr_other"] = psnr(there, _photograph(other), _counted(other))
         if len(rows) < _SHOWN:
             panels = folder.render("held_out" if data.test else "learned", number)
@@ -102,7 +103,7 @@ def judge(
     test |= _means_of_classes(overlap, len(data.names))
     return {
         "judged_by": "held out" if data.test else "learned",
-        "test": test | {"fps": _fps(scene, moving, data.frame(0, 0, tools), plan)},
+        "test": test | {"fps": _fps(drawn_at, data.frame(0, 0, tools))},
         "tracks": _tracks(scene, moving, data, tools),
         "classes": _classes(overlap, data.names),
         "memory_mb": memory,
@@ -133,21 +134,40 @@ class Drawn(NamedTuple):
     features: Float[Array, "h w c"] | None
 
 
-def draw(scene: DeformingScene, moving: Moving, frame: Frame, plan: Plan) -> Drawn:
+def draw(
+    scene: DeformingScene,
+    moving: Moving,
+    frame: Frame,
+    plan: Plan,
+    background: tuple[float, float, float] | None = None,
+) -> Drawn:
     """The scene where and when a frame of one camera was seen. Views that nothing was learned from may need a
-    larger plan, and get it."""
+    larger plan, and get it.
+
+    Args:
+        scene, moving: the scene, and where its field is evaluated.
+        frame: of one camera, on the host.
+        plan: that frames were drawn with.
+        background: RGB behind the scene, 0 to 1 (default: black).
+    """
+    behind = None if background is None else jnp.array([background], jnp.float32)
     time = jnp.asarray(0.0 if frame.time is None else frame.time, jnp.float32)
     (colors, depths, features), _ = with_room(
-        partial(_drawn, scene, moving, time, on_device(frame.cameras)), plan
+        partial(_drawn, scene, moving, time, on_device(frame.cameras), behind), plan
     )
     return Drawn(np.asarray(colors), np.asarray(depths), features)
 
 
 @jax.jit
 def _drawn(
-    scene: DeformingScene, moving: Moving, time: Float[Array, ""], camera: Camera, plan: Plan
+    scene: DeformingScene,
+    moving: Moving,
+    time: Float[Array, ""],
+    camera: Camera,
+    background: Float[Array, "1 3"] | None,
+    plan: Plan,
 ) -> tuple[tuple[Float[Array, "h w 3"], Float[Array, "h w"], Float[Array, "h w c"] | None], Meta]:
-    got = render(scene.at(time, moving), camera, plan)
+    got = render(scene.at(time, moving), camera, plan, backgrounds=background)
     colors, features = jnp.clip(got.colors[0], 0, 1), None if got.features is None else got.features[0]
     return (colors, got.depths[0], features), got.meta._replace(features=None)
 
@@ -271,12 +291,12 @@ def _difference(colors: np.ndarray, frame: Frame) -> np.ndarray:
     return to_uint8(np.clip(off if counts is None else np.where(counts[..., None], off, 0.25), 0, 1))
 
 
-def _fps(scene: DeformingScene, moving: Moving, frame: Frame, plan: Plan) -> float:
+def _fps(drawn_at: Callable[[Frame], Drawn], frame: Frame) -> float:
     """How often a second the scene is deformed and drawn; the median."""
     took = []
     for i in range(_TIMED):
         begun = perf_counter()
-        draw(scene, moving, replace(frame, time=np.asarray(i / _TIMED)), plan)
+        drawn_at(replace(frame, time=np.asarray(i / _TIMED)))
         took.append(perf_counter() - begun)
     return 1 / float(np.median(took[2:]))
 

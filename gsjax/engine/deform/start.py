@@ -1,13 +1,14 @@
 """The start of `gsjax.deform`: that of `gsjax deform`, but with all frames and silently."""
 
 import warnings
+from dataclasses import replace
 
 from rich.console import Console
 
 from gsjax.data.errors import DataWarning
 from gsjax.data.sequence import Sequence
 from gsjax.engine.deform.data import Tools, deform_data
-from gsjax.engine.deform.depth import with_depth
+from gsjax.engine.deform.depth import METRIC, with_depth
 from gsjax.engine.messages import Notes
 from gsjax.engine.teaching.choice import TeacherChoice
 from gsjax.methods.deform import Deform, Problem
@@ -37,7 +38,8 @@ def start_from(
     choice.check(optional=True)
     quiet, config = Console(quiet=True), method.config
     notes = Notes(quiet)
-    seen, source = with_depth(sequence, "auto", config.plane_depth, notes)
+    every = replace(sequence, splits=None)  # what is learned from is selected by whoever calls
+    seen, source = with_depth(every, "auto", config.plane_depth, notes)
     data = deform_data(seen, 0, tools, choice, config.channels, tool_values, notes, quiet)
     if first is not None and first not in data.train:
         raise ValueError(f"first: expected one of the training frames, {data.train}, found {first}")
@@ -48,5 +50,7 @@ def start_from(
         data.lesson,
         first=data.first if first is None else data.train.index(first),
         gaussians=gaussians,
-        timeline=data.timeline(metric=source != "plane"),
+        timeline=data.timeline(metric=source in METRIC),
+        background=seen.background,
+        hull=source == "hull",
     )

@@ -8,6 +8,7 @@ now.result.at(0.5)
 config.py     configuration, and the recipes of the two papers
 method.py     the method of the drive loop
 start.py      initial Gaussians, from the depth of all frames or on a plane
+hull.py       initial Gaussians within the visual hull of a scene that the camera goes around
 poses.py      refined camera poses
 nodes.py      the nodes at which the field is evaluated
 graph.py      the teacher's features at nodes, and the losses on their edges
@@ -36,6 +37,7 @@ from gsjax.methods.deform.graph import (
     graph_of,
     seen_ids,
 )
+from gsjax.methods.deform.hull import goes_around, hull_gaussians
 from gsjax.methods.deform.meaning import Lesson, Meaning, counted_ids, feature_prompt, text_prompt
 from gsjax.methods.deform.method import Deform, Kept, Problem, batch_of, with_field
 from gsjax.methods.deform.nodes import nodes_of
@@ -87,8 +89,10 @@ __all__ = [
     "feature_loss",
     "feature_prompt",
     "frame_graphs",
+    "goes_around",
     "graph_loss",
     "graph_of",
+    "hull_gaussians",
     "nodes_of",
     "on_grid",
     "parse_question",

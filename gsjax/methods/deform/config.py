@@ -76,8 +76,11 @@ class DeformConfig:
     plane_depth: float = 1.0
     """Distance from the first camera to the plane on which a scene without depth is initialized, in the unit
     of the poses; it makes no difference if the camera is static."""
+    hull_points: int = 20_000
+    """Number of Gaussians of a scene that is initialized within its visual hull."""
     warmup_frames: Literal["first", "all"] = "first"
-    """Frames of the warm-up: the one that the canonical scene is initialized from, or all."""
+    """Frames of the warm-up: the one that the canonical scene is initialized from, or all; all too where it
+    is initialized within its visual hull, from all."""
     refine_poses: bool = False
     """Optimize the poses of the cameras of all frames but the first."""
     nodes: int = 2048
@@ -106,6 +109,7 @@ class DeformConfig:
             iterations=(0, np.inf),
             start_pixels=(0.25, np.inf),
             plane_depth=(1e-6, np.inf),
+            hull_points=(8, np.inf),
             channels=(1, 4096),
             nodes=(0, np.inf),
             moving_share=(1e-3, 1),

@@ -14,6 +14,7 @@ from gsjax.geometry.cameras import on_device
 from gsjax.losses.extra import ExtraLosses, named_losses
 from gsjax.methods.deform.config import DeformConfig
 from gsjax.methods.deform.graph import FrameGraph, frame_graphs
+from gsjax.methods.deform.hull import hull_gaussians
 from gsjax.methods.deform.meaning import Lesson, counted_ids
 from gsjax.methods.deform.nodes import far_apart, nodes_of
 from gsjax.methods.deform.poses import refined_viewmats, times_of
@@ -46,10 +47,11 @@ class Problem(NamedTuple):
         seen: the same frames on the device.
         ids: the teacher's ids where pixels count, on the device; None without a teacher.
         codebook: codebook of the teacher, on the device; None without.
-        first: index of the frame that the canonical scene is initialized from.
+        first: index of the frame that the canonical scene is initialized from; None if from all of them.
         radius: radius of the scene, metres; the unit of learning rates.
         bounds: box of the deformation field, around the initial Gaussians, metres.
         timeline: the frames of the whole recording, for the result.
+        background: RGB behind the scene, on the device; None is black.
     """
 
     frames: Sequence[Frame]
@@ -57,10 +59,11 @@ class Problem(NamedTuple):
     seen: list[Frame]
     ids: list[Int[Array, "h w"]] | None
     codebook: Float[Array, "k channels"] | None
-    first: int
+    first: int | None
     radius: float
     bounds: Float[np.ndarray, "2 3"]
     timeline: Timeline
+    background: Float[Array, "1 3"] | None = None
 
 
 class Kept(NamedTuple):
@@ -100,6 +103,8 @@ class Deform:
         first: int | None = None,
         gaussians: Gaussians | None = None,
         timeline: Timeline | None = None,
+        background: tuple[float, float, float] | None = None,
+        hull: bool = False,
     ) -> tuple[Problem, Run]:
         """A reconstruction before its first step.
 
@@ -112,16 +117,24 @@ class Deform:
             gaussians: initial canonical Gaussians; invalid ones are removed (default: from depth, or on the
                 plane).
             timeline: frames of the whole recording, for the result (default: `frames`).
+            background: RGB behind the scene, 0 to 1 (default: black).
+            hull: whether the camera goes around the scene, which is then initialized within its visual hull,
+                from all frames alike.
 
         Raises:
-            ValueError: frames differ in size, no pixel counts, no depth is known, or the teacher's labels do
-                not fit.
+            ValueError: frames differ in size, no pixel counts, no depth is known, the teacher's labels do not
+                fit, or poses are to be refined of frames that share a time.
         """
         config = self.config
         _check(frames, config, lesson)
-        if first is None:
+        if hull:
+            first = None
+            if gaussians is None:
+                gaussians = hull_gaussians(frames, background, config.hull_points, config.seed)
+        elif first is None:
             first = next((i for i, frame in enumerate(frames) if can_start_from(frame, frames)), 0)
         if gaussians is None:
+            assert first is not None
             flat = all(frame.depths is None for frame in frames)
             posed = with_plane_depths(frames, first, config.plane_depth) if flat else frames
             gaussians = start_gaussians(posed, first, config.start_pixels)
@@ -141,7 +154,8 @@ class Deform:
             ids = [jnp.asarray(one, jnp.int32) for one in counted]
             codebook = jnp.asarray(lesson.codebook, jnp.result_type(float))
         timeline = timeline_of(frames) if timeline is None else timeline
-        problem = Problem(frames, lesson, seen, ids, codebook, first, radius, bounds, timeline)
+        behind = None if background is None else jnp.array([background], jnp.result_type(float))
+        problem = Problem(frames, lesson, seen, ids, codebook, first, radius, bounds, timeline, behind)
         cameras = jax.tree.map(lambda *arrays: jnp.concatenate(arrays), *(frame.cameras for frame in seen))
         plans = {PLAN: plan_render(scene.gaussians, cameras, headroom=HEADROOM)}
         return problem, Run(scene, jax.jit(self.step.init)(scene), plans=plans, kept=Kept())
@@ -175,9 +189,8 @@ class Deform:
     def batch(self, problem: Problem, run: Run, progress: float) -> tuple[Batch, tuple[str, ...]]:
         """The next frame: the initial one in the warm-up (`config.warmup_frames`); else all in random order,
         shuffled again for each pass. Arguments as for `Method.batch`."""
-        if run.step < self.config.warmup and self.config.warmup_frames == "first":
-            i = problem.first
-        else:
+        i = problem.first if self.config.warmup_frames == "first" else None
+        if i is None or run.step >= self.config.warmup:
             i = shuffled_index(self.config.seed, run.step, len(problem.seen))
         return batch_of(problem, run, i), (PLAN,)
 
@@ -208,7 +221,8 @@ def batch_of(problem: Problem, run: Run, i: int) -> Batch:
     ids = None if problem.ids is None else problem.ids[i]
     moving, graphs = run.kept
     graph = None if graphs is None else graphs[i]
-    return Batch(problem.seen[i], view, ids, problem.codebook, moving, graph, problem.radius, run.plans[PLAN])
+    given = (problem.codebook, moving, graph, problem.radius, run.plans[PLAN], problem.background)
+    return Batch(problem.seen[i], view, ids, *given)
 
 
 def with_field(
@@ -297,6 +311,12 @@ def _check(frames: Sequence[Frame], config: DeformConfig, lesson: Lesson | None)
     if not any(frame.masks is None or frame.masks.any() for frame in frames):
         raise ValueError(
             "masks: expected pixels that count, found none in any frame; are the masks inverted?"
+        )
+    times = [float(frame.time) for frame in frames if frame.time is not None]
+    if config.refine_poses and len(set(times)) < len(times):
+        raise ValueError(
+            f"refine_poses: expected frames at different times, between which poses are interpolated, found "
+            f"{len(times)} at {len(set(times))} times; turn it off"
         )
     if lesson is None:
         return

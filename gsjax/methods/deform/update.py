@@ -101,6 +101,7 @@ class Batch(NamedTuple):
         graph: graph of the frame and those around it; None without.
         radius: radius of the scene, the unit of learning rates and of the depth error.
         plan: plan for rendering.
+        background: RGB behind the scene; None is black.
     """
 
     frame: Frame
@@ -111,6 +112,7 @@ class Batch(NamedTuple):
     graph: FrameGraph | None
     radius: Float[Array, ""] | float
     plan: Plan
+    background: Float[Array, "1 3"] | None = None
 
 
 def deform_loss(config: DeformConfig, extra_losses: ExtraLosses = ()) -> Callable:
@@ -136,7 +138,7 @@ def deform_loss(config: DeformConfig, extra_losses: ExtraLosses = ()) -> Callabl
                 terms["rigid"] = weights.rigidity * _strain(scene.gaussians, offsets, batch.moving)
         else:
             there = scene.at(time, batch.moving)
-        drawn = render(there, camera, batch.plan)
+        drawn = render(there, camera, batch.plan, backgrounds=batch.background)
         target = frame.colors
         # Pixels that do not count are the photograph's: they add neither a gradient nor an edge.
         image = jnp.where(frame.masks[..., None], drawn.colors, target)

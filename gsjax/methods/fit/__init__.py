@@ -10,6 +10,7 @@ slots (3DGS-MCMC, Kheradmand et al. 2024).
     method.py  the method, for the loop  pruning.py  removal of unneeded Gaussians
 """
 
+from gsjax.geometry.extent import Extent, extent_of
 from gsjax.methods.fit.config import (
     PRESETS,
     FitConfig,
@@ -21,7 +22,6 @@ from gsjax.methods.fit.config import (
 from gsjax.methods.fit.method import Fit, Problem, refined_frames
 from gsjax.methods.fit.model import Model
 from gsjax.methods.fit.pruning import light_of, needed, prune
-from gsjax.methods.fit.start import Extent, extent_of
 from gsjax.methods.fit.update import Batch, fit_loss, grow
 from gsjax.methods.fit.update import fit_step as step
 

@@ -13,11 +13,12 @@ import numpy as np
 from jaxtyping import Float
 
 from gsjax.geometry.cameras import on_device
+from gsjax.geometry.extent import Extent, extent_of
 from gsjax.losses.extra import ExtraLosses, named_losses
 from gsjax.methods.fit.config import FitConfig
 from gsjax.methods.fit.model import Model, carried_over, model_of, refined, with_degree, with_slots
 from gsjax.methods.fit.padding import with_common_sizes
-from gsjax.methods.fit.start import Extent, extent_of, initial_gaussians, start_points
+from gsjax.methods.fit.start import initial_gaussians, start_points
 from gsjax.methods.fit.update import Batch, fit_step, grow, slots_wanted, split
 from gsjax.methods.sampling import shuffled_index
 from gsjax.optim.compiler import host_options
