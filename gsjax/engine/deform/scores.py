@@ -104,7 +104,7 @@ def judge(
     return {
         "judged_by": "held out" if data.test else "learned",
         "test": test | {"fps": _fps(drawn_at, data.frame(0, 0, tools))},
-        "tracks": _tracks(scene, moving, data, tools),
+        "tracks": track_errors(scene, moving, data, tools),
         "classes": _classes(overlap, data.names),
         "memory_mb": memory,
         "scores": rows,
@@ -301,8 +301,17 @@ def _fps(drawn_at: Callable[[Frame], Drawn], frame: Frame) -> float:
     return 1 / float(np.median(took[2:]))
 
 
-def _tracks(scene: DeformingScene, moving: Moving, data: DeformData, tools: Tools) -> dict[str, float] | None:
-    """How far points that the first frame sees are from where they truly are; None without truth."""
+def track_errors(
+    scene: DeformingScene, moving: Moving, data: DeformData, tools: Tools
+) -> dict[str, float] | None:
+    """How far points that the first frame sees are from where they truly are, over all later frames, and how
+    far they would be if nothing moved; None without truth.
+
+    Args:
+        scene, moving: the scene, and where its field is evaluated.
+        data: the recording.
+        tools: whether points on tools count.
+    """
     truth, count = data.sequence.truth, data.sequence.num_frames
     if truth is None or truth.tracks is None or count < 2:
         return None
