@@ -83,3 +83,17 @@ class TestStrain:
         np.testing.assert_allclose(
             pseudo_huber(jnp.square(lengths), 0.1), [0, 1e-8 / 0.2, 1e3 - 0.1], rtol=1e-4, atol=1e-15
         )
+
+    def test_a_point_that_left_is_drawn_back_by_its_neighbours(self):
+        rest = jnp.asarray(points())
+
+        def penalty(moved):
+            return pseudo_huber(strains(rest, moved, np.tile(np.eye(3), (4, 1, 1))), 0.1).sum()
+
+        @jax.jit
+        def descended(moved):
+            return jax.lax.fori_loop(0, 3000, lambda _, at: at - 3e-3 * jax.grad(penalty)(at), moved)
+
+        moved = np.asarray(descended(rest.at[2, 0].add(3.0)))
+        apart = moved - np.asarray(rest)
+        np.testing.assert_allclose(apart, np.broadcast_to(apart.mean(0), (4, 3)), atol=0.1)
