@@ -178,14 +178,14 @@ def drive(
 
 def _guarded(before: Run, run: Run) -> Run:
     """The run with a guard, which begins anew where losses can no longer be compared: with other parameters,
-    other constants, or a plan for pictures of another size."""
+    other constants, a plan for pictures of another size, or where `between` dropped it."""
     old, new = (jax.tree.leaves((one.params, one.kept)) for one in (before, run))
     is_same = (
         len(old) == len(new) and all(map(operator.is_, old, new)) and set(run.plans) <= set(before.plans)
     )
     if run.guard is not None and is_same:
         return run
-    return run.having(guard=begun(run.guard))
+    return run.having(guard=begun(before.guard))
 
 
 @lru_cache(maxsize=4)

@@ -57,7 +57,7 @@ class Guard(eqx.Module):
         guard = replace(self, steps=self.steps + 1, losses=(*self.losses, loss)[-window:])
         if guard.steps % window:
             return guard, params
-        if guard._is_worse(guard.losses, _LOST, _LOST_SIGMA):
+        if guard.best is not None and guard._is_worse(guard.losses, _LOST, _LOST_SIGMA):
             return guard._returned()
         now = float(np.mean(guard.losses)), float(np.std(guard.losses))
         is_level = not replace(guard, least=now)._is_worse(guard.losses[-_TAIL:], 0.0, _WORSE_SIGMA)

@@ -78,7 +78,7 @@ class Method(Protocol[Problem]):
 
     def between(self, problem: Problem, run: Run, progress: float) -> Run:
         """The run for the next step, after changes of shape: densification, new parts, a graph, new plans.
-        Arrays of `run` may be donated.
+        Arrays of `run` may be donated. A run is returned without its guard where the loss becomes another.
 
         Args:
             problem: the data, which does not change.

@@ -109,12 +109,15 @@ def steady_adam(
 
     def update(gradients, state, params=None):
         count = optax.safe_increment(state.count)
-        nu = optax.tree.update_moment_per_elem_norm(gradients, state.nu, b2, 2)
-        roots = jax.tree.map(jnp.sqrt, optax.tree.bias_correction(nu, b2, count))
+
+        def corrected(moment, decay):
+            return moment / (1 - decay**count).astype(moment.dtype)
+
+        nu = jax.tree.map(lambda v, g: b2 * v + (1 - b2) * jnp.square(g), state.nu, gradients)
+        roots = jax.tree.map(lambda v: jnp.sqrt(corrected(v, b2)), nu)
         limited = jax.tree.map(lambda g, root: jnp.clip(g, -_MOST * root, _MOST * root), gradients, roots)
-        mu = optax.tree.update_moment(limited, state.mu, b1, 1)
-        means = optax.tree.bias_correction(mu, b1, count)
-        moves = jax.tree.map(lambda mean, root: mean / (root + eps), means, roots)
+        mu = jax.tree.map(lambda m, g: b1 * m + (1 - b1) * g, state.mu, limited)
+        moves = jax.tree.map(lambda m, root: corrected(m, b1) / (root + eps), mu, roots)
         return moves, optax.ScaleByAdamState(count, mu, nu)
 
     scale = optax.GradientTransformation(optax.scale_by_adam().init, update)

@@ -26,6 +26,7 @@ class DescentConfig:
     steep_after: int = 10_000  # the step after which the slope is many times as steep
     nan_after: int = 10_000  # the step after which nothing is finite
     anew_at: int = -1  # the step before which all parameters are replaced
+    harder_after: int = 10_000  # the step from which on another loss is added, and the guard dropped
 
 
 @dataclass(frozen=True)
@@ -41,6 +42,7 @@ class Descent:
             rate = jnp.where(step > config.steep_after, 3.5, 0.02)  # beyond 2, it diverges
             params = params - rate * jnp.where(step > config.nan_after, jnp.nan, params)
             loss = jnp.square(params).sum() + 1e-3
+            loss += jnp.where(step >= config.harder_after, 5.0, 0.0)
             loss *= 1 + config.noise * jax.random.normal(key)
             false = jnp.asarray(False)
             info = {"loss": loss, "skipped": false, "overflow": false, "needed": jnp.int32(0)}
@@ -56,6 +58,8 @@ class Descent:
         return self.config.steps
 
     def between(self, problem, run: Run, progress: float) -> Run:
+        if run.step == self.config.harder_after:
+            return run.having(guard=None)
         return run.having(params=3 * jnp.ones(SIZE)) if run.step == self.config.anew_at else run
 
     def batch(self, problem, run: Run, progress: float):
@@ -130,6 +134,14 @@ def test_a_run_that_is_resumed_is_the_same_to_the_bit(tmp_path, at):
         pass
     np.testing.assert_array_equal(again.result, whole.result)
     assert again.run.guard.returns == whole.run.guard.returns
+
+
+def test_a_loss_that_becomes_another_begins_anew_and_returns_are_counted_on():
+    ticks, infos = descended(harder_after=600)
+    assert float(infos[-1]["loss"]) > 5
+    assert ticks.run.guard.returns == 0
+    again, _ = descended(harder_after=600, steep_after=430)
+    assert again.run.guard.returns >= 1
 
 
 def test_new_parameters_begin_anew():

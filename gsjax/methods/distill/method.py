@@ -14,7 +14,7 @@ from gsjax.methods.distill.config import DistillConfig
 from gsjax.methods.distill.field import active_table, init_field
 from gsjax.methods.distill.result import DistillResult
 from gsjax.methods.distill.teacher import Teacher, max_rows, view_codebook
-from gsjax.methods.distill.update import Batch, distill_step
+from gsjax.methods.distill.update import Batch, contrast_begins, distill_step
 from gsjax.methods.sampling import shuffled_index
 from gsjax.optim.method import Run
 from gsjax.optim.step import Step
@@ -97,8 +97,9 @@ class Distill:
         return self.config.iterations
 
     def between(self, problem: Problem, run: Run, progress: float) -> Run:
-        """The run unchanged, as shapes are constant and views frozen. Arguments as for `Method.between`."""
-        return run
+        """The run, without its guard as the contrastive loss begins. Arguments as for `Method.between`."""
+        begins = self.config.weights.contrast and run.step == contrast_begins(self.config)
+        return run.having(guard=None) if begins else run
 
     def batch(self, problem: Problem, run: Run, progress: float) -> tuple[Batch, tuple[str, ...]]:
         """The next view, in shuffled order, with its own plan. Arguments as for `Method.batch`."""

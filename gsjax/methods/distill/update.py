@@ -2,6 +2,7 @@
 (FD-3DGS, section 3.4).
 """
 
+import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -76,6 +77,11 @@ def distill_step(config: DistillConfig) -> Step:
     return gradient_step(distill_loss(config), per_field_adam(schedules))
 
 
+def contrast_begins(config: DistillConfig) -> int:
+    """The step from which on the contrastive loss counts."""
+    return math.ceil(config.contrast_after * config.iterations)
+
+
 def distill_loss(config: DistillConfig) -> Callable:
     """`loss(field, batch, *, step, key)` of one view (FD-3DGS, eq. 8).
 
@@ -98,7 +104,7 @@ def distill_loss(config: DistillConfig) -> Callable:
         if weights.contrast:
             assert pooled is not None
             aux["contrast"] = jax.lax.cond(
-                jnp.asarray(step) >= config.contrast_after * config.iterations,
+                jnp.asarray(step) >= contrast_begins(config),
                 lambda: _contrast(pooled, pooled_ids(batch.ids, edge), corner, config),
                 lambda: jnp.zeros((), pooled.dtype),
             )
