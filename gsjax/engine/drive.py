@@ -19,7 +19,7 @@ import jax.numpy as jnp
 
 from gsjax.engine.interrupts import raise_if_interrupted, shielded
 from gsjax.optim.compiler import compile_seconds, host_options
-from gsjax.optim.guard import begun, shortened, window_of
+from gsjax.optim.guard import Guard, begun, shortened, window_of
 from gsjax.optim.method import Method, Run
 from gsjax.optim.traces import jit_once
 from gsjax.rasterize.plan import HEADROOM
@@ -135,18 +135,18 @@ class Drive(Iterator[Tick]):
 
     def _one_step(self, progress: float) -> Tick:
         clock, method, problem = Clock(), self.method, self.problem
-        self.run = _guarded(self.run, method.between(problem, self.run, progress))
+        before, self.run = self.run, method.between(problem, self.run, progress)
+        guard = _guard_of(before, self.run)
         while True:
             run, step = self.run, jnp.asarray(self.run.step)
             batch, names = method.batch(problem, run, progress)
-            inputs = run.params, run.state, run.guard.share
+            inputs = run.params, run.state, guard.share
             params, state, info = self._advance(*inputs, batch, step, self._key)
             self.run = run.having(params=params, state=state)
             overflow, skipped, loss = jax.device_get([info[name] for name in ("overflow", "skipped", "loss")])
             if not overflow:
                 break
             self.run = self.run.grown(names, info["needed"], self._headroom)
-        guard = self.run.guard
         if not skipped:
             guard, params = guard.watched(float(loss), params, self._window)
         self.run = self.run.having(params=params, guard=guard, step=run.step + 1)
@@ -176,16 +176,14 @@ def drive(
     return Drive(method, problem, run, progress, headroom)
 
 
-def _guarded(before: Run, run: Run) -> Run:
-    """The run with a guard, which begins anew where losses can no longer be compared: with other parameters,
-    other constants, a plan for pictures of another size, or where `between` dropped it."""
+def _guard_of(before: Run, run: Run) -> Guard:
+    """The guard of the next step. It begins anew where losses can no longer be compared: with other
+    parameters, other constants, a plan for pictures of another size, or where `between` dropped it."""
     old, new = (jax.tree.leaves((one.params, one.kept)) for one in (before, run))
-    is_same = (
-        len(old) == len(new) and all(map(operator.is_, old, new)) and set(run.plans) <= set(before.plans)
-    )
-    if run.guard is not None and is_same:
-        return run
-    return run.having(guard=begun(before.guard))
+    is_same = len(old) == len(new) and all(map(operator.is_, old, new))
+    if run.guard is not None and is_same and set(run.plans) <= set(before.plans):
+        return run.guard
+    return begun(before.guard)
 
 
 @lru_cache(maxsize=4)
