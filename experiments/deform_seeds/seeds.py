@@ -12,7 +12,7 @@ from rich.console import Console
 import gsjax
 from gsjax.engine.deform.data import DeformData, deform_data
 from gsjax.engine.deform.scores import draw, track_errors
-from gsjax.engine.drive import Drive, drive
+from gsjax.engine.drive import Drive, Tick, drive
 from gsjax.engine.messages import Notes
 from gsjax.engine.teaching.choice import NO_TEACHER, TeacherChoice
 from gsjax.methods.deform import PRESETS, Deform
@@ -33,25 +33,23 @@ def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
     config = replace(PRESETS["surst"], seed=seed)
     method = Deform(config)
     ticks = drive(method, *method.start(data.frames))
-    curve = np.array([float(now.info["psnr"]) for now in ticks])
-    joint = curve[config.warmup :]
-    best = float(np.convolve(joint, np.full(WINDOW, 1 / WINDOW), "valid").max())
-    reached = _psnr(ticks, data, data.train)
+    learned = (now for now in ticks if now.step > config.warmup and now.step % WINDOW == 0)
+    curve = [_psnr(now, data, data.train) for now in learned]
     return {
-        "psnr": reached,
-        "best": best,
-        "lost": max(0.0, best - reached),
-        "held_out": _psnr(ticks, data, data.test),
-        "curve": curve.reshape(-1, WINDOW).mean(1).round(3).tolist(),
+        "psnr": curve[-1],
+        "best": max(curve),
+        "lost": max(curve) - curve[-1],
+        "held_out": _psnr(ticks.tick, data, data.test),
+        "curve": np.round(curve, 3).tolist(),
         "farthest": _farthest(ticks),
         "returns": ticks.run.guard.returns,
         **(track_errors(ticks.result.scene, ticks.result.moving, data, "leave-out") or {}),
     }
 
 
-def _psnr(ticks: Drive, data: DeformData, frames: list[int]) -> float:
+def _psnr(now: Tick, data: DeformData, frames: list[int]) -> float:
     """Mean PSNR of frames where pixels count."""
-    scene, moving, plan = ticks.result.scene, ticks.result.moving, ticks.run.plans[PLAN]
+    scene, moving, plan = now.result.scene, now.result.moving, now.run.plans[PLAN]
     found = []
     for t in frames:
         frame = data.frame(t, 0, "leave-out")

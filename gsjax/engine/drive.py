@@ -16,6 +16,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from gsjax.engine.interrupts import raise_if_interrupted, shielded
 from gsjax.optim.compiler import compile_seconds, host_options
@@ -102,7 +103,7 @@ class Drive(Iterator[Tick]):
     ):
         self.method, self.problem, self.run, self.tick = method, problem, run, None
         total = method.total(problem)
-        self._window = window_of(total)
+        self._window = window_of(total, method.period(problem))
         self._progress = (lambda step: step / total if total else 1.0) if progress is None else progress
         self._headroom = headroom
         self._advance = _compiled(method)
@@ -114,7 +115,6 @@ class Drive(Iterator[Tick]):
     def __next__(self) -> Tick:
         raise_if_interrupted()
         if (progress := self._progress(self.run.step)) >= 1:
-            shielded(self.settle)
             raise StopIteration
         return shielded(self._one_step, progress)
 
@@ -124,7 +124,8 @@ class Drive(Iterator[Tick]):
         return self.method.result(self.problem, self.run) if self.tick is None else self.tick.result
 
     def settle(self) -> None:
-        """End at the best parameters, if the latest are worse. Done by itself where the progress ends."""
+        """End at the best parameters, if the latest are worse. The last step does it by itself, so that it
+        is for runs that end before."""
         guard = self.run.guard
         if guard is None:
             return
@@ -135,8 +136,9 @@ class Drive(Iterator[Tick]):
 
     def _one_step(self, progress: float) -> Tick:
         clock, method, problem = Clock(), self.method, self.problem
-        before, self.run = self.run, method.between(problem, self.run, progress)
-        guard = _guard_of(before, self.run)
+        run = method.between(problem, self.run, progress)
+        guard = _guard_of(self.run, run)
+        self.run = run.having(guard=guard)
         while True:
             run, step = self.run, jnp.asarray(self.run.step)
             batch, names = method.batch(problem, run, progress)
@@ -147,9 +149,11 @@ class Drive(Iterator[Tick]):
             if not overflow:
                 break
             self.run = self.run.grown(names, info["needed"], self._headroom)
-        if not skipped:
-            guard, params = guard.watched(float(loss), params, self._window)
+        loss = np.nan if skipped else float(loss)
+        guard, params = guard.watched(loss, params, run.step + 1, self._window)
         self.run = self.run.having(params=params, guard=guard, step=run.step + 1)
+        if self._progress(self.run.step) >= 1:
+            self.settle()
         self.tick = announced(Tick(method, problem, self.run, info, *clock.read(), progress))
         return self.tick
 
@@ -178,12 +182,10 @@ def drive(
 
 def _guard_of(before: Run, run: Run) -> Guard:
     """The guard of the next step. It begins anew where losses can no longer be compared: with other
-    parameters, other constants, a plan for pictures of another size, or where `between` dropped it."""
+    parameters or constants, or where `between` dropped it."""
     old, new = (jax.tree.leaves((one.params, one.kept)) for one in (before, run))
     is_same = len(old) == len(new) and all(map(operator.is_, old, new))
-    if run.guard is not None and is_same and set(run.plans) <= set(before.plans):
-        return run.guard
-    return begun(before.guard)
+    return run.guard if run.guard is not None and is_same else begun(before.guard)
 
 
 @lru_cache(maxsize=4)

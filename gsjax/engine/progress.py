@@ -83,12 +83,8 @@ class Progress:
     def metadata(self) -> dict[str, Any]:
         """The metadata of a checkpoint."""
         recent = [{name: float(a) for name, a in info.items()} for info in jax.device_get(self.recent)]
-        kept = ("rows", "seconds", "compile_seconds")
-        return (
-            {name: getattr(self, name) for name in kept}
-            | self.mishaps
-            | {"about": dict(self.about), "recent": recent}
-        )
+        kept = ("rows", "seconds", "compile_seconds", "skipped")
+        return {name: getattr(self, name) for name in kept} | {"about": dict(self.about), "recent": recent}
 
     def found(self, steps: int, begun: float) -> dict[str, Any]:
         """The part of metrics.json about the progress.
@@ -158,7 +154,7 @@ def watch(
     listeners: tuple[Callable[[Mapping[str, Any]], None], ...] = (),
 ) -> Progress:
     """Run until all steps are done, the time is up, Ctrl-C or an error. `ticks.run` is then the newest run,
-    or the best if that is worse.
+    or the best if that is worse; where it is enough, the newest.
 
     Args:
         ticks: the method, from `drive`.
@@ -173,6 +169,7 @@ def watch(
         listeners: called with each new row.
     """
     saver, budget = Saver(schedule.doing, save_every), budget or Budget(None, perf_counter())
+    is_enough = False
     budget.begin_steps(progress.used_seconds, console)
 
     def save(last: bool) -> None:
@@ -189,7 +186,7 @@ def watch(
                     for listen in listeners:
                         listen(row)
                 display.show()
-                if row is not None and enough is not None and enough(now, row):
+                if row is not None and enough is not None and (is_enough := enough(now, row)):
                     break
                 save(last=False)
                 raise_if_interrupted()
@@ -198,7 +195,8 @@ def watch(
                 raise  # a failed step has consumed the run; --resume has an earlier one
             progress.stopped = stopped
         save(last=True)
-    ticks.settle()
+    if not is_enough:
+        shielded(ticks.settle)
     if (guard := ticks.run.guard) is not None:
         progress.returns = guard.returns
     return progress
@@ -220,9 +218,14 @@ def note_if_cut_short(progress: Progress, schedule: Schedule, steps: int, notes:
 
 
 def warn_of_mishaps(progress: Progress, notes: Notes) -> None:
-    """Warn of steps that changed nothing, because a number was not finite, and of losses that were lost."""
+    """Warn of steps that changed nothing, because a number was not finite, and of returns."""
     if progress.skipped:
         notes.warn(f"{counted(progress.skipped, 'step')} produced non-finite numbers and changed nothing")
+    warn_of_returns(progress, notes)
+
+
+def warn_of_returns(progress: Progress, notes: Notes) -> None:
+    """Warn of returns to the best parameters, because the loss was lost."""
     if progress.returns:
         notes.warn(
             f"the loss was lost {counted(progress.returns, 'time')}, and the run went back to the best it "

@@ -24,6 +24,7 @@ from gsjax.methods.fit import Fit, FitConfig, prune
 from gsjax.methods.parts import Parts, PartsConfig, begin
 from gsjax.methods.parts.pictures import Problem as PartsProblem
 from gsjax.methods.protocols import Segmenter
+from gsjax.optim.method import Method, Run
 from gsjax.scene.gaussians import Gaussians
 
 if TYPE_CHECKING:
@@ -60,7 +61,7 @@ def fit(
     config, cloud = start_from(photographs, frames, FitConfig() if config is None else config)
     method = Fit(config, extra_losses)
     problem, run = method.start(frames, cloud, photographs.background)
-    return drive(method, problem, run if after is None else after.run)
+    return drive(method, problem, run if after is None else _going_on(after, method))
 
 
 def deform(
@@ -108,7 +109,7 @@ def deform(
 
     method = Deform(DeformConfig() if config is None else config, extra_losses)
     problem, run = start_from(method, sequence, teacher, tools, tool_values, first, gaussians)
-    return drive(method, problem, run if after is None else after.run)
+    return drive(method, problem, run if after is None else _going_on(after, method))
 
 
 def distill(
@@ -148,7 +149,7 @@ def distill(
     teacher, source = teacher_for(photographs, teacher)
     cameras = [photographs.camera(i) for i in range(photographs.num)]
     problem, run = method.start(scene, cameras, teacher, rasterize_mode, source=source)
-    return drive(method, problem, run if after is None else after.run)
+    return drive(method, problem, run if after is None else _going_on(after, method))
 
 
 def parts(
@@ -190,7 +191,7 @@ def parts(
     config, eval_cameras = method.config, tuple(eval_cameras)
     tracked = sequence.select(cameras=[c for c in sequence.camera_ids if c not in eval_cameras])
     if after is not None:
-        return drive(method, PartsProblem(tracked), after.run, headroom=config.headroom)
+        return drive(method, PartsProblem(tracked), _going_on(after, method), headroom=config.headroom)
     if gaussians is not None and anchor is None:
         raise ValueError("anchor: expected the frame that the given Gaussians show, found none; name it")
     chosen, moved = detect_motion(tracked, config, anchor)
@@ -204,3 +205,9 @@ def parts(
     start = begin(tracked, gaussians, chosen, moved, config, segmenter, key)
     problem, run = method.start(tracked, start)
     return drive(method, problem, run, headroom=config.headroom)
+
+
+def _going_on(after: Tick, method: Method) -> Run:
+    """The run of an earlier tick. With other settings or losses, its losses are not compared with those
+    before."""
+    return after.run if after.method == method else after.run.having(guard=None)

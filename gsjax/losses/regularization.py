@@ -1,6 +1,5 @@
 """Losses that do not depend on data."""
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
@@ -50,11 +49,10 @@ def local_strain(
     with rotations of the field, as in SC-GS, Huang et al. 2024). 0 for neighbours in the same place.
 
     Args:
-        rest, moved: points before and after the deformation; there is no gradient by `rest`.
+        rest, moved: points before and after the deformation.
         turns: rotation of each point's surroundings.
         neighbors: rows of the points around each.
     """
-    rest = jax.lax.stop_gradient(rest)
     apart = rest[neighbors] - rest[:, None]
     turned = jnp.einsum("mij,mkj->mki", turns, apart, precision="highest")
     left = moved[neighbors] - moved[:, None] - turned

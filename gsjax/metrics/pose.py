@@ -11,11 +11,12 @@ where S runs over the symmetries of the model. In float64, on the host.
 """
 
 from collections.abc import Callable
+from contextlib import suppress
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
-from scipy.spatial import cKDTree
+from scipy.spatial import ConvexHull, QhullError, cKDTree
 from scipy.spatial.distance import cdist
 
 Poses = Float[np.ndarray, "T 4 4"]
@@ -204,6 +205,8 @@ def average_recall(errors: Float[np.ndarray, "T"], thresholds: Float[np.ndarray,
 
 def diameter(points: Points) -> float:
     """The largest distance between two of the points, in their unit; 0 for one point."""
+    with suppress(QhullError, ValueError):  # they lie in a plane, or are few
+        points = points[ConvexHull(points).vertices]
     blocks = np.array_split(points, -(-len(points) // _BLOCK))
     return float(max(cdist(block, points).max() for block in blocks))
 

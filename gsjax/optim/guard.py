@@ -1,9 +1,10 @@
-"""A guard over the steps of any method: when a smoothed loss is lost, it goes back to the best parameters and
-takes smaller steps from there; and a run ends with the best that it had.
+"""A guard over the steps of any method: when the loss is lost, it goes back to the best parameters and takes
+smaller steps from there; and a run ends with the best that it had.
 
-The loss is the mean of a window of steps, and each comparison allows for the standard error that the losses
-of the best window have, as a step sees one photograph of many. A stretch is the time during which losses can
-be compared: it begins anew when parameters or constants are replaced, such as by densification.
+Losses are compared by their mean over a window of whole passes over the views, so that each view counts in
+each, and beyond the standard error that they have in the best window. A stretch is the time during which
+losses can be compared: it begins anew when parameters or constants are replaced, such as by densification,
+or when a method says that its loss has become another.
 
 That a step is finite is the step's own promise (`gsjax.optim.step`), as is that none is far longer than usual
 (`steady_adam`).
@@ -18,12 +19,37 @@ import numpy as np
 from jaxtyping import Array, Float, PyTree
 
 LEAST_WINDOW = 100
-"""Fewest steps whose mean loss is compared."""
+"""Fewest steps whose losses are compared."""
 _WINDOWS = 50  # of a run, at most
-_TAIL = 20  # steps at the end of a window that must be no worse than it
+_TAIL = 20  # steps by which a candidate is confirmed, and of which most must not be worse at the end
 _LOST, _LOST_SIGMA = 0.25, 4.0  # by how much a loss is lost: relative, and in standard errors
 _WORSE, _WORSE_SIGMA = 0.02, 3.0  # by how much it must be worse at the end to go back
 _SMALLER = 0.5
+
+
+class Level(eqx.Module):
+    """The losses of a window, and the parameters at its end.
+
+    Attributes:
+        mean, deviation: mean and standard deviation of the losses.
+        params: the parameters, copied to the host.
+    """
+
+    mean: float
+    deviation: float
+    params: PyTree
+
+    def is_below(self, loss: float, count: int, relative: float, sigma: float) -> bool:
+        """Whether a mean or median of losses is larger by a relative and a significant amount.
+
+        Args:
+            loss: the mean or median.
+            count: number of losses.
+            relative: least difference, relative to the level.
+            sigma: least difference in standard errors.
+        """
+        margin = max(relative * abs(self.mean), sigma * self.deviation * (2 / count) ** 0.5)
+        return loss > self.mean + margin
 
 
 class Guard(eqx.Module):
@@ -31,38 +57,44 @@ class Guard(eqx.Module):
 
     Attributes:
         share: share of each step that is taken; 1 until a return.
+        losses: the losses of the latest steps, at most a window; NaN for those that were skipped.
         steps: number of steps in the stretch, or since the last return.
-        losses: the losses of the latest of them, at most a window.
-        best: parameters at the end of the best window, copied to the host; None before the first.
-        least: mean and standard deviation of the losses of that window.
+        best: the best window; None before the first.
+        candidate: a better one, until the steps after it confirm its parameters, which no loss has seen.
         returns: number of returns to the best parameters, in all stretches.
     """
 
     share: Float[Array, ""]
-    steps: int = 0
     losses: tuple[float, ...] = ()
-    best: PyTree = None
-    least: tuple[float, float] = (float("inf"), 0.0)
+    steps: int = 0
+    best: Level | None = None
+    candidate: Level | None = None
     returns: int = 0
 
-    def watched(self, loss: float, params: PyTree, window: int) -> tuple["Guard", PyTree]:
+    def watched(self, loss: float, params: PyTree, step: int, window: int) -> tuple["Guard", PyTree]:
         """The guard after a step, and the parameters to continue from: those given or, where the loss is
         lost, the best.
 
         Args:
-            loss: loss of the step.
+            loss: loss of the step; NaN if it was skipped.
             params: parameters after the step.
+            step: number of steps of the run so far.
             window: number of steps that are compared.
         """
-        guard = replace(self, steps=self.steps + 1, losses=(*self.losses, loss)[-window:])
-        if guard.steps % window:
+        guard = replace(self, losses=(*self.losses, loss)[-window:], steps=self.steps + 1)
+        best, candidate = guard.best, guard.candidate
+        if candidate is not None and guard.steps >= _TAIL and step % window == _TAIL:
+            is_confirmed = not candidate.is_below(_median(guard.losses[-_TAIL:]), _TAIL, _LOST, _LOST_SIGMA)
+            guard = replace(guard, best=candidate if is_confirmed else best, candidate=None)
+        if step % window or guard.steps < window:
             return guard, params
-        if guard.best is not None and guard._is_worse(guard.losses, _LOST, _LOST_SIGMA):
-            return guard._returned()
-        now = float(np.mean(guard.losses)), float(np.std(guard.losses))
-        is_level = not replace(guard, least=now)._is_worse(guard.losses[-_TAIL:], 0.0, _WORSE_SIGMA)
-        if now[0] < guard.least[0] and is_level:
-            guard = replace(guard, best=jax.tree.map(np.array, params), least=now)
+        mean = _mean(guard.losses)
+        if best is not None and best.is_below(mean, window, _LOST, _LOST_SIGMA):
+            state = {"share": _SMALLER * self.share, "candidate": None, "returns": self.returns + 1}
+            return replace(guard, losses=(), steps=0, **state), _restored(best)
+        if mean < (np.inf if best is None else best.mean):
+            level = Level(mean, float(np.nanstd(guard.losses)), jax.tree.map(np.array, params))
+            guard = replace(guard, candidate=level)
         return guard, params
 
     def settled(self, params: PyTree) -> tuple["Guard", PyTree]:
@@ -72,25 +104,13 @@ class Guard(eqx.Module):
         Args:
             params: the latest parameters.
         """
-        if self.best is None or len(self.losses) < _TAIL:
+        best, count = self.best, len(self.losses)
+        if best is None or count < _TAIL:
             return self, params
-        latest = self.losses, self.losses[-_TAIL:]
-        if any(self._is_worse(some, _WORSE, _WORSE_SIGMA) for some in latest):
-            return self._returned()
+        latest = ((_mean(self.losses), count), (_median(self.losses[-_TAIL:]), _TAIL))
+        if any(best.is_below(*some, _WORSE, _WORSE_SIGMA) for some in latest):
+            return replace(self, losses=(), steps=0, candidate=None), _restored(best)
         return self, params
-
-    def _is_worse(self, losses: tuple[float, ...], relative: float, sigma: float) -> bool:
-        """Whether the mean of losses exceeds the least by a relative and a significant amount, or is not
-        finite."""
-        least, deviation = self.least
-        margin = max(relative * abs(least), sigma * deviation * (2 / len(losses)) ** 0.5)
-        return not np.mean(losses) <= least + margin
-
-    def _returned(self) -> tuple["Guard", PyTree]:
-        """The guard and the parameters after a return to the best."""
-        best = jax.tree.map(jnp.array, self.best)
-        share = _SMALLER * self.share
-        return replace(self, share=share, steps=0, losses=(), returns=self.returns + 1), best
 
 
 def begun(before: Guard | None = None) -> Guard:
@@ -102,9 +122,14 @@ def begun(before: Guard | None = None) -> Guard:
     return Guard(jnp.ones((), jnp.float32), returns=0 if before is None else before.returns)
 
 
-def window_of(total: int) -> int:
-    """Number of steps that are compared, in a run of a total number."""
-    return max(LEAST_WINDOW, total // _WINDOWS)
+def window_of(total: int, period: int) -> int:
+    """Number of steps that are compared: whole passes.
+
+    Args:
+        total: number of steps of the run.
+        period: number of steps of a pass over the views.
+    """
+    return period * -(-max(LEAST_WINDOW, total // _WINDOWS) // period)
 
 
 def shortened(new: PyTree, old: PyTree, share: Float[Array, ""]) -> PyTree:
@@ -121,3 +146,23 @@ def shortened(new: PyTree, old: PyTree, share: Float[Array, ""]) -> PyTree:
         return jnp.where(share < 1, start + share.astype(start.dtype) * (end - start), end)
 
     return jax.tree.map(of, new, old)
+
+
+def _restored(best: Level) -> PyTree:
+    return jax.tree.map(jnp.array, best.params)
+
+
+def _mean(losses: tuple[float, ...]) -> float:
+    """Mean of losses without those of skipped steps; infinite if these are half of all, or another is not
+    finite."""
+    return _of_those_taken(np.mean, losses)
+
+
+def _median(losses: tuple[float, ...]) -> float:
+    """Median of losses, as `_mean`: one view that stands out does not count."""
+    return _of_those_taken(np.median, losses)
+
+
+def _of_those_taken(statistic, losses: tuple[float, ...]) -> float:
+    taken = np.array(losses)[~np.isnan(losses)]
+    return float(statistic(taken)) if 2 * len(taken) > len(losses) else float("inf")

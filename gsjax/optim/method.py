@@ -76,6 +76,11 @@ class Method(Protocol[Problem]):
         """Number of steps; progress is the fraction of them that has been taken."""
         ...
 
+    def period(self, problem: Problem) -> int:
+        """Number of steps of a pass over the views, after whose multiples a new one begins; 1 where steps are
+        not in passes."""
+        ...
+
     def between(self, problem: Problem, run: Run, progress: float) -> Run:
         """The run for the next step, after changes of shape: densification, new parts, a graph, new plans.
         Arrays of `run` may be donated. A run is returned without its guard where the loss becomes another.

@@ -90,9 +90,7 @@ def keep_if(condition: Bool[Array, ""], new: PyTree, old: PyTree) -> PyTree:
     return jax.tree.map(lambda a, b: jnp.where(condition, a, b), new, old)
 
 
-def steady_adam(
-    rate: Any, b1: float = 0.9, b2: float = 0.999, eps: float = 1e-15, decay: float = 0.0
-) -> optax.GradientTransformation:
+def steady_adam(rate: Any, eps: float = 1e-15, decay: float = 0.0) -> optax.GradientTransformation:
     """Adam in which a single gradient moves a parameter by no more than about ten learning rates.
 
     In plain Adam it is 31, however large or small the gradient, if those before were much smaller: the first
@@ -102,10 +100,10 @@ def steady_adam(
 
     Args:
         rate: learning rate, or a schedule.
-        b1, b2: decay of the first and the second moment.
         eps: added to the root of the second moment.
         decay: weight decay of AdamW.
     """
+    b1, b2 = 0.9, 0.999
 
     def update(gradients, state, params=None):
         count = optax.safe_increment(state.count)

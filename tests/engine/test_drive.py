@@ -14,6 +14,7 @@ import pytest
 import gsjax
 from gsjax.engine import interrupts
 from gsjax.engine.drive import Drive, drive
+from gsjax.engine.verbs import _going_on as going_on
 from gsjax.io.checkpoints import CheckpointError, load_checkpoint, save_checkpoint
 from gsjax.methods.fit import Fit
 from gsjax.optim.method import Run
@@ -64,6 +65,9 @@ class Walk:
     def total(self, problem) -> int:
         return self.config.steps
 
+    def period(self, problem) -> int:
+        return 1
+
     def between(self, problem, run: Run, progress: float) -> Run:
         if run.step and run.step % 4 == 0:
             return run.having(params=jnp.append(run.params, 0.0))
@@ -111,6 +115,12 @@ def test_seeds_differ_and_one_seed_does_not():
     one, same, other = (list(walked(WalkConfig(seed=seed)))[-1].result for seed in (3, 3, 4))
     np.testing.assert_array_equal(one, same)
     assert not np.allclose(one, other)
+
+
+def test_losses_of_other_settings_are_not_compared_with_those_before():
+    now = next(walked())
+    assert going_on(now, Walk()) is now.run
+    assert going_on(now, Walk(WalkConfig(seed=5))).guard is None
 
 
 def test_what_overflows_is_done_again_with_room_and_to_the_same_bits():

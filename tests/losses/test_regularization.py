@@ -76,7 +76,20 @@ class TestStrain:
             return pseudo_huber(strains(rest, moved, turns), 0.1).sum()
 
         check_grads(penalty, (rest + 0.1 * points(2), turns), order=1, modes=("fwd", "rev"))
-        assert not np.any(jax.grad(lambda rest: strains(rest, points(1), turns).sum())(rest))
+
+    def test_it_pulls_no_rest_apart_where_all_is_stretched_alike(self):
+        """Canonical points move what is deformed too: by a field that stretches, the strain is the same
+        wherever they lie, and its gradient by them is 0 along their scale."""
+        stretch, turns = jnp.array([1.3, 1.0, 1.0]), np.tile(np.eye(3), (4, 1, 1))
+
+        def penalty(rest):
+            return pseudo_huber(strains(rest, stretch * rest, turns), 0.1).sum()
+
+        rest = jnp.asarray(points())
+        check_grads(penalty, (rest,), order=1, modes=("fwd", "rev"))
+        slope = jax.grad(penalty)(rest)
+        assert np.abs(slope).max() > 1e-3
+        np.testing.assert_allclose(np.vdot(slope, rest), 0, atol=1e-12)
 
     def test_the_penalty_is_a_square_at_first_and_then_a_line(self):
         lengths = np.array([0.0, 1e-4, 1e3])

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gsjax.methods.deform import Deform
+from gsjax.methods.deform import Deform, nodes_of, start_gaussians
 from gsjax.methods.deform.method import batch_of
 from gsjax.methods.deform.update import deform_loss
 from gsjax.optim.method import Run
@@ -59,3 +59,12 @@ def test_without_nodes_or_weight_there_is_no_such_loss(begun):
         params = run.having(kept=kept)
         _, info = jax.jit(deform_loss(config))(run.params, batch_of(problem, params, 1), step=0, key=0)
         assert "rigid" not in info
+
+
+def test_groups_of_few_have_no_neighbours_in_others():
+    gaussians = start_gaussians(tissue()[0], 0, 2.0)
+    groups = np.repeat([0, 1], [gaussians.num - 3, 3])
+    nodes = nodes_of(gaussians, 8, groups)
+    neighbors = np.asarray(nodes.indices)[np.asarray(nodes.rows)]
+    group = groups[np.asarray(nodes.rows)]
+    np.testing.assert_array_equal(group[neighbors], np.broadcast_to(group[:, None], neighbors.shape))

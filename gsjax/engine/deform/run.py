@@ -99,7 +99,7 @@ def run(options: Options) -> int:
             problem, run = method.start(
                 data.frames,
                 data.lesson,
-                first=data.first,
+                first=None if source == "hull" else data.first,
                 timeline=data.timeline(metric),
                 background=sequence.background,
                 hull=source == "hull",

@@ -45,10 +45,14 @@ def start_from(
         raise ValueError(f"first: expected one of the training frames, {data.train}, found {first}")
     for text in notes.warnings:
         warnings.warn(text, DataWarning, stacklevel=3)
+    if first is not None:
+        first = data.train.index(first)
+    elif source != "hull":
+        first = data.first
     return method.start(
         data.frames,
         data.lesson,
-        first=data.first if first is None else data.train.index(first),
+        first=first,
         gaussians=gaussians,
         timeline=data.timeline(metric=source in METRIC),
         background=seen.background,

@@ -11,7 +11,7 @@ from rich.console import Console
 from gsjax.engine.drive import Tick, drive
 from gsjax.engine.folder import RunFolder
 from gsjax.engine.messages import Notes, counted, reason, stage
-from gsjax.engine.progress import Progress, Schedule, load_run, means_of, watch
+from gsjax.engine.progress import Progress, Schedule, load_run, means_of, warn_of_returns, watch
 from gsjax.io.checkpoints import load_checkpoint
 from gsjax.methods.parts import Discovery, Parts, Problem, RefineParams
 from gsjax.optim.method import Run
@@ -98,6 +98,7 @@ class Loop:
                 self.progress.stopped = None
         if lost := self.progress.skipped - skipped:
             self.notes.warn(f"{lost} of {done} refinement steps produced non-finite numbers and were skipped")
+        warn_of_returns(self.progress, self.notes)
 
     def _watch(self, schedule: Schedule) -> None:
         """Run to the last step of a schedule."""

@@ -57,7 +57,7 @@ class DeformWeightsConfig:
     """Weight of the distance of the space-time planes from 1, at which nothing moves (4DGS)."""
     rigidity: float = 1e-2
     """Weight of strains between neighbouring nodes, in excess of a rigid motion, so that what no camera sees
-    moves with what is around it (ARAP, as in SC-GS)."""
+    moves with what is around it (ARAP, as in SC-GS). Without nodes there is none."""
 
     def __post_init__(self):
         expect(self, "weights.", **dict.fromkeys(vars(self), (0, np.inf)))

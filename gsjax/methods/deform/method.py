@@ -123,12 +123,13 @@ class Deform:
 
         Raises:
             ValueError: frames differ in size, no pixel counts, no depth is known, the teacher's labels do not
-                fit, or poses are to be refined of frames that share a time.
+                fit, poses are to be refined of frames that share a time, or there is a first frame of a hull.
         """
         config = self.config
         _check(frames, config, lesson)
+        if hull and first is not None:
+            raise ValueError(f"first: expected None, as a hull is of all frames, found {first}")
         if hull:
-            first = None
             if gaussians is None:
                 gaussians = hull_gaussians(frames, background, config.hull_points, config.seed)
         elif first is None:
@@ -168,6 +169,10 @@ class Deform:
     def total(self, problem: Problem) -> int:
         """Total number of steps: warm-up steps and joint steps."""
         return self.config.warmup + self.config.iterations
+
+    def period(self, problem: Problem) -> int:
+        """Number of frames."""
+        return len(problem.seen)
 
     def between(self, problem: Problem, run: Run, progress: float) -> Run:
         """Adds the field after the warm-up, selects the Gaussians that keep moving, and makes the graph.
@@ -217,7 +222,7 @@ def batch_of(problem: Problem, run: Run, i: int) -> Batch:
     """
     view = None
     if run.params.twists is not None:
-        view = jnp.asarray(-1 if i == problem.first else i, jnp.int32)
+        view = jnp.asarray(-1 if i == (problem.first or 0) else i, jnp.int32)
     ids = None if problem.ids is None else problem.ids[i]
     moving, graphs = run.kept
     graph = None if graphs is None else graphs[i]

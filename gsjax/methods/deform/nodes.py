@@ -45,7 +45,7 @@ def nodes_of(gaussians: Gaussians, count: int, groups: Int[np.ndarray, "n"] | No
 
 
 def _nodes_of_groups(gaussians: Gaussians, count: int, groups: Int[np.ndarray, "n"]) -> Nodes:
-    """Nodes of all groups; a blend of fewer than four is padded with weights of 0."""
+    """Nodes of all groups; a blend of fewer than four is padded with its nearest, at weights of 0."""
     indices = np.zeros((gaussians.num, _BLENDED), np.int32)
     weights = np.zeros((gaussians.num, _BLENDED), np.float32)
     chosen: list[int] = []
@@ -53,6 +53,7 @@ def _nodes_of_groups(gaussians: Gaussians, count: int, groups: Int[np.ndarray, "
         rows = np.flatnonzero(groups == group)
         found = nodes_of(take(gaussians, rows), count)
         blended = found.indices.shape[1]
+        indices[rows] = len(chosen) + np.asarray(found.indices)[:, :1]
         indices[rows, :blended] = len(chosen) + np.asarray(found.indices)
         weights[rows, :blended] = found.weights
         chosen += rows[np.asarray(found.rows)].tolist()

@@ -96,6 +96,10 @@ class Distill:
         """Number of steps, `config.iterations`."""
         return self.config.iterations
 
+    def period(self, problem: Problem) -> int:
+        """Number of views."""
+        return len(problem.views)
+
     def between(self, problem: Problem, run: Run, progress: float) -> Run:
         """The run, without its guard as the contrastive loss begins. Arguments as for `Method.between`."""
         begins = self.config.weights.contrast and run.step == contrast_begins(self.config)

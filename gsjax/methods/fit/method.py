@@ -120,9 +120,13 @@ class Fit:
         """Number of steps."""
         return self.config.steps
 
+    def period(self, problem: Problem) -> int:
+        """Number of photographs."""
+        return len(problem.frames)
+
     def between(self, problem: Problem, run: Run, progress: float) -> Run:
         """Relocates or splits Gaussians, unlocks the next degree of the spherical harmonics, and plans new
-        sizes. Arguments as for `Method.between`."""
+        sizes, whose losses are others. Arguments as for `Method.between`."""
         run = self._densified(problem, run, run.step - 1, progress)
         run = self._enlarged(run, degree=min(self.config.sh_degree, run.step // self.config.sh_every))
         name, frame = self._turn(problem, run.step, progress)
@@ -130,6 +134,7 @@ class Fit:
         if plan is None:
             mode = "antialiased" if self.config.antialiased else "classic"
             plan = plan_render(gaussians, frame.cameras, headroom=HEADROOM, rasterize_mode=mode)
+            run = run.having(guard=None)
         return run.having(plans=run.plans | {name: replace(plan, sh_degree=gaussians.sh_degree)})
 
     def batch(self, problem: Problem, run: Run, progress: float) -> tuple[Batch, tuple[str, ...]]:

@@ -81,6 +81,10 @@ class Parts:
         """Number of steps, with the refinement."""
         return self.steps_of_frames(problem) + self.config.refine.iterations
 
+    def period(self, problem: Problem) -> int:
+        """1, as pictures are drawn anew for each step."""
+        return 1
+
     def between(self, problem: Problem, run: Run, progress: float) -> Run:
         """Stores the pose of a finished frame, joins and divides parts, and opens the next frame; after the
         last frame, removes parts that no picture needs and begins the refinement.
@@ -91,6 +95,8 @@ class Parts:
             if discovery.is_between_frames:
                 order = order_of_frames(problem.sequence.num_frames, discovery.anchor)
                 run = open_frame(run, order[discovery.count])
+            elif self._size(run) != self._size(run.having(step=run.step - 1)):
+                run = run.having(guard=None)  # losses of larger pictures are others
         return run.having(plans=run.plans | self._missing_plans(problem, run))
 
     def brought_up_to_date(self, problem: Problem, run: Run) -> Run:

@@ -20,7 +20,7 @@ from gsjax.methods.parts.config import StreamConfig
 from gsjax.methods.parts.trajectory import BACKGROUND
 from gsjax.methods.parts.weights import Field, SimplexTable, weights_of
 from gsjax.optim.constrained import simplex_descent
-from gsjax.optim.step import Step, all_finite, keep_if
+from gsjax.optim.step import Step, all_finite, keep_if, steady_adam
 from gsjax.rasterize.plan import Plan
 from gsjax.scene.feature_grid import Located
 from gsjax.scene.frame import Frame
@@ -309,7 +309,7 @@ def stream_step(config: StreamConfig, extra_losses: ExtraLosses = ()) -> Step:
     def fields(field: Field) -> optax.GradientTransformationExtraArgs:
         if isinstance(field, SimplexTable):
             return simplex_descent(config.field_rate)
-        return optax.with_extra_args_support(optax.adam(config.field_rate, eps=1e-12))
+        return optax.with_extra_args_support(steady_adam(config.field_rate, eps=1e-12))
 
     def init(params: StreamParams) -> StreamState:
         field = fields(params.field).init(params.field)

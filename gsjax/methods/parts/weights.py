@@ -7,7 +7,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from gsjax.methods.parts.config import PartsConfig
@@ -87,7 +86,7 @@ def fit_field_to_weights(
 
 @partial(jax.jit, static_argnames="iterations")
 def _fitted_grid(grid: FeatureGrid, located: Located, weights, alive, iterations: int):
-    optimizer = optax.adam(_RATE, eps=1e-12)
+    optimizer = steady_adam(_RATE, eps=1e-12)
 
     def loss(grid):
         logits = jnp.where(alive, grid.at(located), -1e9)
