@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from gsjax.methods.parts.config import PartsConfig
+from gsjax.optim.step import steady_adam
 from gsjax.scene.feature_grid import FeatureGrid, Located, init_feature_grid, locate
 
 _RATE = 1e-2
