@@ -78,8 +78,8 @@ def figure(rows: list[dict[str, Any]], path: Path) -> None:
         for axes, x, y in ((left, "best", "psnr"), (right, "p95_mm", "still_p95_mm")):
             axes.scatter([row[x] for row in mine], [row[y] for row in mine], s=14, label=pattern)
     for axes, x, y in (
-        (left, "best window, dB", "end, dB"),
-        (right, "tracks, p95, mm", "standing still, mm"),
+        (left, "best of every 100 steps, dB", "end, dB"),
+        (right, "tracks, p95, mm", "standing still, p95, mm"),
     ):
         axes.set(xlabel=x, ylabel=y)
         axes.axline((axes.get_xlim()[0],) * 2, slope=1, color="0.6", lw=1, zorder=0)

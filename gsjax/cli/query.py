@@ -10,7 +10,7 @@ import tyro
 from rich.console import Console
 
 from gsjax.engine.deform.file import NAME as DEFORMATION
-from gsjax.engine.deform.file import background_of, origin_of, read_deformation, warn_of_partial
+from gsjax.engine.deform.file import read_beside, read_deformation, warn_of_partial
 from gsjax.engine.deform.query import QueryableScene, label_everything
 from gsjax.engine.distill.file import FOLDER
 from gsjax.engine.distill.query import QueryableField
@@ -206,7 +206,7 @@ def _query_deformation(options: Options, console: Console) -> None:
     with Notes(console) as notes:
         with stage(console, "reading the scene"):
             file = options.run / DEFORMATION
-            result, beside = read_deformation(file), (origin_of(file), background_of(file))
+            result, beside = read_deformation(file), read_beside(file)
         warn_of_partial(options.run, notes)
         scene = QueryableScene(options.run, result, options.weights, *beside)
         if ways:

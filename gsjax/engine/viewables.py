@@ -12,7 +12,7 @@ from gsjax.data.ordered import open_as_sequence
 from gsjax.data.origin import relative_to_origin
 from gsjax.data.photographs import Photographs
 from gsjax.engine.deform.file import NAME as DEFORMATION
-from gsjax.engine.deform.file import background_of, origin_of, read_deformation
+from gsjax.engine.deform.file import read_beside, read_deformation
 from gsjax.engine.deform.query import QueryableScene, probabilities_of
 from gsjax.engine.distill.file import NAME
 from gsjax.engine.distill.query import QueryableField
@@ -205,7 +205,7 @@ def _of_deformation(path: Path, notes: Notes, weights: Path | None, shown: bool)
     if weights is not None and kind in (None, "classes", "closed"):
         raise ValueError(f"--weights: {path} has no CLIP features; leave it out")
     first, labels, asking, times = result.at(0.0), None, None, result.timeline.times
-    origin, background = origin_of(path / DEFORMATION), background_of(path / DEFORMATION)
+    origin, background = read_beside(path / DEFORMATION)
     if result.meaning is not None and first.features is not None:
         asking = asking_of(QueryableScene(path, result, weights, origin, background))
         likely = probabilities_of(first.features, jnp.asarray(result.meaning.codebook, jnp.float32))

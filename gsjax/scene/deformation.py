@@ -239,7 +239,12 @@ def deform_by_nodes(
         time: 0 to 1.
         nodes: control nodes among these Gaussians.
     """
-    return deform(gaussians, blended_offsets(node_offsets(gaussians, field, time, nodes), nodes))
+    return deform(gaussians, _by_nodes(gaussians, field, time, nodes))
+
+
+def _by_nodes(gaussians: Gaussians, field: DeformationField, time: Float[Array, ""], nodes: Nodes) -> Offsets:
+    """Offsets of the Gaussians that `nodes` blends."""
+    return blended_offsets(node_offsets(gaussians, field, time, nodes), nodes)
 
 
 def node_offsets(
@@ -290,9 +295,7 @@ def features_at(
         changes = jax.vmap(lambda time: field(some.means, time, some.features).features)(times)
     else:
         blends = nodes._replace(indices=nodes.indices[rows], weights=nodes.weights[rows])
-        changes = jax.vmap(
-            lambda time: blended_offsets(node_offsets(gaussians, field, time, blends), blends).features
-        )(times)
+        changes = jax.vmap(lambda time: _by_nodes(gaussians, field, time, blends).features)(times)
     return still + changes
 
 

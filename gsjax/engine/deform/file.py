@@ -2,6 +2,7 @@
 
 import os
 from pathlib import Path
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -37,29 +38,31 @@ def write_deformation(
     save_checkpoint(path, result, {name: value for name, value in beside.items() if value is not None})
 
 
-def origin_of(path: str | os.PathLike) -> Float[np.ndarray, "3"] | None:
-    """What the scene that `write_deformation` wrote is relative to; None where that is 0.
+class Beside(NamedTuple):
+    """What `write_deformation` kept beside a scene.
+
+    Attributes:
+        origin: what it is relative to; None where that is 0.
+        background: RGB, 0 to 1, behind it; None where that is black.
+    """
+
+    origin: Float[np.ndarray, "3"] | None
+    background: tuple[float, ...] | None
+
+
+def read_beside(path: str | os.PathLike) -> Beside:
+    """What is beside the scene that `write_deformation` wrote.
 
     Raises:
         FileNotFoundError: there is no such file.
         ValueError: it is damaged.
     """
-    origin = load_metadata(path).get("origin")
-    return None if origin is None else as_numbers(Path(path), "origin", origin, (3,))
-
-
-def background_of(path: str | os.PathLike) -> tuple[float, float, float] | None:
-    """RGB, 0 to 1, behind the scene that `write_deformation` wrote; None where that is black.
-
-    Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: it is damaged.
-    """
-    background = load_metadata(path).get("background")
-    if background is None:
-        return None
-    red, green, blue = as_numbers(Path(path), "background", background, (3,)).tolist()
-    return red, green, blue
+    stored = load_metadata(path)
+    found = {name: stored.get(name) for name in Beside._fields}
+    origin, background = (
+        None if value is None else as_numbers(Path(path), name, value, (3,)) for name, value in found.items()
+    )
+    return Beside(origin, None if background is None else tuple(background.tolist()))
 
 
 def read_deformation(path: str | os.PathLike) -> DeformResult:

@@ -42,6 +42,7 @@ from gsjax.engine.track.results import summarize
 from gsjax.engine.track.resume import Saver, load
 from gsjax.engine.track.scoring import (
     budget_metrics,
+    first_labels,
     group_values,
     labels_of_groups,
     lost_over_frames,
@@ -177,11 +178,12 @@ def _judge(
         scored = f"{scores.num_frames} of {tracking.num_frames} frames"
         notes.warn(f"scoring was stopped after {scored} by {reason(error)}")
         failed = error if isinstance(error, Exception) else None
-    motion = score_motion(tracking, recording)
+    true_labels = first_labels(tracking, recording)
+    motion = score_motion(tracking, recording, true_labels)
     names = object_names(tracking, recording, values)
     seconds["evaluation"] = perf_counter() - begun
     found = _what_ran(tracking, recording, mask, scores, budget_ms)
-    found |= metrics(tracking, recording, mask, scores, motion, values)
+    found |= metrics(tracking, recording, mask, scores, motion, values, true_labels)
     _note_what_is_missing(found, tracking, recording, mask, values, notes)
     _note_what_was_lost(tracking, values, names, notes)
     media = {

@@ -37,17 +37,25 @@ def labels_of_groups(tracking: Tracking, values: np.ndarray | None) -> np.ndarra
     return np.asarray(tracking.scene.label_ids) if values is None else values
 
 
-def score_motion(tracking: Tracking, recording: Recording) -> dict[int, ObjectScore]:
+def score_motion(
+    tracking: Tracking, recording: Recording, labels: Int[np.ndarray, "N"] | None
+) -> dict[int, ObjectScore]:
     """How well the motion of each object of the truth was followed, by its mask value; empty without truth,
-    depth or masks."""
-    truth, labels = recording.tracked.truth, _true_labels(tracking, recording)
+    depth or masks.
+
+    Args:
+        tracking: the scene and its poses.
+        recording: the recording, with its truth.
+        labels: from `first_labels`.
+    """
+    truth = recording.tracked.truth
     if truth is None or labels is None or tracking.num_frames < 2:
         return {}  # errors are relative to the first frame
     poses = {int(k): truth.poses[: tracking.num_frames, i] for i, k in enumerate(truth.label_ids)}
     return score_tracks(tracking.means(), labels, poses)
 
 
-def _true_labels(tracking: Tracking, recording: Recording) -> Int[np.ndarray, "N"] | None:
+def first_labels(tracking: Tracking, recording: Recording) -> Int[np.ndarray, "N"] | None:
     """The true label of each Gaussian of the first frame; None without masks or depth."""
     sequence = recording.tracked
     if not (sequence.has_masks and sequence.has_depth):
@@ -62,6 +70,7 @@ def metrics(
     scores: Scores,
     motion: dict[int, ObjectScore],
     values: np.ndarray | None,
+    true_labels: Int[np.ndarray, "N"] | None,
 ) -> dict[str, Any]:
     """The scores of metrics.json; what was not scored is None, for example the motion of an object that
     is not tracked. docs/track.md explains each score.
@@ -73,11 +82,11 @@ def metrics(
         scores: those of views.
         motion: those of objects, by mask value.
         values: the mask value of each group, [K+1], or None.
+        true_labels: from `first_labels`.
     """
     names = object_names(tracking, recording, values)
     ids, label_ids = labels_of_groups(tracking, values), np.asarray(tracking.scene.label_ids)
     groups, means = np.asarray(tracking.scene.labels), tracking.means()
-    true_labels = _true_labels(tracking, recording)
     poses = {} if values is None else pose_metrics(tracking, recording.tracked, values, true_labels)
     objects = {}
     for label, name in names.items():
