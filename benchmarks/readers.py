@@ -14,7 +14,7 @@ import yaml
 from benchmarks.readers_of_data import CLOUDS, LAYOUTS, PICTURES, SCENES, Arrays, Reader, written
 from gsjax.data.text import decoded
 from gsjax.engine import locks
-from gsjax.engine.deform.file import origin_of, read_deformation, write_deformation
+from gsjax.engine.deform.file import read_beside, read_deformation, write_deformation
 from gsjax.engine.distill.file import read_field
 from gsjax.engine.folder import SIGNATURE
 from gsjax.engine.locks import LOCK
@@ -110,8 +110,9 @@ def _deforming(root: Path) -> None:
 
 
 def _deformation(root: Path) -> Arrays:
-    result, origin = read_deformation(root / "deformation.npz"), origin_of(root / "deformation.npz")
-    return result.scene.gaussians.means, result.timeline.viewmats, origin
+    path = root / "deformation.npz"
+    result, beside = read_deformation(path), read_beside(path)
+    return result.scene.gaussians.means, result.timeline.viewmats, beside.origin
 
 
 def _field(root: Path) -> None:

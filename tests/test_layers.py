@@ -2,6 +2,7 @@
 
 import ast
 from collections.abc import Iterator
+from importlib import import_module
 from pathlib import Path
 
 import pytest
@@ -101,6 +102,28 @@ def test_files_import_only_from_layers_above_their_own():
 @pytest.mark.parametrize("folder", BELOW_COMMANDS)
 def test_experiments_and_benchmarks_stand_on_the_engine(folder):
     assert not leaning_on_commands(ROOT / folder), "\n" + "\n".join(leaning_on_commands(ROOT / folder))
+
+
+@pytest.mark.parametrize("folder", BELOW_COMMANDS)
+def test_what_experiments_and_benchmarks_import_exists(folder):
+    """Few of them run in a test, so a name that moved would be missed when they are next needed."""
+
+    def exists(module: str, name: str) -> bool:
+        try:
+            return hasattr(import_module(module), name) or bool(import_module(f"{module}.{name}"))
+        except ModuleNotFoundError:
+            return False
+
+    imports = {
+        (node.module, alias.name)
+        for file in sorted((ROOT / folder).rglob("*.py"))
+        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8")))
+        if isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] == PACKAGE.name
+        for alias in node.names
+    }
+    missing = [f"{module}.{name}" for module, name in sorted(imports) if not exists(module, name)]
+    assert imports
+    assert not missing
 
 
 @pytest.mark.parametrize("folder", SHORT)

@@ -1,6 +1,4 @@
-"""Helpers for tests of simulated scenes: projection, interpolation, and rendering time."""
-
-import time
+"""Helpers for tests of simulated scenes: projection and interpolation."""
 
 import numpy as np
 from scipy.ndimage import map_coordinates
@@ -29,13 +27,3 @@ def depths_from_another_frame(sequence, t, u):
     x, y = np.floor((K @ there)[:2] / there[2]).astype(int)
     inside = (x >= 0) & (x < sequence.width) & (y >= 0) & (y < sequence.height)
     return sequence.depth(u, 0)[y[inside], x[inside]], there[2][inside]
-
-
-def seconds_per_frame(sequence, views) -> float:
-    """The shortest CPU time of image, depth and mask together, over `views`, pairs (t, c)."""
-    durations = []
-    for t, c in views:
-        start = time.thread_time()
-        sequence.image(t, c), sequence.depth(t, c), sequence.mask(t, c)
-        durations.append(time.thread_time() - start)
-    return min(durations)

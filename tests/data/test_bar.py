@@ -6,7 +6,7 @@ from scipy.ndimage import binary_dilation
 
 from gsjax.data import Truth, open_sequence
 from gsjax.data.simulated import bar
-from tests.data.scene_helpers import interpolate, project_points, seconds_per_frame
+from tests.data.scene_helpers import interpolate, project_points
 
 BAR, BASE, BLOCK = 1, 2, 3
 
@@ -133,9 +133,3 @@ def test_tracks_that_do_not_fit_their_poses(shape):
     Truth((), np.zeros(0, int), poses, tracks=np.zeros((3, 5, 3)))
     with pytest.raises(ValueError, match=r"tracks must have shape \(3, "):
         Truth((), np.zeros(0, int), poses, tracks=np.zeros(shape))
-
-
-def test_a_frame_is_drawn_fast(scene):
-    scene.image(29, 0)  # generates the noise once
-    # It takes 0.3 s without annotation checks.
-    assert seconds_per_frame(scene, ((29, 1), (29, 2), (29, 3))) < 1.5

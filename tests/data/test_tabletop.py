@@ -7,7 +7,6 @@ from scipy.spatial.transform import Rotation
 from gsjax.data.simulated import Light, Primitive, Scene, simulated_sequence, tabletop
 from gsjax.data.simulated.motion import rigid
 from gsjax.geometry.cameras import intrinsics, look_at
-from tests.data.scene_helpers import seconds_per_frame
 from tests.data.test_raycaster import GREY, HEIGHT, SOLIDS, WIDTH, outside, single
 
 SLOW = pytest.mark.slow
@@ -180,13 +179,6 @@ def test_the_caller_may_write_into_an_image(scene):
 def test_counts_must_be_positive(name):
     with pytest.raises(ValueError, match=f"{name} must be at least 1, got 0"):
         tabletop(**{name: 0})
-
-
-def test_a_frame_is_rendered_fast():
-    sequence = tabletop(frames=4, width=320, height=240)
-    sequence.image(0, 0)  # generates the noise once
-    # It takes 0.1 s without annotation checks.
-    assert seconds_per_frame(sequence, ((1, 0), (2, 0), (3, 0))) < 0.6
 
 
 def test_cameras_look_at_the_table(scene):

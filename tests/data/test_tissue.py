@@ -12,7 +12,7 @@ from scipy.ndimage import binary_dilation
 from gsjax.data import open_sequence
 from gsjax.data.simulated import tissue
 from gsjax.data.simulated.sheet import Sheet
-from tests.data.scene_helpers import interpolate, project_points, seconds_per_frame
+from tests.data.scene_helpers import interpolate, project_points
 
 seeds = st.integers(0, 10_000)
 TOOL = 1
@@ -244,8 +244,3 @@ def test_other_pulls_and_patterns_are_refused(as_users_run, wrong, match):
 def test_counts_must_be_positive(name):
     with pytest.raises(ValueError, match=f"{name} must be at least 1, got 0"):
         tissue(**{name: 0})
-
-
-def test_a_frame_is_drawn_fast(scene):
-    # It takes 0.15 s without annotation checks.
-    assert seconds_per_frame(scene, ((14, 0), (15, 0), (16, 0))) < 1
