@@ -16,7 +16,7 @@ from gsjax.data import Sequence, Truth, open_sequence
 from gsjax.data.simulated import tabletop
 from gsjax.engine.recording import Recording, remembered
 from gsjax.engine.track.loop import Tracking
-from gsjax.engine.track.scoring import lost_over_frames, score_motion, turn_unknown
+from gsjax.engine.track.scoring import first_labels, lost_over_frames, score_motion, turn_unknown
 from gsjax.methods.track import PRESETS, TrackConfig
 
 START = TrackConfig(start=replace(PRESETS["fast"].start, iterations=40))  # few: colours hardly matter here
@@ -70,7 +70,8 @@ def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
     truth = recording.tracked.truth
     assert truth is not None
     names = dict(zip(truth.label_ids.tolist(), truth.names, strict=True))
-    motion, pixels = score_motion(tracking, recording), seen_pixels(recording.tracked)
+    motion = score_motion(tracking, recording, first_labels(tracking, recording))
+    pixels = seen_pixels(recording.tracked)
     objects = {
         names[label]: judge(
             score.centroid_errors_mm,

@@ -9,26 +9,32 @@ from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 import gsjax
+from experiments.optimisation_extremes.tracker import TRACKER, faster, longer, track
 from gsjax.data import Sequence
 from gsjax.data.photographs import photographs_of
 from gsjax.engine.drive import Drive
 from gsjax.engine.parts.start import FIT
-from gsjax.methods.deform import PRESETS
+from gsjax.methods.deform import PRESETS, DeformConfig
 from gsjax.methods.distill import DistillConfig
 from gsjax.methods.fit import FitConfig, StartConfig
 from gsjax.methods.parts import PartsConfig
+from gsjax.methods.track import TrackConfig
 from gsjax.optim.compiler import host_options
 from gsjax.scene.gaussians import Gaussians, take
 
 TISSUE = "simulated:tissue?width=96&height=76&frames=12"
 STILL = TISSUE + "&still=true"
+TABLE = "simulated:tabletop?width=160&height=120&frames=24"
 PARTS = "simulated:hard_parts?case=small&width=96&height=72&cameras=4&frames=5"
 STEPS = 600
 WINDOW = 100
 MILLION = 1_000_000
+STEPS_OF_A_MILLION = 60  # each takes seconds
+SEEDS = 20
 
 
 class Given(NamedTuple):
@@ -38,70 +44,92 @@ class Given(NamedTuple):
         sequence: the recording.
         config: settings.
         gaussians: number of Gaussians that it starts with; None for the usual number.
+        colors: type of the colours of a scene that it starts with; None for the usual one.
     """
 
     sequence: Sequence
     config: Any
     gaussians: int | None = None
+    colors: Any = None
 
 
 def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
     """One optimisation; a ValueError is an outcome, any other error is raised."""
-    given, begin = METHODS[options["method"]]
-    given = CASES[options["case"]](given(seed))
+    method, case = options["method"], options["case"]
+    if case == "twenty seeds":
+        rows = [_outcome(method, CASES["as it is"], seed + i) for i in range(SEEDS)]
+        worst = max(rows, key=lambda row: (not row["finite"], row["lost"]))
+        said = dict.fromkeys(row["said"] for row in rows if row["said"])
+        totals = {key: sum(row[key] for row in rows) for key in ("returns", "skipped", "seconds")}
+        return worst | totals | {"said": "; ".join(said)}
+    return _outcome(method, CASES[case], seed)
+
+
+def _outcome(method: str, case: Callable[[Given], Given], seed: int) -> dict[str, Any]:
+    made, begin = METHODS[method]
     begun = perf_counter()
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", UserWarning)
         try:
-            row = _followed(begin(given))
+            row = begin(case(made(seed)))
         except ValueError as error:
             return {"finite": None, "said": f"error: {error}"}
     said = dict.fromkeys(str(one.message) for one in caught if one.category is not DeprecationWarning)
+    said |= dict.fromkeys([row.pop("said")] if "said" in row else [])
     return row | {"said": "; ".join(said), "seconds": perf_counter() - begun}
 
 
 def _followed(ticks: Drive) -> dict[str, Any]:
-    """Its losses to the end, and the loss of what it ends with, over the batches of its last window."""
-    losses, skipped, stretch = [], 0, 0
+    """Its quality to the end, and that of what it ends with, over the batches of its last window."""
+    values, skipped, stretch = [], 0, 0
     for now in ticks:
         if now.run.guard.best is None and now.run.guard.steps == 1:
-            stretch = len(losses)  # from here on, losses can be compared
-        losses.append(float(now.info["loss"]))
+            stretch = len(values)  # from here on, losses can be compared
+        values.append(_quality(now.info))
         skipped += bool(now.info["skipped"])
-    last = np.array(losses[stretch:])
+    last = np.array(values[stretch:])
     window = min(WINDOW, len(last))
-    best = float(np.convolve(last, np.full(window, 1 / window), "valid").min())
-    ended = float(np.mean(_losses_at_end(ticks, window)))
-    result = jax.tree.leaves(eqx.filter(ticks.run.params, eqx.is_inexact_array))
+    best = float(np.convolve(last, np.full(window, 1 / window), "valid").max())
+    ended = float(np.mean(_values_at_end(ticks, window)))
     return {
-        "finite": all(bool(np.isfinite(np.asarray(leaf)).all()) for leaf in result),
+        "finite": _finite(ticks.run.params),
         "best": best,
         "ended": ended,
-        "lost": 100 * (ended / best - 1),
+        "lost": max(best, ended) - ended,
         "returns": ticks.run.guard.returns,
         "skipped": skipped,
-        "curve": np.array(losses[:: max(1, len(losses) // 200)]).tolist(),
+        "curve": np.round(values[:: max(1, len(values) // 200)], 3).tolist(),
     }
 
 
-def _losses_at_end(ticks: Drive, window: int) -> list[float]:
-    """The losses of the parameters at the end on the batches of the last steps."""
+def _quality(info: dict[str, Any]) -> float:
+    """PSNR of the photograph, dB; without one, the loss in dB: 10 of them are a tenth of the loss."""
+    return float(info["psnr"]) if "psnr" in info else -10 * float(np.log10(info["loss"]))
+
+
+def _finite(tree: Any) -> bool:
+    leaves = jax.tree.leaves(eqx.filter(tree, eqx.is_inexact_array))
+    return all(bool(np.isfinite(np.asarray(leaf)).all()) for leaf in leaves)
+
+
+def _values_at_end(ticks: Drive, window: int) -> list[float]:
+    """The quality of the parameters at the end on the batches of the last steps."""
     method, problem, last = ticks.method, ticks.problem, ticks.run
-    key, losses = jax.random.key(method.config.seed), []
+    key, values = jax.random.key(method.config.seed), []
 
-    def loss_of(params, state, batch, step):
+    def info_of(params, state, batch, step):
         key_of_step = jax.random.fold_in(key, step)
-        return method.step.update(params, state, batch, step=step, key=key_of_step)[2]["loss"]
+        return method.step.update(params, state, batch, step=step, key=key_of_step)[2]
 
-    loss = jax.jit(loss_of, compiler_options=host_options() or None)
+    info = jax.jit(info_of, compiler_options=host_options() or None)
     for step in range(last.step - window, last.step):
         at, progress = last.having(step=step), step / max(1, last.step)
         batch, _ = method.batch(problem, at, progress)
-        losses.append(float(loss(last.params, last.state, batch, step)))
-    return losses
+        values.append(_quality(info(last.params, last.state, batch, step)))
+    return values
 
 
-def _fit(given: Given) -> Drive:
+def _fitting(given: Given) -> Drive:
     photographs = photographs_of(given.sequence.select(frames=[0]))
     config = given.config
     if given.gaussians is not None:
@@ -110,34 +138,36 @@ def _fit(given: Given) -> Drive:
 
 
 def _deform(given: Given) -> Drive:
-    gaussians = None
-    if given.gaussians is not None:
-        gaussians = _sized(_fit(Given(given.sequence, FIT_CONFIG)), given.gaussians)
-    return gsjax.deform(given.sequence, given.config, teacher="none", gaussians=gaussians)
+    is_given = given.gaussians is not None or given.colors is not None
+    scene = _scene(given, FIT_CONFIG) if is_given else None
+    return gsjax.deform(given.sequence, given.config, teacher="none", gaussians=scene)
 
 
 def _distill(given: Given) -> Drive:
-    scene = _sized(_fit(Given(given.sequence, FIT_CONFIG)), given.gaussians)
     photographs = photographs_of(given.sequence.select(frames=[0]))
-    return gsjax.distill(scene, photographs, "classes", given.config)
+    return gsjax.distill(_scene(given, FIT_CONFIG), photographs, "classes", given.config)
 
 
 def _parts(given: Given) -> Drive:
-    photographs = photographs_of(given.sequence.select(frames=[0]))
-    scene = _sized(gsjax.fit(photographs, replace(FIT, steps=STEPS)), given.gaussians)
+    scene = _scene(given, replace(FIT, steps=STEPS))
     return gsjax.parts(given.sequence, given.config, anchor=0, gaussians=scene)
 
 
-def _sized(fitting: Drive, count: int | None) -> Gaussians:
-    """The scene of a fit, with a number of Gaussians: the first ones, over and over."""
+def _scene(given: Given, config: FitConfig) -> Gaussians:
+    """A scene of the first frame with the number of Gaussians that is asked for: the first ones, over and
+    over."""
+    fitting = gsjax.fit(photographs_of(given.sequence.select(frames=[0])), config)
     for _ in fitting:
         pass
-    scene = fitting.result
-    return scene if count is None else take(scene, np.resize(np.arange(scene.num), count))
+    scene, count = fitting.result, given.gaussians
+    scene = scene if count is None else take(scene, np.resize(np.arange(scene.num), count))
+    return scene if given.colors is None else replace(scene, sh0=scene.sh0.astype(given.colors))
 
 
 def _longer(given: Given) -> Given:
     config = given.config
+    if isinstance(config, TrackConfig):
+        return given._replace(config=longer(config))
     if isinstance(config, PartsConfig):
         refine = replace(config.refine, iterations=10 * config.refine.iterations)
         stream = replace(config.stream, iterations=10 * config.stream.iterations)
@@ -151,6 +181,8 @@ def _faster(factor: float) -> Callable[[Given], Given]:
 
     def changed(given: Given) -> Given:
         config = given.config
+        if isinstance(config, TrackConfig):
+            return given._replace(config=faster(config, factor))
         if isinstance(config, PartsConfig):
             names = ("rate", "turn_rate", "field_rate")
             rates = {name: factor * getattr(config.stream, name) for name in names}
@@ -199,39 +231,58 @@ def _one_time(given: Given) -> Given:
     return given._replace(sequence=replace(given.sequence, times=np.full(count, 1.0), shared_times=True))
 
 
+def _halved(given: Given) -> Given:
+    """Pictures, and the colours of a scene that is given, as float16."""
+    load = given.sequence.load_image
+    pictures = {"load_image": lambda t, c: (load(t, c) / 255).astype(np.float16), "float_images": True}
+    return given._replace(sequence=replace(given.sequence, **pictures), colors=jnp.float16)
+
+
+def _million(given: Given) -> Given:
+    config = given.config
+    if isinstance(config, FitConfig):
+        config = replace(config, steps=STEPS_OF_A_MILLION)
+    elif isinstance(config, DistillConfig):
+        config = replace(config, iterations=STEPS_OF_A_MILLION)
+    elif isinstance(config, DeformConfig):
+        config = replace(config, warmup=STEPS_OF_A_MILLION // 2, iterations=STEPS_OF_A_MILLION // 2)
+    return given._replace(config=config, gaussians=MILLION)
+
+
 CASES: dict[str, Callable[[Given], Given]] = {
     "as it is": lambda given: given,
     "ten times the steps": _longer,
     "rates ten times as high": _faster(10.0),
     "rates a tenth": _faster(0.1),
     "two Gaussians": lambda given: given._replace(gaussians=2),
-    "a million Gaussians": lambda given: given._replace(gaussians=MILLION),
+    "a million Gaussians": _million,
     "one view": _one_view,
     "one colour": _seen_as(lambda picture, t: np.full_like(picture, 130)),
     "a constant picture": _as_at_first,
     "the whole picture moves": _seen_as(lambda picture, t: np.roll(picture, 9 * t, axis=1)),
     "all at one time": _one_time,
     "depth with 5 % outliers": _outliers,
+    "float16 colours": _halved,
 }
 
 
 FIT_CONFIG = FitConfig(steps=STEPS, cap=4_000, start=StartConfig(count=2_000), coarse_until=0.0)
 
 
-METHODS: dict[str, tuple[Callable[[int], Given], Callable[[Given], Drive]]] = {
-    "fit": (lambda seed: Given(gsjax.open_sequence(STILL), replace(FIT_CONFIG, seed=seed)), _fit),
+def _of(name: str, config: Any) -> Callable[[int], Given]:
+    """What a method is given for a seed."""
+    return lambda seed: Given(gsjax.open_sequence(name), replace(config, seed=seed))
+
+
+METHODS: dict[str, tuple[Callable[[int], Given], Callable[[Given], dict[str, Any]]]] = {
+    "fit": (_of(STILL, FIT_CONFIG), lambda given: _followed(_fitting(given))),
     "distill": (
-        lambda seed: Given(
-            gsjax.open_sequence(STILL), DistillConfig(iterations=STEPS, contrast_after=0.3, seed=seed)
-        ),
-        _distill,
+        _of(STILL, DistillConfig(iterations=STEPS, contrast_after=0.3)),
+        lambda given: _followed(_distill(given)),
     ),
-    "parts": (lambda seed: Given(gsjax.open_sequence(PARTS), PartsConfig(seed=seed)), _parts),
+    "parts": (_of(PARTS, PartsConfig()), lambda given: _followed(_parts(given))),
+    "track": (_of(TABLE, TRACKER), lambda given: track(given.sequence, given.config, given.gaussians)),
 }
 for name in PRESETS:
-    METHODS[f"deform {name}"] = (
-        lambda seed, name=name: Given(
-            gsjax.open_sequence(TISSUE), replace(PRESETS[name], warmup=200, iterations=STEPS, seed=seed)
-        ),
-        _deform,
-    )
+    config = replace(PRESETS[name], warmup=200, iterations=STEPS)
+    METHODS[f"deform {name}"] = (_of(TISSUE, config), lambda given: _followed(_deform(given)))

@@ -15,7 +15,7 @@ from gsjax.engine.recording import FirstMask, Recording, draw_ahead, first_mask,
 from gsjax.engine.scores import Scores
 from gsjax.engine.track.loop import Tracking, begin, follow
 from gsjax.engine.track.results import MOVED_MM
-from gsjax.engine.track.scoring import group_values, metrics, score_motion
+from gsjax.engine.track.scoring import first_labels, group_values, metrics, score_motion
 from gsjax.engine.track.views import views
 from gsjax.methods.track import StartConfig, TrackConfig, TrackedScene, start_scene
 from gsjax.metrics.tracking import true_labels
@@ -82,7 +82,9 @@ def scored(start: Start, tracking: Tracking, every: int = 1) -> dict[str, Any]:
     for views_of_frame in views(tracking, recording, every):
         for view in views_of_frame:
             scores.add(view)
-    found = metrics(tracking, recording, start.mask, scores, score_motion(tracking, recording), values)
+    labels = first_labels(tracking, recording)
+    motion = score_motion(tracking, recording, labels)
+    found = metrics(tracking, recording, start.mask, scores, motion, values, labels)
     moved = {name: s for name, s in found["objects"].items() if (s["moved_mm"] or 0) > MOVED_MM}
     centroids = {name: s["centroid_error_mm"] for name, s in moved.items()}
     return {

@@ -57,7 +57,7 @@ class Guard(eqx.Module):
 
     Attributes:
         share: share of each step that is taken; 1 until a return.
-        losses: the losses of the latest steps, at most a window; NaN for those that were skipped.
+        losses: those of the latest steps, at most a window; NaN for the ones that were skipped.
         steps: number of steps in the stretch, or since the last return.
         best: the best window; None before the first.
         candidate: a better one, until the steps after it confirm its parameters, which no loss has seen.
@@ -65,7 +65,7 @@ class Guard(eqx.Module):
     """
 
     share: Float[Array, ""]
-    losses: tuple[float, ...] = ()
+    losses: Float[np.ndarray, "n"] = eqx.field(default_factory=lambda: np.zeros(0))
     steps: int = 0
     best: Level | None = None
     candidate: Level | None = None
@@ -81,7 +81,7 @@ class Guard(eqx.Module):
             step: number of steps of the run so far.
             window: number of steps that are compared.
         """
-        guard = replace(self, losses=(*self.losses, loss)[-window:], steps=self.steps + 1)
+        guard = replace(self, losses=np.append(self.losses, loss)[-window:], steps=self.steps + 1)
         best, candidate = guard.best, guard.candidate
         if candidate is not None and guard.steps >= _TAIL and step % window == _TAIL:
             is_confirmed = not candidate.is_below(_median(guard.losses[-_TAIL:]), _TAIL, _LOST, _LOST_SIGMA)
@@ -91,7 +91,7 @@ class Guard(eqx.Module):
         mean = _mean(guard.losses)
         if best is not None and best.is_below(mean, window, _LOST, _LOST_SIGMA):
             state = {"share": _SMALLER * self.share, "candidate": None, "returns": self.returns + 1}
-            return replace(guard, losses=(), steps=0, **state), _restored(best)
+            return replace(guard, losses=np.zeros(0), steps=0, **state), _restored(best)
         if mean < (np.inf if best is None else best.mean):
             level = Level(mean, float(np.nanstd(guard.losses)), jax.tree.map(np.array, params))
             guard = replace(guard, candidate=level)
@@ -109,7 +109,7 @@ class Guard(eqx.Module):
             return self, params
         latest = ((_mean(self.losses), count), (_median(self.losses[-_TAIL:]), _TAIL))
         if any(best.is_below(*some, _WORSE, _WORSE_SIGMA) for some in latest):
-            return replace(self, losses=(), steps=0, candidate=None), _restored(best)
+            return replace(self, losses=np.zeros(0), steps=0, candidate=None), _restored(best)
         return self, params
 
 
@@ -152,17 +152,17 @@ def _restored(best: Level) -> PyTree:
     return jax.tree.map(jnp.array, best.params)
 
 
-def _mean(losses: tuple[float, ...]) -> float:
+def _mean(losses: Float[np.ndarray, "n"]) -> float:
     """Mean of losses without those of skipped steps; infinite if these are half of all, or another is not
     finite."""
     return _of_those_taken(np.mean, losses)
 
 
-def _median(losses: tuple[float, ...]) -> float:
+def _median(losses: Float[np.ndarray, "n"]) -> float:
     """Median of losses, as `_mean`: one view that stands out does not count."""
     return _of_those_taken(np.median, losses)
 
 
-def _of_those_taken(statistic, losses: tuple[float, ...]) -> float:
-    taken = np.array(losses)[~np.isnan(losses)]
+def _of_those_taken(statistic, losses: Float[np.ndarray, "n"]) -> float:
+    taken = losses[~np.isnan(losses)]
     return float(statistic(taken)) if 2 * len(taken) > len(losses) else float("inf")

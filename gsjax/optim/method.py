@@ -9,17 +9,15 @@ A method is a frozen dataclass that holds its configuration. `gsjax.engine.drive
     method.result(problem, run)
 """
 
-from dataclasses import replace
-from typing import Any, Protocol, TypeVar, runtime_checkable
+from typing import Any, NamedTuple, Protocol, TypeVar, runtime_checkable
 
-import equinox as eqx
 from jaxtyping import PyTree
 
 from gsjax.optim.guard import Guard
 from gsjax.optim.step import Step
 
 
-class Run(eqx.Module):
+class Run(NamedTuple):
     """Everything needed to continue a method with bitwise equal results; all methods share this form.
 
     Attributes:
@@ -35,13 +33,13 @@ class Run(eqx.Module):
     params: PyTree
     state: PyTree
     step: int = 0
-    plans: dict[str, Any] = eqx.field(default_factory=dict)
+    plans: dict[str, Any] = {}  # noqa: RUF012 - a NamedTuple has no factories; nothing changes it in place
     kept: PyTree = None
     guard: Guard | None = None
 
     def having(self, **changes: Any) -> "Run":
         """A copy with some fields replaced."""
-        return replace(self, **changes)
+        return self._replace(**changes)
 
     def grown(self, names: tuple[str, ...], needed: Any, headroom: float) -> "Run":
         """A copy whose plans have room for what a step needed.
