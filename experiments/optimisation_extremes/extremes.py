@@ -4,7 +4,6 @@ import warnings
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from time import perf_counter
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -60,14 +59,13 @@ def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
         rows = [_outcome(method, CASES["as it is"], seed + i) for i in range(SEEDS)]
         worst = max(rows, key=lambda row: (not row["finite"], row["lost"]))
         said = dict.fromkeys(row["said"] for row in rows if row["said"])
-        totals = {key: sum(row[key] for row in rows) for key in ("returns", "skipped", "seconds")}
+        totals = {key: sum(row[key] for row in rows) for key in ("returns", "skipped")}
         return worst | totals | {"said": "; ".join(said)}
     return _outcome(method, CASES[case], seed)
 
 
 def _outcome(method: str, case: Callable[[Given], Given], seed: int) -> dict[str, Any]:
     made, begin = METHODS[method]
-    begun = perf_counter()
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", UserWarning)
         try:
@@ -76,7 +74,7 @@ def _outcome(method: str, case: Callable[[Given], Given], seed: int) -> dict[str
             return {"finite": None, "said": f"error: {error}"}
     said = dict.fromkeys(str(one.message) for one in caught if one.category is not DeprecationWarning)
     said |= dict.fromkeys([row.pop("said")] if "said" in row else [])
-    return row | {"said": "; ".join(said), "seconds": perf_counter() - begun}
+    return row | {"said": "; ".join(said)}
 
 
 def _followed(ticks: Drive) -> dict[str, Any]:
