@@ -20,7 +20,7 @@ import numpy as np
 
 from gsjax.engine.interrupts import raise_if_interrupted, shielded
 from gsjax.optim.compiler import compile_seconds, host_options
-from gsjax.optim.guard import Guard, begun, shortened, window_of
+from gsjax.optim.guard import Guard, begun, part_of_step, window_of
 from gsjax.optim.method import Method, Run
 from gsjax.optim.traces import jit_once
 from gsjax.rasterize.plan import HEADROOM
@@ -196,6 +196,6 @@ def _compiled(method: Method) -> Callable:
     def advance(params, state, share, batch, step, key):
         jax.monitoring.record_event(COMPILING)  # Python runs only while JAX traces
         new, state, info = update(params, state, batch, step=step, key=jax.random.fold_in(key, step))
-        return shortened(new, params, share), state, info
+        return part_of_step(new, params, share), state, info
 
     return jit_once(advance, method, compiler_options=host_options(), donate_argnums=(0, 1))

@@ -132,7 +132,7 @@ def window_of(total: int, period: int) -> int:
     return period * -(-max(LEAST_WINDOW, total // _WINDOWS) // period)
 
 
-def shortened(new: PyTree, old: PyTree, share: Float[Array, ""]) -> PyTree:
+def part_of_step(new: PyTree, old: PyTree, share: Float[Array, ""]) -> PyTree:
     """The parameters after a share of a step; after a whole one, the new ones to the bit.
 
     Args:
