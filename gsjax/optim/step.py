@@ -76,8 +76,14 @@ def gradient_step(
 @jax.jit
 def copied(tree: PyTree) -> PyTree:
     """The same arrays in buffers of their own, for what must survive a step that donates those of its
-    inputs."""
-    return jax.tree.map(jnp.copy, tree)
+    inputs. Half precision, in which the moments of Adam underflow, becomes single."""
+
+    def own(leaf):
+        leaf = jnp.asarray(leaf)
+        is_half = jnp.issubdtype(leaf.dtype, jnp.floating) and leaf.dtype.itemsize < 4
+        return jnp.copy(leaf.astype(jnp.float32) if is_half else leaf)
+
+    return jax.tree.map(own, tree)
 
 
 def all_finite(tree: PyTree) -> Bool[Array, ""]:

@@ -225,6 +225,15 @@ class TestLearning:
         with pytest.raises(ValueError, match="gaussians: expected at least one"):
             Deform(CONFIG).start(frames, gaussians=nowhere)
 
+    def test_half_precision_is_learned_from_in_single(self, frames):
+        """Adam divided 0 by 0 there, and every Gaussian was culled without a word."""
+        given = start_gaussians(frames, 0, CONFIG.start_pixels)
+        halved = eqx.tree_at(lambda g: g.sh0, given, given.sh0.astype(jnp.float16))
+        method = Deform(replace(CONFIG, warmup=2, iterations=0))
+        *_, last = drive(method, *method.start(frames, gaussians=halved))
+        assert last.run.params.gaussians.sh0.dtype == jnp.float32
+        assert all(jnp.isfinite(leaf).all() for leaf in jax.tree.leaves(last.run.params.gaussians))
+
     def test_given_gaussians_are_not_donated(self, frames, lesson):
         """They are those that `learned` started from, so its program serves here too."""
         given, method = start_gaussians(frames, 0, CONFIG.start_pixels), Deform(CONFIG)
