@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from gsjax.engine.drive import drive
 from gsjax.io.checkpoints import load_checkpoint, save_checkpoint
-from gsjax.optim.guard import LEAST_WINDOW, begun, shortened, window_of
+from gsjax.optim.guard import LEAST_WINDOW, begun, part_of_step, window_of
 from gsjax.optim.method import Run
 from gsjax.optim.step import Step
 
@@ -238,6 +238,6 @@ def test_half_a_step_is_half_of_each_array_and_integers_pass():
     new = {"a": old["a"] + 3, "half": old["half"] + 1, "count": jnp.int32(2)}
     expected = {"a": old["a"] + 1.5, "half": old["half"] + 0.5, "count": new["count"]}
     for share, result in ((0.5, expected), (1.0, new)):
-        found = shortened(new, old, jnp.float32(share))
+        found = part_of_step(new, old, jnp.float32(share))
         jax.tree.map(np.testing.assert_array_equal, found, result)
         assert found["half"].dtype == jnp.bfloat16
