@@ -57,9 +57,9 @@ def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
     method, case = options["method"], options["case"]
     if case == "twenty seeds":
         rows = [_outcome(method, CASES["as it is"], seed + i) for i in range(SEEDS)]
-        worst = max(rows, key=lambda row: (not row["finite"], row["lost"]))
+        worst = max(rows, key=lambda row: (not row["finite"], row.get("lost", row.get("error_mm", 0.0))))
         said = dict.fromkeys(row["said"] for row in rows if row["said"])
-        totals = {key: sum(row[key] for row in rows) for key in ("returns", "skipped")}
+        totals = {key: sum(row.get(key, 0) for row in rows) for key in ("returns", "skipped") if key in worst}
         return worst | totals | {"said": "; ".join(said)}
     return _outcome(method, CASES[case], seed)
 
@@ -73,8 +73,7 @@ def _outcome(method: str, case: Callable[[Given], Given], seed: int) -> dict[str
         except ValueError as error:
             return {"finite": None, "said": f"error: {error}"}
     said = dict.fromkeys(str(one.message) for one in caught if one.category is not DeprecationWarning)
-    said |= dict.fromkeys([row.pop("said")] if "said" in row else [])
-    return row | {"said": "; ".join(said)}
+    return row | {"said": "; ".join([*said, *row.pop("said", [])])}
 
 
 def _followed(ticks: Drive) -> dict[str, Any]:
@@ -96,7 +95,6 @@ def _followed(ticks: Drive) -> dict[str, Any]:
         "lost": max(best, ended) - ended,
         "returns": ticks.run.guard.returns,
         "skipped": skipped,
-        "curve": np.round(values[:: max(1, len(values) // 200)], 3).tolist(),
     }
 
 

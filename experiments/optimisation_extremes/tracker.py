@@ -41,8 +41,6 @@ def track(sequence: Sequence, config: TrackConfig, gaussians: int | None) -> dic
     poses = jax.tree.leaves(tracking.poses)
     return {
         "finite": all(bool(np.isfinite(leaf).all()) for leaf in poses),
-        "lost": 0.0,
-        "returns": 0,
         "skipped": tracking.skipped,
         "error_mm": float(errors[worst][-1]),
         "median_mm": float(np.median([np.median(of) for of in errors.values()])),
@@ -50,12 +48,12 @@ def track(sequence: Sequence, config: TrackConfig, gaussians: int | None) -> dic
     }
 
 
-def _said(tracking: Tracking) -> str:
+def _said(tracking: Tracking) -> list[str]:
     """How many updates reported an object as lost, or its turn as unknown."""
     lost = int(np.stack(tracking.lost).any(axis=1).sum())
     unknown = int((~np.stack(tracking.turn_known)).any(axis=1).sum())
     counts = {"an object lost": lost, "a turn unknown": unknown}
-    return ", ".join(f"{words} in {count} frames" for words, count in counts.items() if count)
+    return [f"{words} in {count} frames" for words, count in counts.items() if count]
 
 
 def longer(config: TrackConfig) -> TrackConfig:

@@ -79,9 +79,9 @@ def copied(tree: PyTree) -> PyTree:
     inputs. Half precision, in which the moments of Adam underflow, becomes single."""
 
     def own(leaf):
-        leaf = jnp.asarray(leaf)
-        is_half = jnp.issubdtype(leaf.dtype, jnp.floating) and leaf.dtype.itemsize < 4
-        return jnp.copy(leaf.astype(jnp.float32) if is_half else leaf)
+        if jnp.issubdtype(leaf.dtype, jnp.floating):
+            leaf = leaf.astype(jnp.promote_types(leaf.dtype, jnp.float32))
+        return jnp.copy(leaf)
 
     return jax.tree.map(own, tree)
 
