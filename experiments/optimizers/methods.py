@@ -24,7 +24,8 @@ from gsjax.methods.track.config import PRESETS, RefineConfig
 from gsjax.methods.track.motion import Motion, place
 from gsjax.methods.track.points import tone_images
 from gsjax.methods.track.refine import refine_loss, refine_residual
-from gsjax.methods.track.search import align_groups, first_watch, search
+from gsjax.methods.track.search import align_groups, follow, search
+from gsjax.methods.track.watch import first_watch
 from gsjax.optim.least_squares import least_squares_step
 from gsjax.optim.step import Step
 from gsjax.scene.render import render
@@ -173,7 +174,8 @@ def searched(start, points, centers, frame, config=ALIGN):
     """Alignment followed by a search for every group in all directions."""
     images, count = tone_images(frame, config.shading), len(centers)
     seen = (config, first_watch(jnp.ones(count)), jnp.ones(count, bool), jnp.int32(count))
-    return search(start[None], points, centers, images, *seen).estimate.twists
+    given = (start[None], points, centers, images, *seen)
+    return search(follow(*given), *given).estimate.twists
 
 
 def direct(update: Update, counts: list[int], find: Callable = aligned) -> Trace:

@@ -49,7 +49,7 @@ class Tracking:
         lost: [K] per update: which objects were not where they were believed to be.
         turn_known: [K] per update: whether the rotation of each object since the first frame is known.
         skipped: number of updates that changed nothing, because a number in them was not finite.
-        everywhere: number of groups that each update searched for everywhere.
+        everywhere: number of groups that each update turned or searched for.
         resumed: number of frames that an earlier run had tracked; 0 without one.
         stopped: what ended the loop early, or None.
     """

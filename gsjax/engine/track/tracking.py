@@ -102,7 +102,7 @@ def _ticks(
     frames: Iterable[Frame],
     governor: Governor | None,
 ) -> Iterator[Tick]:
-    """An update per frame; the governor limits how many groups are searched for everywhere, or the config."""
+    """An update per frame; the governor limits how many groups are searched for, or the config."""
     advance, count = _Updates(method, shape, run), run.params.scene.num_objects
     most = method.config.align.everywhere
     usually = count if most is None else min(most, count)
@@ -163,7 +163,7 @@ class _Updates:
 
     def __call__(self, run: Run, frame: Frame, everywhere: int) -> tuple[Run, dict[str, Any], float, float]:
         """The run after a frame, info, the seconds that it took, and those of compiling; `everywhere` is the
-        number of groups that may be searched for everywhere."""
+        number of groups that may be searched for."""
         clock, step = Clock(), np.int32(run.step)
         while True:
             batch = TrackBatch(frame, run.plans[PLAN], jnp.int32(everywhere))

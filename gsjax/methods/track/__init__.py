@@ -13,6 +13,7 @@ align.py      Levenberg-Marquardt on points, without rendering
 reference.py  the Gaussians that the first mask labelled: what an object has to look like
 lost.py       detection of lost objects   recover.py    relocation of lost objects
 search.py     several starts, aligned; the one that agrees best is kept
+watch.py      the record of each object: what is usual, whether it is lost or was found
 matching.py   masked cross-correlation of templates (the paper's)
 refine.py     photometric refinement (the paper's), in the tiles of region.py
 plan.py       capacities of a step        state.py      parameters, state and batch of the step

@@ -239,6 +239,13 @@ def coarse_shifts(config: AlignConfig, images: ToneImages) -> Float[Array, "n 6"
     return jnp.concatenate([shifts, jnp.zeros_like(shifts)], axis=1)
 
 
+def principal_axes(points: Points, center: Float[Array, "3"]) -> Float[Array, "3 3"]:
+    """Principal axes of a group, one a row: a bottle rolls about its own, whichever way it lies."""
+    away = (points.means - center[:, None]) * (points.seen > 0)[:, None]
+    _, vectors = jnp.linalg.eigh(jnp.einsum("cip,cjp->ij", away, away))
+    return vectors.T
+
+
 def turn_hypotheses(
     twist: Float[Array, "6"], axes: Float[Array, "3 3"], angles: tuple[float, ...]
 ) -> Float[Array, "h 6"]:

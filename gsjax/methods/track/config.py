@@ -88,7 +88,8 @@ class AlignConfig:
     spacing: float = 0.015
     """Distance between those shifts, metres."""
     everywhere: int | None = 2
-    """Groups per frame to search for throughout that radius, those that agree worst first; None: all."""
+    """Groups per frame that are turned to all sides or, if they may be lost, searched for elsewhere (which
+    counts as two), those that agree worst first; None: all. One more is shifted, none with 0."""
     turns: tuple[float, ...] = (0.2, 0.6)
     """Angles by which the best start is rotated, both ways about each principal axis, radians."""
     max_step: float = 0.1
@@ -221,6 +222,6 @@ ACCURATE = replace(
 )
 PAPER = replace(ACCURATE, refine=RefineConfig(), matching=True, redraw="all")
 PRESETS = {"fast": TrackConfig(), "balanced": BALANCED, "accurate": ACCURATE, "paper": PAPER}
-"""`fast`, the default, is for 30 Hz on one core, and searches everywhere for two objects per update;
+"""`fast`, the default, is for 30 Hz on one core, and searches for two objects per update;
 `balanced` and `accurate` align more and more points. `paper` has all stages of the paper, including template
 matching and photometric refinement, which cost much and gain little: see docs/results-tracking.md."""

@@ -21,7 +21,16 @@ _FLAT = 0.9  # a group with more than this fraction of its points in the backgro
 
 LOST, DOUBTFUL, FOUND = 0.35, 0.6, 0.6
 """Thresholds of `Confidence.agreement`: below the first a group is lost, below the second it may be
-elsewhere, above the third it is found. docs/results-hard-cases.md has measured values."""
+elsewhere, above the third it may be found. docs/results-hard-cases.md has measured values."""
+SURELY_LOST, SURELY_FOUND = 0.25, 0.7
+"""The same for a group whose residual and turn raise no doubt: it has turned to sides that look otherwise;
+and for what needs no further frame to be found."""
+SUDDEN = 0.6
+"""A group is lost at once if its agreement drops by this factor from one frame to the next."""
+FOUND_FRAMES = 4
+"""Frames in a row in which a group has to look found unless it surely is: chance does not persist."""
+PROBATION = 4
+"""Searches that must find no better place for a group that was found; it has to go on looking found."""
 
 
 class Confidence(NamedTuple):

@@ -1,9 +1,10 @@
-"""Relocation of a lost group: many guesses are aligned, and the one where most of the group shows is kept.
+"""Relocation of a lost group: the best of many guesses are aligned, and the one where most of the group shows
+is kept.
 
 Residuals cannot choose among guesses, because they count as disagreement what hides a group or lies outside
 the images. So `group_confidence` chooses, from the Gaussians of the first frame that would face each camera.
 The result is again a guess, from which the next frame continues, until enough of the group shows there for it
-to be found, in two frames: among many guesses one may agree by chance.
+to be found, in two frames unless surely: among many guesses one may agree by chance.
 """
 
 from functools import partial
@@ -14,17 +15,26 @@ import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Bool, Float, Key
 
-from gsjax.methods.track.align import align_from_afar, coarse_shifts, compose, turn_hypotheses
+from gsjax.methods.track.align import (
+    align,
+    align_from_afar,
+    coarse_shifts,
+    compose,
+    principal_axes,
+    turn_hypotheses,
+)
 from gsjax.methods.track.config import AlignConfig
 from gsjax.methods.track.layers import Shown
 from gsjax.methods.track.lost import COLOR_SCALE, Confidence, group_confidence
-from gsjax.methods.track.points import Points, ToneImages, sum_of_three
+from gsjax.methods.track.points import Points, ToneImages, pixels_of_groups, sum_of_three
 from gsjax.methods.track.reference import ReferencePoints, points_facing
+from gsjax.optim.compiler import in_memory
 
 _LARGEST_TURN = 2.0  # radians; beyond it, the points that were visible seldom still face the camera
 _NEAR_TURN = 0.3  # radians; standard deviation of turns near the last guess, per axis
-_STARTS = 8  # guesses that are aligned
-_ROUNDS = 2  # of turns that are tried from the best
+_AT_PIXELS = 4  # guesses at unexplained pixels for each coarse shift
+_STARTS = (6, 18, 14)  # guesses of each kind that are aligned, with a quarter of the points
+_ROUNDS = 2  # of turns that are tried from the best two
 
 
 def relative_twists(twists: Float[Array, "*k 6"], moved: Float[Array, "*k 6"]) -> Float[Array, "*k 6"]:
@@ -47,7 +57,7 @@ class SearchContext(NamedTuple):
     images: ToneImages
     background: Float[Array, "c h w"] | None  # its depth, metres, 0 if unknown
     others: Float[Array, "c h w"]  # depth of the groups that are not in doubt, see `depths_of_others`
-    unexplained_pixels: Points  # of the last frame
+    unexplained: Points  # pixels of the images that the last scene does not explain
 
 
 def recover(
@@ -76,41 +86,67 @@ def recover(
         points = jax.vmap(points_facing, in_axes=(None, 0, None, None))(reference, twists, center, images)
         return group_confidence(points, images, gap, context.background, context.others)
 
-    def aligned(twist):
-        faces = points_facing(reference, twist, center, images).seen
-        points = points_facing(reference, jnp.zeros_like(twist), center, images)._replace(seen=faces)
-        return align_from_afar(twist, points, center, images, config)
+    def places(twists, by: ReferencePoints, how) -> tuple[Float[Array, "n 6"], Confidence]:
+        """The twists as they are, and then aligned by these points; all points tell how much shows there."""
 
-    def places(twists) -> tuple[Float[Array, "n 6"], Confidence]:
-        """The twists as they are, and then aligned."""
-        twists = jnp.concatenate([twists, jax.vmap(aligned)(twists)])
+        def aligned(twist):
+            faces = points_facing(by, twist, center, images).seen
+            points = points_facing(by, jnp.zeros_like(twist), center, images)._replace(seen=faces)
+            return how(twist, points, center, images, config)
+
+        twists = in_memory(jnp.concatenate([twists, jax.vmap(aligned)(twists)]), images.cameras.K)
         return twists, shown(twists, reference)
 
-    def best(places) -> tuple[Float[Array, "6"], Confidence]:
-        return jax.tree.map(lambda a: a[jnp.argmax(evidence(places[1]))], places)
-
-    tried, shifts = guess[None], coarse_shifts(config, images)
+    few = jax.tree.map(lambda a: a[..., ::4], reference)
+    tried, shifts = [guess[None]], coarse_shifts(config, images)
+    axes = principal_axes(Points(reference.means[None], reference.tones[None], reference.real[None]), center)
     if len(shifts):
-        few = jax.tree.map(lambda a: a[..., ::4], reference)
-        drawn = draw_guesses(key, shifts, reference, center, context.unexplained_pixels, guess, config)
-        most = jax.lax.top_k(evidence(shown(drawn, few)), min(_STARTS, len(drawn)))[1]
-        tried = jnp.concatenate([tried, drawn[most]])
-    rounds = _ROUNDS if config.max_turn and config.turns else 0
-    count = max(len(tried), 1 + 6 * len(config.turns)) if rounds else len(tried)
-    tried = jnp.concatenate([tried, jnp.broadcast_to(guess, (count - len(tried), 6))])
+        near, around, spun = jax.random.split(key, 3)
+        drawn = (
+            guesses_near(near, shifts, guess, config),
+            guesses_at(around, shifts, few, center, context.unexplained, config),
+            guesses_spun(spun, len(shifts), axes, reference, center, guess, config),
+        )
+        drawn = in_memory(drawn, images.cameras.K)
+        for kind, most in zip(drawn, _STARTS, strict=True):
+            best = jax.lax.top_k(evidence(shown(kind, few)), min(most, len(kind)))[1]
+            tried.append(kind[best])
+    tried = jnp.concatenate(tried)
+    turns = config.turns if config.max_turn else ()
+    each = 1 + 6 * len(turns)
+    beam = max(len(tried) // each, 1)
+    count = max(len(tried), beam * each)
 
-    def one_round(i, last: Relocation) -> Relocation:
-        """What was drawn, and then turns of the best, all by one program."""
-        turned = turn_hypotheses(last.twists, jnp.eye(3), config.turns) if rounds else tried
-        turned = jnp.concatenate([turned, jnp.broadcast_to(last.twists, (count - len(turned), 6))])
-        found = places(jnp.where(i == 0, tried, turned))
-        of_guess = best(jax.tree.map(lambda a: a[::count], found))[1]  # the guess as it is, and aligned
-        of_guess = jax.tree.map(partial(jnp.where, i == 0), of_guess, last.guess_confidence)
-        return Relocation(*best(found), of_guess)
+    def padded(twists):
+        return jnp.concatenate([twists, jnp.broadcast_to(guess, (count - len(twists), 6))])
 
-    nothing = jnp.zeros((), guess.dtype)
-    unknown = Confidence(nothing, nothing, nothing > 0)
-    return jax.lax.fori_loop(0, 1 + rounds, one_round, Relocation(guess, unknown, unknown))
+    def one_round(_, tried):
+        """The best of what was tried, and what they become when they turn."""
+        twists, confidence = places(tried, few, partial(align, widen=config.widen))
+        best = best_distinct(beam, twists, evidence(confidence), config)
+        return padded(jnp.concatenate([turn_hypotheses(twist, axes, turns) for twist in best]))
+
+    tried = jax.lax.fori_loop(0, 1 + (_ROUNDS if turns else 0), one_round, padded(tried))
+    twists, confidence = places(jnp.stack([guess, tried[0]]), reference, align_from_afar)
+    best = jnp.argmax(evidence(confidence))
+    of_guess = jnp.argmax(evidence(confidence).at[1::2].set(-1.0))  # the guess as it is, and aligned
+    of_best = jax.tree.map(lambda a: a[best], confidence)
+    return Relocation(twists[best], of_best, jax.tree.map(lambda a: a[of_guess], confidence))
+
+
+def best_distinct(
+    count: int, twists: Float[Array, "n 6"], evidence: Float[Array, "n"], config: AlignConfig
+) -> list[Float[Array, "6"]]:
+    """The twist with the most evidence, then the one with the most among those that differ from it, and so
+    on."""
+    best = []
+    for _ in range(count):
+        best.append(twists[jnp.argmax(evidence)])
+        apart = relative_twists(twists, jnp.broadcast_to(best[-1], twists.shape))
+        far, turned = (jnp.linalg.norm(part, axis=1) for part in (apart[:, :3], apart[:, 3:]))
+        differs = (far > config.spacing) | (turned > max(config.turns, default=0.0))
+        evidence = jnp.where(differs, evidence, -1.0)
+    return best
 
 
 def evidence(confidence: Confidence) -> Float[Array, "*k"]:
@@ -125,52 +161,59 @@ def depths_of_others(shown: Shown, doubtful: Bool[Array, "k"]) -> Float[Array, "
     return jnp.where(sound, shown.depths, 0.0)
 
 
-def label_unexplained(
-    shown: Shown, images: ToneImages, num_groups: int, gap: float, thickness: float, coarseness: int
-) -> Shown:
-    """`shown`, in which pixels that no group explains have the label num_groups + 1 and their measured depth.
+def unexplained_pixels(
+    shown: Shown, images: ToneImages, gap: float, config: AlignConfig, coarseness: int
+) -> Points:
+    """Pixels of a frame that are nearer than what the scene shows there: something has come to them.
 
     Args:
         shown: what the scene shows, of every n-th pixel.
-        images: the frame.
-        num_groups: K.
+        images: the frame, with depths.
         gap: the background does not explain depth that is nearer by more than this, metres.
-        thickness: a group does not explain depth that is nearer by more than this, metres.
+        config: a group does not explain depth that is nearer by more than its `max_thickness`.
         coarseness: n.
     """
-    if images.depths is None:
-        return shown
+    assert images.depths is not None
     measured = images.depths[:, ::coarseness, ::coarseness]
-    nearest = shown.depths - jnp.where(shown.labels > 0, thickness, gap)
+    nearest = shown.depths - jnp.where(shown.labels > 0, config.max_thickness, gap)
     unexplained = (measured > 0) & shown.covered & (measured < nearest)
-    labels = jnp.where(unexplained, num_groups + 1, shown.labels)
-    return shown._replace(labels=labels, depths=jnp.where(unexplained, measured, shown.depths))
+    pixels = pixels_of_groups(images, unexplained.astype(jnp.int32), measured, 1, config, coarseness)
+    return jax.tree.map(lambda a: a[0], pixels)
 
 
-def draw_guesses(
+def guesses_near(
+    key: Key[Array, ""], shifts: Float[Array, "n 6"], guess: Float[Array, "6"], config: AlignConfig
+) -> Float[Array, "n 6"]:
+    """Places near the last guess, where a lost group may be: shifted by half of `shifts`, and slightly turned
+    unless `config.max_turn` is 0."""
+    turns = _NEAR_TURN * jax.random.normal(key, (len(shifts), 3)) * (config.max_turn > 0)
+    nearby = jnp.concatenate([shifts[:, :3] / 2, turns], axis=1)
+    return compose(nearby, jnp.broadcast_to(guess, nearby.shape))
+
+
+def guesses_at(
     key: Key[Array, ""],
     shifts: Float[Array, "h 6"],
     reference: ReferencePoints,
     center: Float[Array, "3"],
-    unexplained_pixels: Points,
-    guess: Float[Array, "6"],
+    unexplained: Points,
     config: AlignConfig,
-) -> Float[Array, "h 6"]:
-    """Random places where a lost group may be: half of them at unexplained pixels and a quarter nearby, both
-    turned at random, and a quarter near the last guess.
+) -> Float[Array, "n 6"]:
+    """Random places where a lost group may be, turned at random: around where it is believed to be and, four
+    times as many, at unexplained pixels, if there are any.
 
     Args:
         key: random key.
-        shifts: shifts of the places nearby.
+        shifts: shifts of the places around.
         reference: reference points of the group. One of a similar colour is brought to an unexplained pixel.
         center: centroid of the group, metres.
-        unexplained_pixels: pixels that no group explains, in each camera.
-        guess: see `recover`.
+        unexplained: see `unexplained_pixels`.
         config: nothing is turned if its `max_turn` is 0.
     """
-    count = len(shifts)
-    place, pair, axis, angle, small = jax.random.split(key, 5)
-    to, colors, there = (jnp.moveaxis(a, 0, -2).reshape(*a.shape[1:-1], -1) for a in unexplained_pixels)
+    shifts = jnp.tile(shifts[:, :3], (1 + _AT_PIXELS, 1))
+    count, around = len(shifts), len(shifts) // (1 + _AT_PIXELS)
+    place, pair, axis, angle = jax.random.split(key, 4)
+    to, colors, there = (jnp.moveaxis(a, 0, -2).reshape(*a.shape[1:-1], -1) for a in unexplained)
     any_there = there.sum() > 0
     chosen = jax.random.choice(place, len(there), (count,), p=there + ~any_there)
     apart = sum_of_three((colors[:, chosen, None] - reference.tones[:, None]) ** 2, axis=0) / COLOR_SCALE**2
@@ -180,9 +223,44 @@ def draw_guesses(
     turns *= _LARGEST_TURN * jax.random.uniform(angle, (count, 1)) * (config.max_turn > 0)
     offsets = reference.means[:, paired].T - center
     away = to[:, chosen].T - center - jaxlie.SO3.exp(turns).apply(offsets)
-    unexplained = (jnp.arange(count) % 2 == 1) & any_there
-    far = jnp.concatenate([jnp.where(unexplained[:, None], away, shifts[:, :3]), turns], axis=1)
-    small_turns = _NEAR_TURN * jax.random.normal(small, (count, 3)) * (config.max_turn > 0)
-    nearby = jnp.concatenate([shifts[:, :3] / 2, small_turns], axis=1)
-    near = compose(nearby, jnp.broadcast_to(guess, far.shape))
-    return jnp.where((jnp.arange(count) % 4 == 0)[:, None], near, far)
+    at_pixel = (jnp.arange(count) >= around) & any_there
+    return jnp.concatenate([jnp.where(at_pixel[:, None], away, shifts), turns], axis=1)
+
+
+def guesses_spun(
+    key: Key[Array, ""],
+    count: int,
+    axes: Float[Array, "3 3"],
+    reference: ReferencePoints,
+    center: Float[Array, "3"],
+    guess: Float[Array, "6"],
+    config: AlignConfig,
+) -> Float[Array, "n 6"]:
+    """The guess of the last frame, upright or upside down in any way, and spun about one of its axes by any
+    angle: what looks alike when it is turned, like a can or a box, is often found turned at first.
+
+    Args:
+        key: random key.
+        count: n, static.
+        axes: principal axes of the group, one a row.
+        reference, center, guess, config: as for `recover`.
+    """
+    angles = jax.random.uniform(key, (count, 1), minval=-jnp.pi, maxval=jnp.pi)
+    flips = jnp.pi * jnp.concatenate([axes, jnp.zeros_like(axes[:1])])
+    index, turns = jnp.arange(count), config.max_turn > 0
+    flips, spins = turns * flips[index // 3 % 4], turns * angles * axes[index % 3]
+    last = jaxlie.SO3.exp(guess[3:])
+    spun = last @ jaxlie.SO3.exp(flips) @ jaxlie.SO3.exp(spins)
+    arm = middle_of_solid(reference) - center
+    stays = guess[:3] + last.apply(arm) - spun.apply(jnp.broadcast_to(arm, (count, 3)))
+    return jnp.concatenate([stays, spun.log()], axis=1)
+
+
+def middle_of_solid(reference: ReferencePoints) -> Float[Array, "3"]:
+    """The middle of an object of which some sides are known, metres: the point that is as far below all of
+    them as possible, by least squares over the distance and the point. Without normals, their centroid."""
+    weights = reference.real / jnp.maximum(reference.real.sum(), 1)
+    mean, normal = reference.means @ weights, reference.normals @ weights
+    away, tilt = reference.means - mean[:, None], reference.normals - normal[:, None]
+    depth = jnp.sum(weights * away * tilt) / jnp.maximum(jnp.sum(weights * tilt**2), 1e-6)
+    return mean - depth * normal

@@ -1,8 +1,8 @@
 """Search for where each group has gone: several starts are aligned with the images, and the best is kept.
 
 Every group continues from the best of its starts. A group that jumps or changes its spin is missed by all of
-them and then agrees badly. So the groups that agree worst, as many as the time allows, are searched for
-everywhere around.
+them and then agrees worse than usual. So the groups that do are shifted to all sides, and those that agree
+worst after that are turned to all sides, as many as the time allows.
 """
 
 from collections.abc import Callable
@@ -20,39 +20,22 @@ from gsjax.methods.track.align import (
     align_from_afar,
     coarse_shifts,
     disagreement,
+    principal_axes,
     turn_hypotheses,
 )
 from gsjax.methods.track.config import AlignConfig
-from gsjax.methods.track.lost import DOUBTFUL, LOST, Confidence, is_found
+from gsjax.methods.track.lost import Confidence
 from gsjax.methods.track.points import Points, ToneImages
 from gsjax.methods.track.recover import Relocation
+from gsjax.methods.track.watch import JUMPED_FACTOR, MOVED_FACTOR, Estimate, SearchResult, Watch
 
-_RESIDUAL_FLOOR = 0.02  # a residual below this is noise
 _DOUBT_WEIGHT = 0.5  # urgency of being in doubt, relative to a residual at its usual value
 _WAIT_WEIGHT = 0.05  # urgency of each frame of waiting, relative to a residual at its usual value
+_FIRST_WEIGHT = 1e3  # urgency of what must not wait, likewise
+_RELOCATION_COST = 2  # a relocation takes as long as two to three turns
 _DISTINCT_TURN = 0.14  # radians; orientations further apart than this are distinct
-_STEADY_FACTOR = 2.0  # residual relative to the usual one above which a group has just moved: follow it first
+_IMPROVED = 0.9  # a search found a better place if it lowered the residual by this factor
 _MAX_OWN_RESIDUAL = 0.5  # above this a group is hidden or elsewhere, and its orientation is not known
-TURN_KNOWN = 0.045
-"""Lead above which a group's orientation is known; docs/results-hard-cases.md has leads of both kinds."""
-_FOUND_TURN_AGREEMENT = 0.65  # agreement above which a group that is found again has its first orientation
-
-
-class Estimate(NamedTuple):
-    """Where each group is, as far as is known."""
-
-    twists: Float[Array, "*k 6"]  # translation, metres, and rotation vector, radians
-    residuals: Float[Array, "*k"]  # disagreement with the images: 0 perfect, 1 not at all
-
-
-class SearchResult(NamedTuple):
-    """The result of a search."""
-
-    estimate: Estimate
-    searched: Bool[Array, "k"]  # groups that were searched for everywhere
-    relocation: Relocation  # where each group may be instead, valid only where it was tried
-    relocation_tried: Bool[Array, "k"]
-    leads: Float[Array, "k"]  # see `search_everywhere`; infinite if unknown
 
 
 align_groups = jax.vmap(align_from_afar, in_axes=(0, 0, 0, None, None))
@@ -69,14 +52,23 @@ def best_of(residuals: Float[Array, "h *k"], twists: Float[Array, "h *k 6"]) -> 
     return Estimate(take(twists, best[..., None], axis=0)[0], take(residuals, best, axis=0)[0])
 
 
-def principal_axes(points: Points, center: Float[Array, "3"]) -> Float[Array, "3 3"]:
-    """Principal axes of a group, one a row: a bottle rolls about its own, whichever way it lies."""
-    away = (points.means - center[:, None]) * (points.seen > 0)[:, None]
-    _, vectors = jnp.linalg.eigh(jnp.einsum("cip,cjp->ij", away, away))
-    return vectors.T
+def _every(step: int, points: Points) -> Points:
+    """Every n-th point."""
+    return jax.tree.map(lambda a: a[..., ::step], points)
 
 
-def search_everywhere(
+def _judged(twists: Float[Array, "h 6"], *where, widen: float = 1.0) -> Float[Array, "h"]:
+    """`disagreement` of one group after each of many twists; `where` as there."""
+    return jax.vmap(lambda twist: disagreement(twist, *where, widen))(twists)
+
+
+def _better(known: Estimate, twist: Float[Array, "6"], *where) -> Estimate:
+    """`known` or, if that agrees better, the estimate after `twist`; `where` as for `disagreement`."""
+    residuals = jnp.stack([known.residuals, disagreement(twist, *where)])
+    return best_of(residuals, jnp.stack([known.twists, twist]))
+
+
+def search_shifts(
     known: Estimate,
     starts: Float[Array, "h 6"],
     points: Points,
@@ -84,16 +76,10 @@ def search_everywhere(
     images: ToneImages,
     config: AlignConfig,
     shifts: Float[Array, "n 6"],
-) -> tuple[Estimate, Float[Array, ""]]:
-    """`known` of one group or a better estimate, and its lead: how much worse other orientations agree.
+) -> Estimate:
+    """`known` of one group, or a better estimate from shifts of its starts to all sides.
 
-    Every start is aligned, and so is the best shift of each start, for groups without texture to match or
-    that are pushed; the shifts are distributed over the starts. Then turns to all sides are tried from the
-    best result, because a knock changes a spin from one frame to the next, and a round object may roll
-    without changing its shape. Half the points choose among these hypotheses; all points make the final
-    decision. If another orientation agrees nearly as well, the images do not determine the orientation. The
-    lead is a fraction of the agreement, because hidden points agree with no orientation. It is infinite if
-    little agrees or no turn was tried.
+    A quarter of the points chooses the best shift of each start and aligns it; all points decide in the end.
 
     Args:
         known: the estimate so far.
@@ -102,35 +88,57 @@ def search_everywhere(
         center: centroid of the group, metres.
         images: the new frame.
         config: configuration of the alignment.
-        shifts: twists that are added to the starts.
+        shifts: twists that are added to the starts; they are distributed over them.
     """
-    half = jax.tree.map(lambda a: a[..., ::2], points)
+    few, count = _every(4, points), len(starts)
+    shifted = [starts[i] + shifts[i::count] for i in range(count)]
+    ends = np.cumsum([*map(len, shifted)])[:-1]
+    residuals = _judged(jnp.concatenate(shifted), few, center, images, config, widen=config.widen)
+    parts = jnp.split(residuals, ends)
+    tried = jnp.stack([best_of(*part).twists for part in zip(parts, shifted, strict=True)])
+    tried = jax.vmap(align_from_afar, in_axes=(0, None, None, None, None))(tried, few, center, images, config)
+    best = best_of(_judged(tried, few, center, images, config), tried)
+    return _better(known, align(best.twists, points, center, images, config), points, center, images, config)
 
-    def judged(twists, points, widen=1.0) -> Float[Array, "h"]:
-        over_twists = jax.vmap(disagreement, in_axes=(0, None, None, None, None, None))
-        return over_twists(twists, points, center, images, config, widen)
+
+def search_turns(
+    known: Estimate,
+    starts: Float[Array, "h 6"],
+    points: Points,
+    center: Float[Array, "3"],
+    images: ToneImages,
+    config: AlignConfig,
+) -> tuple[Estimate, Float[Array, ""]]:
+    """`known` of one group or a better estimate, and its lead: how much worse other orientations agree.
+
+    Every start is aligned. Then turns to all sides are tried from the best result, because a knock changes a
+    spin from one frame to the next, and a round object may roll without changing its shape. Half the points
+    choose among these hypotheses; all points make the final decision. If another orientation agrees nearly as
+    well, the images do not determine the orientation. The lead is a fraction of the agreement, because hidden
+    points agree with no orientation. It is infinite if little agrees or no turn was tried.
+
+    Args:
+        known: the estimate so far.
+        starts: twists to start from.
+        points: points of the group.
+        center: centroid of the group, metres.
+        images: the new frame.
+        config: configuration of the alignment.
+    """
+    half = _every(2, points)
 
     def aligned(twists):
         over_twists = jax.vmap(align, in_axes=(0, None, None, None, None, None))
         return over_twists(twists, half, center, images, config, config.widen)
 
-    tried = jnp.concatenate([starts, known.twists[None]])
-    if len(shifts):
-        few, count = jax.tree.map(lambda a: a[..., ::4], points), len(starts)
-        shifted = [starts[i] + shifts[i::count] for i in range(count)]
-        parts = jnp.split(
-            judged(jnp.concatenate(shifted), few, config.widen), np.cumsum([*map(len, shifted)])[:-1]
-        )
-        tried = jnp.stack([*tried, *(best_of(*part).twists for part in zip(parts, shifted, strict=True))])
-    tried = aligned(tried)
-    residuals = judged(tried, half)
+    tried = aligned(jnp.concatenate([starts, known.twists[None]]))
+    residuals = _judged(tried, half, center, images, config)
     if config.max_turn and config.turns:
         axes = principal_axes(points, center)
         tried = aligned(turn_hypotheses(best_of(residuals, tried).twists, axes, config.turns))
-        residuals = judged(tried, half)
+        residuals = _judged(tried, half, center, images, config)
     last = align(best_of(residuals, tried).twists, points, center, images, config)
-    ends = jnp.stack([known.twists, last])
-    best = best_of(jnp.stack([known.residuals, disagreement(last, points, center, images, config)]), ends)
+    best = _better(known, last, points, center, images, config)
     apart = jaxlie.SO3.exp(best.twists[3:]).inverse() @ jaxlie.SO3.exp(tried[:, 3:])
     distinct = jnp.linalg.norm(apart.log(), axis=-1) > _DISTINCT_TURN
     rival = jnp.min(jnp.where(distinct, residuals, jnp.inf))
@@ -138,68 +146,54 @@ def search_everywhere(
     return best, jnp.where(own < _MAX_OWN_RESIDUAL, (rival - own) / (1 - own), jnp.inf)
 
 
-class Watch(NamedTuple):
-    """Record of how each group has been followed, which decides where to search first."""
+class Followed(NamedTuple):
+    """The result of following each group from its starts."""
 
-    usual: Float[Array, "k"]  # running mean of the residual
-    waited: Float[Array, "k"]  # frames since the group was last searched for everywhere
-    largest: Float[Array, "k"]  # most pixels that ever showed the group, all cameras together
-    agrees: Float[Array, "k"]  # `Confidence.agreement` when it was last conclusive
-    lost: Bool[Array, "k"]
-    showed: Float[Array, "k"]  # `Confidence.coverage` in the first frame
-    turn_known: Bool[Array, "k"]  # orientation known since the first frame, or since it was found again
-    glimpsed: Bool[Array, "k"]  # found elsewhere in this frame, to be confirmed by the next one
-
-    @property
-    def doubtful(self) -> Bool[Array, "k"]:
-        """Groups that may be elsewhere."""
-        return self.lost | (self.agrees < DOUBTFUL)
-
-    def after(
-        self,
-        residuals: Float[Array, "k"],
-        result: SearchResult,
-        counts: Float[Array, "k"],
-        confidence: Confidence,
-        elsewhere: Bool[Array, "k"],
-        relocated: Bool[Array, "k"],
-    ) -> "Watch":
-        """The record one frame later.
-
-        Args:
-            residuals: as in `Estimate`, where each group was aligned.
-            result: result of the search.
-            counts: number of pixels that showed each group.
-            confidence: confidence that each group is where it is believed to be.
-            elsewhere: groups of which more shows in another place than in their own.
-            relocated: those of them that were moved there.
-        """
-        lost = jnp.where(self.lost, ~is_found(confidence, self.showed), confidence.agreement < LOST)
-        lost = jnp.where(confidence.conclusive, lost, self.lost)
-        as_at_first = confidence.conclusive & (confidence.agreement > _FOUND_TURN_AGREEMENT)
-        turn_known = jnp.where(self.lost | relocated, as_at_first, self.turn_known)
-        found_elsewhere = elsewhere & is_found(result.relocation.confidence, self.showed)
-        watch = Watch(
-            usual=0.8 * self.usual + 0.2 * jnp.maximum(residuals, _RESIDUAL_FLOOR),
-            waited=jnp.where(result.searched, 0.0, self.waited + 1.0),
-            largest=jnp.maximum(self.largest, counts),
-            agrees=jnp.where(confidence.conclusive, confidence.agreement, self.agrees),
-            lost=lost,
-            showed=self.showed,
-            turn_known=turn_known & (result.leads > TURN_KNOWN) & ~lost,
-            glimpsed=found_elsewhere & ~relocated & ~self.glimpsed,
-        )
-        return watch._replace(glimpsed=watch.glimpsed & watch.doubtful)
+    estimate: Estimate
+    aligned: Float[Array, "k"]  # residuals before any shift
+    shifted: Bool[Array, "k"]  # groups that agreed worse than usual then, and were shifted to all sides
+    missed: Bool[Array, "k"]  # those of them that agree nowhere near nevertheless: turn them, then relocate
 
 
-def first_watch(showed: Float[Array, "k"]) -> Watch:
-    """The record before the second frame; `showed` is the coverage of each group in the first."""
-    nothing, certain = jnp.zeros_like(showed), jnp.ones_like(showed)
-    no, yes = nothing > 0, certain > 0
-    return Watch(jnp.full_like(showed, 0.1), nothing, nothing, certain, no, showed, yes, no)
+def follow(
+    starts: Float[Array, "h k 6"],
+    points: Points,
+    centers: Float[Array, "k 3"],
+    images: ToneImages,
+    config: AlignConfig,
+    watch: Watch,
+    visible: Bool[Array, "k"],
+    everywhere: Int[Array, ""],
+) -> Followed:
+    """Each group aligned from the best of its starts, and from shifts of them if it agrees worse than usual:
+    one group more than `everywhere`, the worst first. Arguments as for `search`."""
+    over_starts = jax.vmap(disagreements, in_axes=(0, None, None, None, None))
+    best = best_of(over_starts(starts, points, centers, images, config), starts)
+    aligned = align_groups(best.twists, points, centers, images, config)
+    residuals = jnp.stack([best.residuals, disagreements(aligned, points, centers, images, config)])
+    first = estimate = best_of(residuals, jnp.stack([best.twists, aligned]))
+    shifts = coarse_shifts(config, images)
+    if not len(shifts):
+        none = jnp.zeros_like(visible)
+        return Followed(estimate, first.residuals, none, none)
+    ratio = first.residuals / watch.usual
+    jumped = visible & ~watch.lost & (ratio > JUMPED_FACTOR)
+    order = jnp.argsort(-jnp.where(jumped, ratio, 0.0))
+    count = jnp.where(everywhere > 0, jnp.minimum(jumped.sum(), everywhere + 1), 0)
+    shifted = jnp.zeros_like(jumped).at[order].set(jnp.arange(len(order)) < count)
+
+    def shift(i, estimate: Estimate) -> Estimate:
+        group = order[i]
+        known, own = jax.tree.map(lambda a: a[group], (estimate, points))
+        where = (starts[:, group], own, centers[group], images, config, shifts)
+        return _with_group(estimate, group, search_shifts(known, *where))
+
+    estimate = jax.lax.fori_loop(0, count, shift, estimate)
+    return Followed(estimate, first.residuals, shifted, shifted & watch.is_far_off(estimate.residuals))
 
 
 def search(
+    followed: Followed,
     starts: Float[Array, "h k 6"],
     points: Points,
     centers: Float[Array, "k 3"],
@@ -211,9 +205,10 @@ def search(
     suspects: Bool[Array, "k"] | None = None,
     relocate: Callable[[Int[Array, ""]], Relocation] | None = None,
 ) -> SearchResult:
-    """The twist of each group that agrees best with the images, no worse than any start.
+    """The twist of each group that agrees best with the images, no worse than where it was followed to.
 
     Args:
+        followed: result of `follow`.
         starts: hypotheses of each group: translation, metres, and rotation vector, radians.
         points: points of each group in the last frame.
         centers: centroids of the groups, metres.
@@ -221,50 +216,55 @@ def search(
         config: configuration of the alignment.
         watch: record of how the groups have been followed.
         visible: groups that some camera sees. Others are searched for only if lost.
-        everywhere: number of groups that are searched for everywhere. First come those glimpsed elsewhere,
-            then those that agree worst relative to their usual residual or have waited longest.
-        suspects: groups that are lost or may be. They are relocated where others are followed, unless they
-            are not lost and have just moved; None: no group.
+        everywhere: number of groups that are turned; one that is searched for elsewhere counts as two. First
+            come those that were glimpsed elsewhere, then lost ones that have waited, then those that agree
+            worst relative to their usual residual or have waited longest. One more is searched for elsewhere
+            if several of the first two kinds wait. With 0, `follow` shifts none either.
+        suspects: groups that are lost or may be. They are relocated where others are turned, unless they are
+            neither lost nor missed and have just moved; None: no group.
         relocate: index of a suspect -> where it may be instead.
     """
-    over_starts = jax.vmap(disagreements, in_axes=(0, None, None, None, None))
-    best = best_of(over_starts(starts, points, centers, images, config), starts)
-    aligned = align_groups(best.twists, points, centers, images, config)
-    residuals = jnp.stack([best.residuals, disagreements(aligned, points, centers, images, config)])
-    estimate = best_of(residuals, jnp.stack([best.twists, aligned]))
-    steady = estimate.residuals < _STEADY_FACTOR * watch.usual
-    suspects = jnp.zeros_like(watch.lost) if suspects is None else suspects & (watch.lost | steady)
-    shifts = coarse_shifts(config, images)
-
+    estimate = followed.estimate
+    moved = followed.aligned >= MOVED_FACTOR * watch.usual
+    suspects = jnp.zeros_like(watch.lost) if suspects is None else suspects
+    suspects &= watch.lost | followed.missed | ~moved
     urgency = estimate.residuals / watch.usual + _WAIT_WEIGHT * watch.waited + _DOUBT_WEIGHT * watch.doubtful
-    urgency = jnp.where(watch.glimpsed, jnp.inf, urgency)
-    there = visible | watch.lost
+    waits, there = watch.lost & (watch.waited > 0), visible | watch.lost
+    urgency += _FIRST_WEIGHT * (2 * watch.glimpsed + waits)
     order = jnp.argsort(-jnp.where(there, urgency, -jnp.inf))
-    count = jnp.minimum(everywhere, there.sum())
+    several = jnp.sum(watch.glimpsed | waits) > 1
+    spent = jnp.cumsum(jnp.where(suspects, _RELOCATION_COST, 1)[order])
+    within = (spent <= everywhere + _RELOCATION_COST * several) | (jnp.arange(len(order)) == 0)
+    count = jnp.where(everywhere > 0, jnp.sum(within & there[order]), 0)
 
     def look(i, carried):
-        estimate, relocation, leads = carried
+        estimate, relocation, tried, leads = carried
         group = order[i]
 
-        def follow():
+        def turned():
             known, own = jax.tree.map(lambda a: a[group], (estimate, points))
-            start = (starts[:, group], own, centers[group], images, config, shifts)
-            better, lead = search_everywhere(known, *start)
-            return _with_group(estimate, group, better), relocation, leads.at[group].set(lead)
+            better, lead = search_turns(known, starts[:, group], own, centers[group], images, config)
+            return _with_group(estimate, group, better), leads.at[group].set(lead)
 
         if relocate is None:
-            return follow()
-        elsewhere = partial(relocate, group)
-        return jax.lax.cond(
-            suspects[group], lambda: (estimate, _with_group(relocation, group, elsewhere()), leads), follow
-        )
+            estimate, leads = turned()
+            return estimate, relocation, tried, leads
+        turns = followed.missed[group] | ~suspects[group]
+        estimate, leads = jax.lax.cond(turns, turned, lambda: (estimate, leads))
+        lies_elsewhere = suspects[group] & ~(turns & ~watch.is_far_off(estimate.residuals)[group])
+        found = partial(_with_group, relocation, group)
+        relocation = jax.lax.cond(lies_elsewhere, lambda: found(relocate(group)), lambda: relocation)
+        return estimate, relocation, tried.at[group].set(lies_elsewhere), leads
 
     unknown, nothing = jnp.full_like(estimate.residuals, jnp.inf), jnp.zeros_like(estimate.residuals)
     none = Confidence(nothing, nothing, nothing > 0)
     nowhere = Relocation(jnp.zeros_like(estimate.twists), none, none)
-    estimate, relocation, leads = jax.lax.fori_loop(0, count, look, (estimate, nowhere, unknown))
+    start = (estimate, nowhere, nothing > 0, unknown)
+    estimate, relocation, tried, leads = jax.lax.fori_loop(0, count, look, start)
     searched = jnp.zeros(len(centers), bool).at[order].set(jnp.arange(len(centers)) < count)
-    return SearchResult(estimate, searched, relocation, searched & suspects, leads)
+    looked = followed.shifted | jnp.isfinite(leads) | (searched & ~tried)
+    confirmed = looked & (estimate.residuals > _IMPROVED * followed.aligned)
+    return SearchResult(estimate, searched, confirmed, relocation, tried, leads)
 
 
 def _with_group(values, group, value):

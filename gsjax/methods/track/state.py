@@ -15,7 +15,7 @@ from gsjax.methods.track.motion import Motion, Pose, place
 from gsjax.methods.track.plan import TrackPlan
 from gsjax.methods.track.points import Keyframe, Points, first_keyframe
 from gsjax.methods.track.scene import TrackedScene
-from gsjax.methods.track.search import Watch, first_watch
+from gsjax.methods.track.watch import Watch, first_watch
 from gsjax.scene.frame import Frame
 from gsjax.scene.gaussians import Gaussians
 
@@ -48,7 +48,6 @@ class TrackState(NamedTuple):
         motion: motion of the last frame: the start of delta, and the constant-velocity hypothesis.
         pixels: pixels that showed each group in the last frame.
         keyframe: pixels that showed it in an earlier frame.
-        unexplained_pixels: pixels of the last frame that no group explains.
         relocation_guesses: for groups that may be elsewhere, the twist from where they are believed to be:
             translation, metres, and rotation vector, radians.
         watch: record of how each group has been followed.
@@ -61,7 +60,6 @@ class TrackState(NamedTuple):
     motion: Motion
     pixels: Points
     keyframe: Keyframe
-    unexplained_pixels: Points
     relocation_guesses: Float[Array, "k 6"]
     watch: Watch
     count: Int[Array, ""]
@@ -81,7 +79,7 @@ class TrackBatch(NamedTuple):
     Attributes:
         frame: the frame of all cameras.
         plan: capacities for rendering.
-        everywhere: number of groups to search for everywhere; None: as configured.
+        everywhere: number of groups to turn or search for; None: as configured.
     """
 
     frame: Frame
@@ -102,8 +100,7 @@ def blank_state(params: Tracked, config: TrackConfig, shape: FrameShape) -> Trac
     width, height = shape.width // config.shrink, shape.height // config.shrink
     nowhere = jnp.zeros((groups, 6), dtype)
     vectors, weights = (cameras, 3, config.align.pixels), (cameras, config.align.pixels)
-    unexplained = Points(*(jnp.zeros(size, dtype) for size in (vectors, vectors, weights)))
-    pixels = Points(*(jnp.zeros((groups, *of_one.shape), dtype) for of_one in unexplained))
+    pixels = Points(*(jnp.zeros((groups, *size), dtype) for size in (vectors, vectors, weights)))
     shown = backdrop = images = None
     if config.redraw == "moving":
         columns, rows = (-(-size // config.coarseness) for size in (width, height))
@@ -117,7 +114,6 @@ def blank_state(params: Tracked, config: TrackConfig, shape: FrameShape) -> Trac
         Motion(nowhere, jnp.zeros_like(pose.means)),
         pixels,
         first_keyframe(pixels),
-        unexplained,
         nowhere,
         first_watch(jnp.zeros(groups, dtype)),
         jnp.int32(-1),

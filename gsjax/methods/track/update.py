@@ -37,8 +37,8 @@ def track_step(
     1. determine what the last scene shows of each object;
     2. collect hypotheses of the motion: none, the same as in the last frame and, with `config.matching`, that
        of template matching;
-    3. align each object with the images from there and keep what agrees best; search everywhere for those
-       that agree worst, and elsewhere for those that may be lost;
+    3. align each object with the images from there and keep what agrees best; shift those that agree worse
+       than usual to all sides, turn those that agree worst, and search elsewhere for those that may be lost;
     4. with `config.refine.iterations`, refine D_k and delta_i photometrically, and keep the improvements;
     5. detect lost objects, and move those that were found again;
     6. draw what the scene shows now, from which the next frame continues. With `config.redraw` "moving", only
@@ -49,7 +49,7 @@ def track_step(
     or a new pose is not finite, the update changes nothing.
 
     Beside what every step reports, `info` has `residual`, `visible`, `agrees`, `lost`, `turn_known` and
-    `looked_for` (searched for everywhere) of each group; `motion` and `centers`; `found` and `score` of
+    `looked_for` (turned or searched for) of each group; `motion` and `centers`; `found` and `score` of
     template matching; `joined`, the number of Gaussians that have joined; `broken_pixels`; and the info of
     the refinement. `loss` is the mean residual of the visible groups, and `needed` is for `TrackPlan.grown`.
 

@@ -13,8 +13,8 @@ from gsjax.methods.track.plan import Needed, TrackPlan
 from gsjax.methods.track.points import Points, ToneImages
 from gsjax.methods.track.reference import ReferencePoints
 from gsjax.methods.track.scene import TrackedScene
-from gsjax.methods.track.search import SearchResult
 from gsjax.methods.track.state import TrackState
+from gsjax.methods.track.watch import SearchResult
 from gsjax.scene.frame import Frame
 from gsjax.scene.render import Rendered
 
@@ -62,6 +62,7 @@ class Alignment(NamedTuple):
     points: Points  # the points that were aligned
     reference: Points  # the reference points among them, as the last frame saw them
     suspects: Bool[Array, "k"]  # groups that are lost, or may be and whose turn it was to be relocated
+    missed: Bool[Array, "k"]  # those of them that have just jumped and agree nowhere near
     other_depths: Float[Array, "c h w"]  # depth of the groups that are not in doubt, metres; else 0
     needed: Int[Array, ""]  # capacity that drawing the last scene in the new cameras needed
 

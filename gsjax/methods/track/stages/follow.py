@@ -1,5 +1,6 @@
 """The first four stages: each group is followed to where it agrees best with the images."""
 
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -14,11 +15,17 @@ from gsjax.methods.track.matching import Template, lift, match_templates
 from gsjax.methods.track.motion import Motion, move, select_motion
 from gsjax.methods.track.plan import Needed
 from gsjax.methods.track.points import faded, join, pixel_counts
-from gsjax.methods.track.recover import Relocation, SearchContext, depths_of_others, recover
+from gsjax.methods.track.recover import (
+    Relocation,
+    SearchContext,
+    depths_of_others,
+    recover,
+    unexplained_pixels,
+)
 from gsjax.methods.track.reference import points_last_seen
 from gsjax.methods.track.refine import RefineBatch, refine
 from gsjax.methods.track.region import near_background, near_scene, scatter, shift_background
-from gsjax.methods.track.search import disagreements, search
+from gsjax.methods.track.search import disagreements, follow, search
 from gsjax.methods.track.stages.context import Alignment, Past, Refined, Starts, UpdateContext
 from gsjax.methods.track.stages.shown import show
 from gsjax.scene.region import tiles_to_pixels, touched_tiles
@@ -87,12 +94,12 @@ def align_and_search(
     key: Key[Array, ""],
     config: TrackConfig,
 ) -> Alignment:
-    """Third stage: each group is aligned with the images. Those that agree worst are searched for
-    throughout their surroundings, and those that may be lost are searched for elsewhere.
+    """Third stage: each group is aligned with the images and, if it agrees worse than usual, shifted. Those
+    that agree worst then are turned, or searched for elsewhere if they may be lost.
 
     Args:
         now, past, starts: from the earlier stages.
-        everywhere: number of groups that are searched for everywhere.
+        everywhere: number of groups that are turned or searched for.
         key: random key of the relocation.
     """
     state, gap = now.state, config.start.depth_gap
@@ -100,22 +107,44 @@ def align_and_search(
     reference = points_last_seen(now.reference, past.shown, past.cameras, gap)
     weighted = reference._replace(seen=config.align.center_weight * reference.seen)
     points = join(weighted, state.pixels, keyframe)
+    given = (starts.twists, points, now.centers, now.images)
+    how = (config.align, state.watch, past.visible, everywhere)
+    followed = follow(*given, *how)
     doubtful = state.watch.doubtful
     in_turn = in_search_round(state.count, now.scene.num_objects) | state.watch.glimpsed
-    suspects = state.watch.lost | (doubtful & in_turn)
+    suspects = state.watch.lost | (doubtful & in_turn) | followed.missed
     shown, needed = _show_again(now, past, suspects.any(), config)
     other_depths = depths_of_others(shown, doubtful)
-    context = SearchContext(now.images, past.background, other_depths, state.unexplained_pixels)
+    # Without depth, an occluder cannot be distinguished from anything else that is not the group.
+    elsewhere = ()
+    if now.images.depths is not None:
+        elsewhere = suspects, _relocation(now, past, shown, suspects.any(), other_depths, key, config)
+    result = search(followed, *given, *how, *elsewhere)
+    return Alignment(result, points, reference, suspects, followed.missed, other_depths, needed)
+
+
+def _relocation(
+    now: UpdateContext,
+    past: Past,
+    shown: Shown,
+    wanted: Bool[Array, ""],
+    other_depths: Float[Array, "c h w"],
+    key: Key[Array, ""],
+    config: TrackConfig,
+) -> Callable[[Int[Array, ""]], Relocation]:
+    """index of a group -> where it may be instead; what all groups share is prepared only if `wanted`."""
+    gap = config.start.depth_gap
+    how = (config.grow.min_gap, config.align, config.coarseness)
+    found = partial(unexplained_pixels, shown, now.images, *how)
+    nothing = jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), jax.eval_shape(found))
+    unexplained = jax.lax.cond(wanted, found, lambda: nothing)
+    context = SearchContext(now.images, past.background, other_depths, unexplained)
 
     def relocate(group) -> Relocation:
-        own = jax.tree.map(lambda a: a[group], (now.reference, now.centers, state.relocation_guesses))
+        own = jax.tree.map(lambda a: a[group], (now.reference, now.centers, now.state.relocation_guesses))
         return recover(jax.random.fold_in(key, group), *own, context, config.align, gap)
 
-    how = (config.align, state.watch, past.visible, everywhere)
-    # Without depth, an occluder cannot be distinguished from anything else that is not the group.
-    elsewhere = () if now.images.depths is None else (suspects, relocate)
-    result = search(starts.twists, points, now.centers, now.images, *how, *elsewhere)
-    return Alignment(result, points, reference, suspects, other_depths, needed)
+    return relocate
 
 
 def in_search_round(count: Int[Array, ""], num_objects: int) -> Bool[Array, "k"]:

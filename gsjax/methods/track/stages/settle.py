@@ -7,18 +7,20 @@ import jax.numpy as jnp
 
 from gsjax.methods.track.config import TrackConfig
 from gsjax.methods.track.layers import Shown
-from gsjax.methods.track.lost import Confidence, group_confidence, is_found
+from gsjax.methods.track.lost import SURELY_FOUND, Confidence, group_confidence, is_found
 from gsjax.methods.track.motion import Motion, Pose, move, select_motion
 from gsjax.methods.track.plan import Needed
-from gsjax.methods.track.points import carry, carry_keyframe, renewed, where_groups
+from gsjax.methods.track.points import carry, carry_keyframe, pixels_of_groups, renewed, where_groups
 from gsjax.methods.track.recover import evidence, relative_twists
 from gsjax.methods.track.reference import all_points_facing, radii
-from gsjax.methods.track.search import first_watch
 from gsjax.methods.track.stages.context import Alignment, Past, Refined, Settled, UpdateContext
-from gsjax.methods.track.stages.shown import memory_of, pixels_shown, show
+from gsjax.methods.track.stages.shown import memory_of, show
 from gsjax.methods.track.state import TrackState
+from gsjax.methods.track.watch import first_watch
 
-_BETTER = 1.3  # a group is moved elsewhere only if the evidence for it is stronger by this factor
+# A group is moved elsewhere only if the evidence for it is stronger by the first of these factors; one that
+# was just found, by the second.
+_BETTER, _STILL_BETTER = 1.3, 1.1
 
 
 def detect_lost(
@@ -42,12 +44,18 @@ def detect_lost(
 
     of_facing = jax.lax.cond(alignment.suspects.any() | state.is_blank, by_all_facing, lambda: confidence)
     confidence = jax.tree.map(partial(where_groups, lost | state.is_blank), of_facing, confidence)
-    better = evidence(relocation.confidence) > _BETTER * evidence(of_facing)
-    twice = is_found(relocation.confidence, showed) & is_found(relocation.guess_confidence, showed)
-    # A group that is not lost is seen where it is. If it is only turned there, it is in no other place.
+    on_probation, astray = state.watch.probation > 0, lost | alignment.missed
+    factor = jnp.where(on_probation, _STILL_BETTER, _BETTER)
+    better = evidence(relocation.confidence) > factor * evidence(of_facing)
+    found = is_found(relocation.confidence, showed)
+    twice = found & is_found(relocation.guess_confidence, showed)
+    surely = found & (relocation.confidence.agreement > SURELY_FOUND)
+    # A group that is not lost is seen where it is. If it is only turned there, it is in no other place; but
+    # one that was just found may be turned wrongly.
     away = jnp.linalg.norm(relocation.twists[:, :3], axis=-1) > radii(now.reference, now.centers)
-    elsewhere = tried & better & (lost | away)
-    relocated = elsewhere & twice
+    elsewhere = tried & better & (astray | away | on_probation)
+    # Among many guesses one may agree by chance, but not twice.
+    relocated = elsewhere & jnp.where(astray, twice | surely, twice & (surely | on_probation))
     guesses = where_groups(tried, relocation.twists, state.relocation_guesses)
     there = Motion(relocation.twists, jnp.zeros_like(kept.delta))
     kept = select_motion(relocated, there, kept, now.scene.groups)
@@ -78,7 +86,8 @@ def remember(
     else:
         near = jnp.maximum(alignment.needed, shown_needed)
         needed = needed._replace(full=past.needed, near=jnp.maximum(needed.near, near))
-    pixels, unexplained_pixels = pixels_shown(shown, now.images, now.scene.num_objects, config)
+    how = (now.scene.num_objects, config.align, config.coarseness)
+    pixels = pixels_of_groups(now.images, shown.labels, shown.depths, *how)
     keyframe = carry_keyframe(state.keyframe, motion.twists, now.centers)
     keyframe = renewed(keyframe, pixels, config.align.keyframe_turn, relocated | state.is_blank)
     watch = state.watch.after(
@@ -90,8 +99,9 @@ def remember(
     guesses = where_groups(
         watch.doubtful & ~relocated, relative_twists(settled.guesses, motion.twists), still
     )
-    # A relocation is no velocity.
-    velocity = select_motion(relocated, jax.tree.map(jnp.zeros_like, motion), motion, groups)
+    # A relocation is no velocity, unless the group was in its place one frame ago.
+    no_velocity = relocated & ~alignment.missed
+    velocity = select_motion(no_velocity, jax.tree.map(jnp.zeros_like, motion), motion, groups)
     memory = memory_of(shown, past.backdrop, now.frame, config)
-    new = TrackState(velocity, pixels, keyframe, unexplained_pixels, guesses, watch, state.count + 1, *memory)
+    new = TrackState(velocity, pixels, keyframe, guesses, watch, state.count + 1, *memory)
     return pose, new, shown, needed

@@ -1,14 +1,11 @@
 """What a scene shows in the cameras of a frame, and the part of it that the next frame needs."""
 
-import jax
 from jaxtyping import Array, Int
 
 from gsjax.methods.track.config import TrackConfig
 from gsjax.methods.track.layers import Backdrop, Shown, render_labels, show_moving, shown_by
 from gsjax.methods.track.motion import Pose
 from gsjax.methods.track.plan import TrackPlan
-from gsjax.methods.track.points import Points, ToneImages, pixels_of_groups
-from gsjax.methods.track.recover import label_unexplained
 from gsjax.methods.track.scene import TrackedScene
 from gsjax.scene.frame import Frame
 
@@ -27,18 +24,6 @@ def show(
         rendered = render_labels(scene, pose, frame, plan.full)
         return shown_by(rendered), rendered.meta.needed.max()
     return show_moving(scene, pose, backdrop, plan.near, config.coarseness)
-
-
-def pixels_shown(
-    shown: Shown, images: ToneImages, num_objects: int, config: TrackConfig
-) -> tuple[Points, Points]:
-    """Pixels of `images` in which `shown` has each of the `num_objects` groups, and those that no group
-    explains."""
-    gaps = (config.grow.min_gap, config.align.max_thickness)
-    labelled = label_unexplained(shown, images, num_objects, *gaps, config.coarseness)
-    how = (num_objects + 1, config.align, config.coarseness)
-    pixels = pixels_of_groups(images, labelled.labels, labelled.depths, *how)
-    return jax.tree.map(lambda a: a[:-1], pixels), jax.tree.map(lambda a: a[-1], pixels)
 
 
 def memory_of(shown: Shown, backdrop: Backdrop | None, frame: Frame, config: TrackConfig) -> tuple:

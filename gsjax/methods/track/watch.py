@@ -1,0 +1,142 @@
+"""The record of how each group has been followed: which are lost, which were found, and what is usual for
+them."""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from gsjax.methods.track.lost import (
+    DOUBTFUL,
+    FOUND,
+    FOUND_FRAMES,
+    LOST,
+    PROBATION,
+    SUDDEN,
+    SURELY_FOUND,
+    SURELY_LOST,
+    Confidence,
+    is_found,
+)
+from gsjax.methods.track.recover import Relocation
+
+_RESIDUAL_FLOOR = 0.02  # a residual below this is noise
+JUMPED_FACTOR = 1.5
+"""Residual relative to the usual one above which a group may have jumped."""
+MOVED_FACTOR = 2.0
+"""The same above which it has just moved."""
+_CALM_FACTOR = 1.25  # the same below which it agrees as usual
+_FAR_OFF_FACTOR, _FAR_OFF = 4.0, 0.3  # the same, and the residual itself, above which it is nowhere near
+TURN_KNOWN = 0.045
+"""Lead above which a group's orientation is known; docs/results-hard-cases.md has leads of both kinds."""
+_FOUND_TURN_AGREEMENT = 0.65  # agreement above which a group that is found again has its first orientation
+
+
+class Estimate(NamedTuple):
+    """Where each group is, as far as is known."""
+
+    twists: Float[Array, "*k 6"]  # translation, metres, and rotation vector, radians
+    residuals: Float[Array, "*k"]  # disagreement with the images: 0 perfect, 1 not at all
+
+
+class SearchResult(NamedTuple):
+    """The result of a search."""
+
+    estimate: Estimate
+    searched: Bool[Array, "k"]  # groups that were turned or searched for elsewhere
+    confirmed: Bool[Array, "k"]  # groups for which shifts or turns found no better place
+    relocation: Relocation  # where each group may be instead, valid only where it was tried
+    relocation_tried: Bool[Array, "k"]
+    leads: Float[Array, "k"]  # see `search_turns`; infinite if unknown
+
+
+class Watch(NamedTuple):
+    """Record of how each group has been followed, which decides where to search first, and what is lost."""
+
+    usual: Float[Array, "k"]  # running mean of the residual
+    waited: Float[Array, "k"]  # frames since the group was last `SearchResult.searched`
+    largest: Float[Array, "k"]  # most pixels that ever showed the group, all cameras together
+    agrees: Float[Array, "k"]  # `Confidence.agreement` when it was last conclusive
+    lost: Bool[Array, "k"]
+    showed: Float[Array, "k"]  # `Confidence.coverage` in the first frame
+    turn_known: Bool[Array, "k"]  # orientation known since the first frame, or since it was found again
+    glimpsed: Bool[Array, "k"]  # found elsewhere in this frame, to be confirmed by the next one
+    streak: Float[Array, "k"]  # consecutive frames in which the group has looked found
+    probation: Float[Array, "k"]  # searches that a group that was found again has yet to pass, see `after`
+
+    @property
+    def doubtful(self) -> Bool[Array, "k"]:
+        """Groups that may be elsewhere."""
+        return self.lost | (self.agrees < DOUBTFUL) | (self.probation > 1)
+
+    def is_far_off(self, residuals: Float[Array, "k"]) -> Bool[Array, "k"]:
+        """Groups that agree nowhere near as well as usual."""
+        return residuals > jnp.maximum(_FAR_OFF_FACTOR * self.usual, _FAR_OFF)
+
+    def after(
+        self,
+        residuals: Float[Array, "k"],
+        result: SearchResult,
+        counts: Float[Array, "k"],
+        confidence: Confidence,
+        elsewhere: Bool[Array, "k"],
+        relocated: Bool[Array, "k"],
+    ) -> "Watch":
+        """The record one frame later.
+
+        The usual residual rises only where a search found no better place, or a group that lags would soon be
+        taken to agree as usual. A group is lost below a threshold of its agreement, or if its agreement drops
+        within one frame while its residual rises. It is found if most of it agrees, or enough in several
+        frames in a row. Then it is on probation: one that looks alike must not be found elsewhere in several
+        searches, and then a search has to tell its turn.
+
+        Args:
+            residuals: as in `Estimate`, where each group was aligned.
+            result: result of the search.
+            counts: number of pixels that showed each group.
+            confidence: confidence that each group is where it is believed to be.
+            elsewhere: groups of which more shows in another place than in their own.
+            relocated: those of them that were moved there.
+        """
+        agreement, conclusive = confidence.agreement, confidence.conclusive
+        there = is_found(confidence, self.showed)
+        streak = jnp.where(there, self.streak + 1.0, 0.0)
+        found = there & ((agreement > SURELY_FOUND) | (streak >= FOUND_FRAMES))
+        calm = self.turn_known & (residuals < _CALM_FACTOR * self.usual)
+        least = jnp.where(self.probation > 0, FOUND, jnp.where(calm, SURELY_LOST, LOST))
+        dropped = (agreement < SUDDEN * self.agrees) & (residuals > MOVED_FACTOR * self.usual)
+        lost = jnp.where(self.lost | relocated, ~found, (agreement < least) | dropped)
+        lost = jnp.where(conclusive, lost, self.lost)
+
+        told = (self.probation == 1) & jnp.isfinite(result.leads) & conclusive
+        told &= agreement > _FOUND_TURN_AGREEMENT
+        passed = (self.probation > 1) & result.relocation_tried & ~elsewhere
+        probation = self.probation - (passed | told)
+        probation = jnp.where(self.lost | relocated, 1.0 + PROBATION, probation)
+        probation = jnp.where(lost, 0.0, probation)
+        turn_known = (self.turn_known | told) & (probation == 0) & (result.leads > TURN_KNOWN) & ~lost
+
+        found_elsewhere = elsewhere & is_found(result.relocation.confidence, self.showed)
+        residuals = jnp.maximum(residuals, _RESIDUAL_FLOOR)
+        usual = jnp.where(result.confirmed | (residuals < self.usual), residuals, self.usual)
+        watch = Watch(
+            usual=0.8 * self.usual + 0.2 * usual,
+            waited=jnp.where(result.searched, 0.0, self.waited + 1.0),
+            largest=jnp.maximum(self.largest, counts),
+            agrees=jnp.where(conclusive, agreement, self.agrees),
+            lost=lost,
+            showed=self.showed,
+            turn_known=turn_known,
+            glimpsed=found_elsewhere & ~relocated & ~self.glimpsed,
+            streak=streak,
+            probation=probation,
+        )
+        return watch._replace(glimpsed=watch.glimpsed & watch.doubtful)
+
+
+def first_watch(showed: Float[Array, "k"]) -> Watch:
+    """The record before the second frame; `showed` is the coverage of each group in the first."""
+    nothing, certain = jnp.zeros_like(showed), jnp.ones_like(showed)
+    no, yes = nothing > 0, certain > 0
+    usual = jnp.full_like(showed, 0.1)
+    return Watch(usual, nothing, nothing, certain, no, showed, yes, no, nothing, nothing)
