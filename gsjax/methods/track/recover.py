@@ -124,7 +124,8 @@ def recover(
         """The best of what was tried, and what they become when they turn."""
         twists, confidence = places(tried, few, partial(align, widen=config.widen))
         best = best_distinct(beam, twists, evidence(confidence), config)
-        return padded(jnp.concatenate([turn_hypotheses(twist, axes, turns) for twist in best]))
+        turned = [turn_hypotheses(twist, axes, turns) if turns else twist[None] for twist in best]
+        return padded(jnp.concatenate(turned))
 
     tried = jax.lax.fori_loop(0, 1 + (_ROUNDS if turns else 0), one_round, padded(tried))
     twists, confidence = places(jnp.stack([guess, tried[0]]), reference, align_from_afar)
