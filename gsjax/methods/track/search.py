@@ -252,8 +252,8 @@ def search(
         turns = followed.missed[group] | ~suspects[group]
         estimate, leads = jax.lax.cond(turns, turned, lambda: (estimate, leads))
         lies_elsewhere = suspects[group] & ~(turns & ~watch.is_far_off(estimate.residuals)[group])
-        found = partial(_with_group, relocation, group)
-        relocation = jax.lax.cond(lies_elsewhere, lambda: found(relocate(group)), lambda: relocation)
+        found, find = partial(_with_group, relocation, group), relocate
+        relocation = jax.lax.cond(lies_elsewhere, lambda: found(find(group)), lambda: relocation)
         return estimate, relocation, tried.at[group].set(lies_elsewhere), leads
 
     unknown, nothing = jnp.full_like(estimate.residuals, jnp.inf), jnp.zeros_like(estimate.residuals)
