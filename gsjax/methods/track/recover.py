@@ -211,8 +211,8 @@ def guesses_at(
         unexplained: see `unexplained_pixels`.
         config: nothing is turned if its `max_turn` is 0.
     """
-    shifts = jnp.tile(shifts[:, :3], (1 + _AT_PIXELS, 1))
-    count, around = len(shifts), len(shifts) // (1 + _AT_PIXELS)
+    around, shifts = len(shifts), jnp.tile(shifts[:, :3], (1 + _AT_PIXELS, 1))
+    count = len(shifts)
     place, pair, axis, angle = jax.random.split(key, 4)
     to, colors, there = (jnp.moveaxis(a, 0, -2).reshape(*a.shape[1:-1], -1) for a in unexplained)
     any_there = there.sum() > 0
