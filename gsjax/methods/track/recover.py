@@ -34,7 +34,7 @@ _LARGEST_TURN = 2.0  # radians; beyond it, the points that were visible seldom s
 _NEAR_TURN = 0.3  # radians; standard deviation of turns near the last guess, per axis
 _AT_PIXELS = 4  # guesses at unexplained pixels for each coarse shift
 _STARTS = (6, 18, 14)  # guesses of each kind that are aligned, with a quarter of the points
-_ROUNDS = 2  # of turns that are tried from the best two
+_ROUNDS = 2  # of turns that are tried from the best of them
 
 
 def relative_twists(twists: Float[Array, "*k 6"], moved: Float[Array, "*k 6"]) -> Float[Array, "*k 6"]:
@@ -114,7 +114,7 @@ def recover(
     tried = jnp.concatenate(tried)
     turns = config.turns if config.max_turn else ()
     each = 1 + 6 * len(turns)
-    beam = max(len(tried) // each, 1)
+    beam = max(len(tried) // each, 1) if turns else 1
     count = max(len(tried), beam * each)
 
     def padded(twists):
