@@ -138,8 +138,7 @@ def recover(
 def best_distinct(
     count: int, twists: Float[Array, "n 6"], evidence: Float[Array, "n"], config: AlignConfig
 ) -> list[Float[Array, "6"]]:
-    """The twist with the most evidence, then the one with the most among those that differ from it, and so
-    on."""
+    """The `count` twists with the most evidence, each of which differs from all those before it."""
     best = []
     for _ in range(count):
         best.append(twists[jnp.argmax(evidence)])
@@ -186,7 +185,7 @@ def guesses_near(
     key: Key[Array, ""], shifts: Float[Array, "n 6"], guess: Float[Array, "6"], config: AlignConfig
 ) -> Float[Array, "n 6"]:
     """Places near the last guess, where a lost group may be: shifted by half of `shifts`, and slightly turned
-    unless `config.max_turn` is 0."""
+    at random by `key` unless `config.max_turn` is 0."""
     turns = _NEAR_TURN * jax.random.normal(key, (len(shifts), 3)) * (config.max_turn > 0)
     nearby = jnp.concatenate([shifts[:, :3] / 2, turns], axis=1)
     return compose(nearby, jnp.broadcast_to(guess, nearby.shape))
