@@ -83,15 +83,15 @@ class Notes:
 
     @property
     def warnings(self) -> list[str]:
-        """The first warning of each kind."""
-        return list(self._first.values())
+        """The first warning of each kind, with the number of the others."""
+        more = {kind: count - 1 for kind, count in self._counts.items()}
+        tail = {kind: f" (and {n} more like it)" if n else "" for kind, n in more.items()}
+        return [f"{text}{tail[kind]}" for kind, text in self._first.items()]
 
     @property
     def all(self) -> list[str]:
-        """The notes, then the first warning of each kind, with the number of the others."""
-        more = {kind: count - 1 for kind, count in self._counts.items()}
-        tail = {k: f" (and {n} more like it)" if n else "" for k, n in more.items()}
-        return [*self._added, *(f"Warning: {text}{tail[kind]}" for kind, text in self._first.items())]
+        """The notes, then the warnings."""
+        return [*self._added, *(f"Warning: {text}" for text in self.warnings)]
 
     def __enter__(self) -> "Notes":
         self._caught = warnings.catch_warnings()

@@ -1,4 +1,4 @@
-"""The start of `gsjax.deform`: that of `gsjax deform`, but with all frames and silently."""
+"""The start of `gsjax.deform`: that of `gsjax deform`, but with all frames, and each kind of warning once."""
 
 import warnings
 from dataclasses import replace
@@ -39,8 +39,9 @@ def start_from(
     quiet, config = Console(quiet=True), method.config
     notes = Notes(quiet)
     every = replace(sequence, splits=None)  # what is learned from is selected by whoever calls
-    seen, source = with_depth(every, "auto", config.plane_depth, notes)
-    data = deform_data(seen, 0, tools, choice, config.channels, tool_values, notes, quiet)
+    with notes:
+        seen, source = with_depth(every, "auto", config.plane_depth, notes)
+        data = deform_data(seen, 0, tools, choice, config.channels, tool_values, notes, quiet)
     if first is not None and first not in data.train:
         raise ValueError(f"first: expected one of the training frames, {data.train}, found {first}")
     for text in notes.warnings:

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
+import gsjax as gs
 from gsjax.data import DataError, DataWarning, open_photographs, open_sequence
 from gsjax.data.ordered import sequence_of
 from gsjax.engine.deform.depth import with_depth
@@ -92,6 +93,15 @@ def test_what_there_is_is_taken_first():
     together = replace(blind, viewmats=blind.viewmats[:, [0, 0]])
     with pytest.raises(ValueError, match=r"cameras 0 and 1 cannot be matched: .* --depth plane starts"):
         with_depth(together, "auto", 1.0, notes)
+
+
+def test_in_python_each_kind_of_warning_is_given_once():
+    grey = replace(open_sequence(EYES), load_image=lambda t, c: np.full((80, 96, 3), 9 + c, np.uint8))
+    with pytest.warns(DataWarning) as caught:
+        gs.deform(grey, gs.DeformConfig(warmup=2, iterations=2), teacher="none")
+    empty = [str(one.message) for one in caught if "all of one colour" in str(one.message)]
+    assert len(empty) == 1
+    assert empty[0].endswith("more like it)")
 
 
 def test_photographs_that_were_placed_are_frames(gsjax, photographs, tmp_path):
