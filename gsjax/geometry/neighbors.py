@@ -4,6 +4,10 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 
+_AROUND = [(down, right) for down in (-1, 0, 1) for right in (-1, 0, 1) if down or right]
+_MOST, _ENOUGH = 5, 2  # pixels around one that have depth, and that have the same
+_SAME_DEPTH = 0.05  # relative: a surface seen at a grazing angle recedes by this from pixel to pixel
+
 
 def nearest(
     queries: Float[np.ndarray, "m 3"], points: Float[np.ndarray, "n 3"], max_distance: float = np.inf
@@ -42,3 +46,23 @@ def voxel_thin(points: Float[np.ndarray, "n 3"], voxel: float) -> Int[np.ndarray
     order = np.lexsort((distance, inverse))
     first = np.concatenate([[True], np.diff(inverse[order]) > 0])
     return np.sort(order[first])
+
+
+def on_surfaces(depths: Float[np.ndarray, "*c h w"]) -> Float[np.ndarray, "*c h w"]:
+    """Depth where it is that of a surface, else 0: a pixel is on none if its depth is not positive and
+    finite, or if most of its eight neighbours have depth but fewer than two of them the same, within 5 %.
+    Depth cameras measure such points at edges, in rain and on dark or shiny things. Sparse depth is kept,
+    and so are lines one pixel wide.
+
+    Args:
+        depths: depth images of any number of cameras, metres.
+    """
+    known = np.where(np.isfinite(depths) & (depths > 0), depths, 0)
+    height, width = known.shape[-2:]
+    padded = np.pad(known, [(0, 0)] * (known.ndim - 2) + [(1, 1), (1, 1)])
+    around, alike = np.zeros(known.shape, np.int8), np.zeros(known.shape, np.int8)
+    for down, right in _AROUND:
+        other = padded[..., 1 + down : 1 + down + height, 1 + right : 1 + right + width]
+        around += other > 0
+        alike += (other > 0) & (np.abs(other - known) <= _SAME_DEPTH * known)
+    return np.where((around >= _MOST) & (alike < _ENOUGH), 0, known).astype(depths.dtype)

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, UInt8
 
 from gsjax.geometry.cameras import Camera, resized
+from gsjax.geometry.neighbors import on_surfaces
 
 Seen = TypeVar("Seen")
 
@@ -40,14 +41,11 @@ class Frame(eqx.Module):
 
     @property
     def known_depths(self) -> Float[np.ndarray, "c height width"]:
-        """On the host: depths where they are finite, positive and count, else 0; zeros without depth."""
+        """On the host: depths of surfaces (`on_surfaces`) where they count, else 0; zeros without depth."""
         if self.depths is None:
             return np.zeros(self.images.shape[:-1], np.float32)
-        depths = np.asarray(self.depths)
-        known = np.isfinite(depths) & (depths > 0)
-        if self.masks is not None:
-            known &= np.asarray(self.masks)
-        return np.where(known, depths, 0)
+        depths = on_surfaces(np.asarray(self.depths))
+        return depths if self.masks is None else np.where(np.asarray(self.masks), depths, 0)
 
 
 def of_cameras(frame: Frame, which: slice | Int[Array | np.ndarray, "k"]) -> Frame:

@@ -1,9 +1,12 @@
 """Neighbour queries against brute force."""
 
 import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
 
-from gsjax.geometry.neighbors import nearest, neighbor_spacing, voxel_thin
+from gsjax.geometry.neighbors import nearest, neighbor_spacing, on_surfaces, voxel_thin
 
+AROUND = [(down, right) for down in (-1, 0, 1) for right in (-1, 0, 1) if down or right]
 POINTS = np.random.default_rng(0).uniform(size=(60, 3))
 
 
@@ -44,3 +47,33 @@ def test_thinning_keeps_the_point_nearest_to_the_mean_of_each_voxel():
         np.testing.assert_allclose(np.linalg.norm(POINTS[i] - here.mean(0)), gap)
     np.testing.assert_array_equal(voxel_thin(POINTS, 0.0), np.arange(60))
     assert len(voxel_thin(POINTS[:0], 0.3)) == 0
+
+
+def slope(height=24, width=32):
+    return np.float32(1 + np.linspace(0, 0.5, width) + np.linspace(0, 0.2, height)[:, None])
+
+
+@given(st.integers(0, 2**32 - 1), st.sampled_from([0.1, 0.3, 3.0, 10.0]))
+def test_depth_that_stands_alone_is_on_no_surface(seed, factor):
+    random, surface = np.random.default_rng(seed), slope()
+    off = random.uniform(size=surface.shape) < 0.05
+    wrong = on_surfaces(np.where(off, factor * surface, surface))
+    crowd = np.pad(off, 1)
+    others = sum(np.roll(crowd, by, (0, 1)) for by in AROUND)[1:-1, 1:-1]
+    inside = np.pad(np.ones((22, 30), bool), 1)
+    assert (wrong[off & (others < 2) & inside] == 0).all()
+    assert (wrong[~off & (others < 4)] == surface[~off & (others < 4)]).all()
+
+
+def test_surfaces_edges_lines_and_sparse_depth_are_kept():
+    scene = slope()
+    scene[8:16, 10:20] = 0.7
+    scene[4, 2:30] = 0.5
+    scene[:, 31] = 0
+    kept = on_surfaces(np.stack([scene, scene]))
+    ends = np.zeros(scene.shape, bool)
+    ends[4, [2, 29]] = True
+    assert (kept == np.where(ends, 0, scene)).all()
+    lidar = np.where(np.arange(24 * 32).reshape(24, 32) % 3 == 0, np.geomspace(1, 9, 32, dtype=np.float32), 0)
+    assert (on_surfaces(lidar) == lidar).all()
+    assert on_surfaces(np.full((5, 5), np.nan)).sum() == 0

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from gsjax.geometry.neighbors import on_surfaces
 from gsjax.losses.photometric import photometric_loss, truncated_l1
 from gsjax.methods.track.config import TrackConfig
 from gsjax.methods.track.scene import TrackedScene, labelled_cloud, scene_from_cloud
@@ -50,6 +51,9 @@ def start_scene(
     frame, broken = without_broken(eqx.tree_at(lambda f: f.images, frame, frame.colors))
     if broken:
         warnings.warn(f"the first frame has {broken} pixels that are not finite; ignored", stacklevel=2)
+    if frame.depths is not None:
+        surfaces = jnp.asarray(on_surfaces(np.asarray(frame.depths)))
+        frame = eqx.tree_at(lambda f: f.depths, frame, surfaces)
     scene = scene_from_cloud(labelled_cloud(frame, mask, mask_camera, config.start), config.start)
     if before_fit is not None:
         before_fit(scene)
