@@ -1,5 +1,7 @@
 """The first frame: labels lifted from one view, discs that face their camera, and errors that help."""
 
+import warnings
+
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
@@ -80,6 +82,17 @@ def test_depth_that_is_off_in_single_pixels_makes_no_groups_and_nothing_large(ta
         points = [np.asarray(s.gaussians.means)[values_of(s) == value] for s in (told, given)]
         low, high = points[0].min(0) - 0.02, points[0].max(0) + 0.02
         assert ((points[1] > low) & (points[1] < high)).all(1).mean() > 0.98
+
+
+def test_objects_of_a_few_gaussians_are_told_of(table):
+    """They could go astray by 166 mm without a word."""
+    _, frames, mask = table()
+    coarse = TrackConfig(start=StartConfig(iterations=0, object_pixels=60.0))
+    with pytest.warns(UserWarning, match=r"gives \d+ to object \d.*fewer than 12 .*object_pixels, now 60"):
+        start_scene(frames[0], mask, 0, coarse)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        start_scene(frames[0], mask, 0, TrackConfig(start=START))
 
 
 def values_of(scene):

@@ -50,7 +50,11 @@ _OVER_TIME = (
 )
 _CLASSES = (Column("class", "class"), Column("IoU", "iou", "", 4), Column("Dice (F1)", "dice", "", 4))
 _TRACKS = (Column("", "which"), Column("median", "median", "mm", 3), Column("p95", "p95", "mm", 2))
-_RECIPES = {"surst": "After SurstSplat", "clin": "After GaussianClin"}
+_RECIPES = {
+    "surst": "After SurstSplat",
+    "clin": "After GaussianClin",
+    "around": "For a camera around a moving object",
+}
 
 
 def summarize(folder: RunFolder, found: Metrics) -> Summary:

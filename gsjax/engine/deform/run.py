@@ -42,7 +42,7 @@ from gsjax.engine.progress import (
 )
 from gsjax.engine.recording import located, open_recording
 from gsjax.engine.teaching.choice import NO_TEACHER, TeacherChoice, TeacherOptions
-from gsjax.methods.deform import PRESETS, Deform, DeformConfig
+from gsjax.methods.deform import PRESETS, Deform, DeformConfig, with_defaults
 from gsjax.methods.deform.method import PLAN
 from gsjax.methods.deform.update import LOSSES
 
@@ -54,8 +54,10 @@ _UNLIKE = 0.6  # an IoU
 class Options(TeacherOptions, OfDataset):
     """Options of `gsjax deform`."""
 
-    preset: Literal["surst", "clin"] = "surst"
-    """Recipe whose settings are the defaults of --deform: SurstSplat's or GaussianClin's."""
+    preset: Literal["surst", "clin", "around"] | None = None
+    """Recipe whose settings are the defaults of --deform: SurstSplat's, GaussianClin's, or the one for a
+    camera that goes around a moving object, as in D-NeRF's scenes. Default: around if the scene starts within
+    its visual hull (--depth), else surst."""
     tools: Tools = "leave-out"
     """Leave tools out, or draw them too. Tools are recognised by the names of mask values; without
     names, all values but 0 are tools."""
@@ -83,10 +85,11 @@ def run(options: Options) -> int:
     with Notes(console) as notes:
         expect_dataset(options.dataset)
         folder = RunFolder.locked(options.out, overwrite=options.overwrite, resume=options.resume)
+        sequence, source = _recording(options, notes)
+        options = _with_preset(options, source, notes)
         settings = replace(options, dataset=located(options.dataset), **choice.located())
         if options.resume:
             folder.check_config(settings, but=RESUME_MAY_CHANGE)
-        sequence, source = _recording(options, notes)
         how = (options.test_every, options.tools, choice, options.deform.channels)
         data = deform_data(sequence, *how, options.tool_values, notes, console)
         if data.meaning is None and choice.features != NO_TEACHER:
@@ -144,6 +147,17 @@ def run(options: Options) -> int:
         }
         finish(folder, found, summarize)
     return exit_code(progress.stopped)
+
+
+def _with_preset(options: Options, source: DepthSource, notes: Notes) -> Options:
+    """The options with the preset that suits the recording, if none was named."""
+    if options.preset is not None:
+        return options
+    if source != "hull":
+        return replace(options, preset="surst")
+    notes.add("The camera goes around: --preset around, whose values replace all defaults of surst.")
+    suited = with_defaults(options.deform, PRESETS["around"], PRESETS["surst"])
+    return replace(options, preset="around", deform=suited)
 
 
 def _warn_of_oddities(progress: Progress, judged: Mapping[str, Any], notes: Notes) -> None:

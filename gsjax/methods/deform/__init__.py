@@ -5,7 +5,7 @@ problem, run = method.start(frames, lesson)
 for now in drive(method, problem, run): ...
 now.result.at(0.5)
 
-config.py     configuration, and the recipes of the two papers
+config.py     configuration, the recipes of the two papers, and one for a camera around an object
 method.py     the method of the drive loop
 start.py      initial Gaussians, from the depth of all frames or on a plane
 hull.py       initial Gaussians within the visual hull of a scene that the camera goes around
@@ -27,6 +27,7 @@ from gsjax.methods.deform.config import (
     DeformConfig,
     DeformRatesConfig,
     DeformWeightsConfig,
+    with_defaults,
 )
 from gsjax.methods.deform.facts import LabelledView, SceneFacts, facts_of_views, scene_facts
 from gsjax.methods.deform.graph import (
@@ -106,5 +107,6 @@ __all__ = [
     "step",
     "text_prompt",
     "times_of",
+    "with_defaults",
     "with_field",
 ]

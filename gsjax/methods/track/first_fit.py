@@ -13,6 +13,7 @@ import numpy as np
 from gsjax.geometry.neighbors import on_surfaces
 from gsjax.losses.photometric import photometric_loss, truncated_l1
 from gsjax.methods.track.config import TrackConfig
+from gsjax.methods.track.lost import MIN_POINTS
 from gsjax.methods.track.scene import TrackedScene, labelled_cloud, scene_from_cloud
 from gsjax.optim.compiler import host_options
 from gsjax.optim.step import gradient_step, per_field_adam
@@ -24,6 +25,7 @@ from gsjax.scene.render import plan_render, render
 # Depth has measured the means, so they hardly move; the other fields learn to blend into the images.
 RATES = {"means": 2e-5, "quats": 5e-3, "log_scales": 1e-2, "logit_opacities": 3e-2, "sh0": 1e-2}
 _DEPTH_WEIGHT, _DEPTH_LIMIT = 1.0, 0.05
+_FEW = 2 * MIN_POINTS
 
 
 def start_scene(
@@ -55,9 +57,23 @@ def start_scene(
         surfaces = jnp.asarray(on_surfaces(np.asarray(frame.depths)))
         frame = eqx.tree_at(lambda f: f.depths, frame, surfaces)
     scene = scene_from_cloud(labelled_cloud(frame, mask, mask_camera, config.start), config.start)
+    _warn_of_few(scene, config.start.object_pixels)
     if before_fit is not None:
         before_fit(scene)
     return fit_scene(scene, frame, config.start.iterations, config.headroom)[0]
+
+
+def _warn_of_few(scene: TrackedScene, pixels: float) -> None:
+    """Warns of objects that could go astray without a word."""
+    counts = np.bincount(np.asarray(scene.labels), minlength=len(scene.label_ids))[1:]
+    few = {label: n for label, n in zip(scene.label_ids[1:], counts.tolist(), strict=True) if n < _FEW}
+    if few:
+        words = ", ".join(f"{count} to object {label}" for label, count in few.items())
+        warnings.warn(
+            f"the first frame gives {words}: with fewer than {_FEW} Gaussians, hardly anything tells whether "
+            f"one is lost; lower track.start.object_pixels, now {pixels:g}, or leave them out of the mask",
+            stacklevel=3,
+        )
 
 
 def fit_loss(gaussians, batch, *, step, key):

@@ -16,7 +16,8 @@ from gsjax.methods.track.points import Points, ToneImages, rotated, sum_of_three
 
 COLOR_SCALE = 0.15
 """Scale of the difference of tones, which allows for turns and shadows since the first frame."""
-_MIN_POINTS = 6.0  # fewer visible points are not conclusive
+MIN_POINTS = 6
+"""Fewer visible points are not conclusive."""
 _FLAT = 0.9  # a group with more than this fraction of its points in the background's surface is a card on it
 
 LOST, DOUBTFUL, FOUND = 0.35, 0.6, 0.6
@@ -101,7 +102,7 @@ def group_confidence(
     sums = (a.sum((1, 2), dtype=float) for a in over_groups(*centers, *views))
     alike, of_a_card, flat, clear, expected = sums
     alike = jnp.where(flat > _FLAT * clear, of_a_card, alike)
-    return Confidence(alike / jnp.maximum(clear, 1), alike / jnp.maximum(expected, 1), clear >= _MIN_POINTS)
+    return Confidence(alike / jnp.maximum(clear, 1), alike / jnp.maximum(expected, 1), clear >= MIN_POINTS)
 
 
 def is_found(confidence: Confidence, showed: Float[Array, "k"]) -> Bool[Array, "k"]:

@@ -7,6 +7,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+import yaml
 from rich.console import Console
 
 import gsjax as gs
@@ -19,7 +20,7 @@ from gsjax.engine.messages import Notes
 from gsjax.engine.pictures import frame_rate
 from gsjax.engine.teaching.choice import TeacherChoice
 from gsjax.engine.viewables import open_viewable
-from gsjax.methods.deform import Deform, DeformConfig, goes_around, hull_gaussians
+from gsjax.methods.deform import PRESETS, Deform, DeformConfig, goes_around, hull_gaussians
 from tests.data.moving_object import write_dnerf
 
 SIZE, COUNTS = 40, {"train": 12, "val": 3, "test": 4}
@@ -126,6 +127,10 @@ def test_a_run_is_learned_and_scored_on_white(gsjax, folder, tmp_path):
     found = json.loads((run / "metrics.json").read_text())
     assert found["frames"] == {"learned": 12, "held_out": 4}
     assert found["depth"] == {"source": "hull", "metric": False}
+    assert found["preset"] == "around"
+    settings = yaml.safe_load((run / "config.yml").read_text())
+    assert settings["deform"]["rates"] == vars(PRESETS["around"].rates)
+    assert (settings["deform"]["warmup"], settings["deform"]["deformation"]["resolution"]) == (6, 8)
     assert found["num_gaussians"] == 600
     splits = open_as_sequence(str(folder)).splits
     assert {splits[row["frame"]] for row in found["scores"]} == {"test"}
