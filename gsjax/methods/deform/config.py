@@ -81,6 +81,9 @@ class DeformConfig:
     warmup_frames: Literal["first", "all"] = "first"
     """Frames of the warm-up: the one that the canonical scene is initialized from, or all; all too where it
     is initialized within its visual hull, from all."""
+    coarse_until: float = 0.0
+    """Share of all steps that see smaller pictures, a quarter and then half as wide and high: they take less
+    time, and what moves far is found more easily."""
     refine_poses: bool = False
     """Optimize the poses of the cameras of all frames but the first."""
     nodes: int = 2048
@@ -110,6 +113,7 @@ class DeformConfig:
             start_pixels=(0.25, np.inf),
             plane_depth=(1e-6, np.inf),
             hull_points=(8, np.inf),
+            coarse_until=(0, 1),
             channels=(1, 4096),
             nodes=(0, np.inf),
             moving_share=(1e-3, 1),
@@ -130,10 +134,13 @@ PRESETS = MappingProxyType(
         "around": DeformConfig(
             warmup=200,
             iterations=3800,
+            coarse_until=0.5,
             optimizer="adamw",
             schedule="cosine",
             deformation=DeformationConfig(resolution=32, time_resolution=15),
-            rates=DeformRatesConfig(means=1.6e-3, log_scales=1e-2, sh0=7.5e-3),
+            rates=DeformRatesConfig(
+                means=1.6e-3, quats=3e-3, log_scales=1e-2, logit_opacities=5e-2, sh0=7.5e-3
+            ),
         ),
     }
 )
