@@ -27,7 +27,7 @@ MOVES = 0.1  # standard deviation of a pixel over time above which something mov
 
 
 def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
-    """One reconstruction; without a field, all of its steps are warm-up."""
+    """One reconstruction by a preset; a static one is all warm-up."""
     near = ReadOptions(near=0.5)  # cameras of the dome see each other
     sequence = gsjax.open_sequence(str(recorded("panoptic_basketball")), near).scaled(SCALE)
     times, ids = unit_times(sequence), sequence.camera_ids
@@ -40,9 +40,8 @@ def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
     moments = range(sequence.num_frames)
     views = {"one": [(t, learners[t % len(learners)]) for t in moments]}
     views["all"] = [(t, c) for t in moments for c in learners]
-    learned, preset = [frame(*view) for view in views[options["cameras"]]], PRESETS["around"]
-    if options["field"] == "none":
-        preset = replace(preset, warmup=STEPS, iterations=0)
+    learned, recipe = [frame(*view) for view in views[options["cameras"]]], options["recipe"]
+    preset = replace(PRESETS["around"], warmup=STEPS, iterations=0) if recipe == "static" else PRESETS[recipe]
     ticks, took = reconstructed(learned, preset, STEPS, None, hull_points=POINTS, seed=seed)
     judged = [[frame(t, ids.index(camera)) for t in moments[::EVERY]] for camera in HELD_OUT]
     held_out = scores(ticks, [one for of_camera in judged for one in of_camera], None)

@@ -42,12 +42,18 @@ def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
         config = replace(config, weights=replace(config.weights, rigidity=0.0))
     method = Deform(config)
     problem, started = method.start(data.frames)
+    cameras = jax.tree.map(lambda *all: jnp.concatenate(all), *(f.cameras for f in problem.seen))
+    plan = plan_render(started.params.gaussians, cameras, headroom=ROOM)
     if how in ("total variation", "both"):
-        cameras = jax.tree.map(lambda *all: jnp.concatenate(all), *(f.cameras for f in problem.seen))
-        variation = hidden_variation(plan_render(started.params.gaussians, cameras, headroom=ROOM))
-        method = replace(method, extra_losses=(variation,))
+        method = replace(method, extra_losses=(hidden_variation(plan),))
     ticks = drive(method, problem, started)
     seconds = [now.seconds for now in ticks if now.step > config.warmup + 100]
+    for frame in problem.seen:
+        there = ticks.result.scene.at(frame.time, ticks.result.moving)
+        if render(there, frame.cameras, plan).meta.overflow.any():
+            raise ValueError(
+                f"ROOM: expected a plan for all frames, found {ROOM} times the first one too small"
+            )
     return {
         "held_out": _held_out(ticks, data),
         "step_ms": 1e3 * float(np.median(seconds)),
@@ -56,7 +62,8 @@ def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
 
 
 def hidden_variation(plan: Plan) -> ExtraLoss:
-    """The total variation of colours and depth in the pixels that a frame hides, a mean over its pixels.
+    """The total variation of colours and depth over pairs of neighbouring pixels of which a frame hides one
+    or both, a mean over its pixels.
 
     Args:
         plan: of pictures without masks.

@@ -19,8 +19,8 @@ Color = tuple[float, float, float] | None
 def reconstructed(
     frames: list[Frame], preset: DeformConfig, steps: int, background: Color, **changes: Any
 ) -> tuple[Drive, dict[str, float]]:
-    """A scene of frames without depth, and what it took: milliseconds of a step, and minutes in all. The
-    warm-up takes the share of the steps that it has in the preset."""
+    """A scene of frames without depth, and what it took without compiling: milliseconds of a step at the end,
+    and minutes. The warm-up takes the share of the steps that it has in the preset."""
     warmup = steps * preset.warmup // (preset.warmup + preset.iterations)
     method = Deform(replace(preset, warmup=warmup, iterations=steps - warmup, **changes))
     ticks = drive(method, *method.start(frames, background=background, hull=True))

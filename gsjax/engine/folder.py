@@ -280,11 +280,12 @@ class RunFolder:
         return _flat(read_values(self.config, parse_yaml)).get(name)
 
     def check_config(self, config: Any, *, but: tuple[str, ...]) -> None:
-        """Raises ValueError if config.yml differs from `config` in settings other than `but`."""
+        """Raises ValueError if config.yml differs from `config` in settings other than `but`, or those that
+        an earlier version did not have."""
         stored = _flat(read_values(self.config, parse_yaml))
         given = _flat(plain(dataclasses.asdict(config)))
         names = [n for n in dict.fromkeys([*given, *stored]) if n.split(".")[0] not in but]
-        others = [name for name in names if stored.get(name) != given.get(name)]
+        others = [name for name in names if name in stored and stored[name] != given.get(name)]
         if others:
             words = [f"{n} {stored.get(n)!r}, now it is {given.get(n)!r}" for n in others]
             raise ValueError(

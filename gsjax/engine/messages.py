@@ -59,11 +59,16 @@ class Notes:
         with Notes(console) as notes: ...
 
     While the block runs, warnings of gsjax are printed plainly to the console. Two that differ only in
-    numbers (one per frame, say) are of one kind.
+    numbers (one per frame, say) are of one kind. Those of other packages are hidden from users of the command
+    line, unless Python runs with -W.
+
+    Args:
+        console: where warnings are printed.
+        of_all: show warnings of other packages as usual.
     """
 
-    def __init__(self, console: Console):
-        self._console = console
+    def __init__(self, console: Console, of_all: bool = False):
+        self._console, self._of_all = console, of_all or bool(sys.warnoptions)
         self._first: dict[str, str] = {}
         self._counts: Counter[str] = Counter()
         self._added: list[str] = []
@@ -105,7 +110,7 @@ class Notes:
                 issubclass(category, UserWarning) and Path(filename).is_relative_to(_PACKAGE)
             ):
                 self.warn(" ".join(str(message).split()))
-            elif sys.warnoptions:  # with python -W, other warnings are shown as usual
+            elif self._of_all:
                 show(message, category, filename, lineno, file, line)
 
         warnings.showwarning = showwarning

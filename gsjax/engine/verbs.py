@@ -18,7 +18,7 @@ from gsjax.data.sequence import Sequence
 from gsjax.engine.drive import Drive, Tick, drive
 from gsjax.engine.track.tracking import track as track
 from gsjax.losses.extra import ExtraLosses
-from gsjax.methods.deform import Deform, DeformConfig
+from gsjax.methods.deform import DeformConfig
 from gsjax.methods.distill import Distill, DistillConfig, Teacher
 from gsjax.methods.fit import Fit, FitConfig, prune
 from gsjax.methods.parts import Parts, PartsConfig, begin
@@ -81,8 +81,9 @@ def deform(
     Args:
         sequence: from `gsjax.open_sequence`; trains on all frames of its first camera (see `select`).
             Depth is the camera's own, else from stereo matching with the second camera; without either, the
-            scene starts as a plane.
-        config: settings (default: those of `DeformConfig`).
+            scene starts within its visual hull if the camera goes around it, else as a plane.
+        config: settings (default: `PRESETS["around"]` of `gsjax.methods.deform` for a hull, else those of
+            `DeformConfig`).
         teacher: source of the features learned beside colours: "classes" of masks, "closed", a folder of
             feature files, "none", or a `TeacherChoice` with weights and masks (default: classes, if there are
             two or more among the pixels that count).
@@ -107,8 +108,8 @@ def deform(
     """
     from gsjax.engine.deform.start import start_from  # teachers are slow to import
 
-    method = Deform(DeformConfig() if config is None else config, extra_losses)
-    problem, run = start_from(method, sequence, teacher, tools, tool_values, first, gaussians)
+    given = (sequence, teacher, tools, tool_values, first, gaussians)
+    method, problem, run = start_from(config, extra_losses, *given)
     return drive(method, problem, run if after is None else _going_on(after, method))
 
 

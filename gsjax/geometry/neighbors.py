@@ -5,7 +5,6 @@ from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 
 _AROUND = [(down, right) for down in (-1, 0, 1) for right in (-1, 0, 1) if down or right]
-_MOST, _ENOUGH = 5, 2  # pixels around one that have depth, and that have the same
 _SAME_DEPTH = 0.05  # relative: a surface seen at a grazing angle recedes by this from pixel to pixel
 
 
@@ -49,10 +48,12 @@ def voxel_thin(points: Float[np.ndarray, "n 3"], voxel: float) -> Int[np.ndarray
 
 
 def on_surfaces(depths: Float[np.ndarray, "*c h w"]) -> Float[np.ndarray, "*c h w"]:
-    """Depth where it is that of a surface, else 0: a pixel is on none if its depth is not positive and
-    finite, or if most of its eight neighbours have depth but fewer than two of them the same, within 5 %.
-    Depth cameras measure such points at edges, in rain and on dark or shiny things. Sparse depth is kept,
-    and so are lines one pixel wide.
+    """Depth where it is that of a surface, else 0.
+
+    A pixel is on none if its depth is not positive and finite, or stands alone: of five or more of its eight
+    neighbours that have depth, fewer than two have the same within 5 %, or of three or four none has. Depth
+    cameras measure such points at edges, in rain and on dark or shiny things. Sparse depth is kept, and lines
+    one pixel wide, but depth whose noise is above about 3 % is thinned.
 
     Args:
         depths: depth images of any number of cameras, metres.
@@ -65,4 +66,5 @@ def on_surfaces(depths: Float[np.ndarray, "*c h w"]) -> Float[np.ndarray, "*c h 
         other = padded[..., 1 + down : 1 + down + height, 1 + right : 1 + right + width]
         around += other > 0
         alike += (other > 0) & (np.abs(other - known) <= _SAME_DEPTH * known)
-    return np.where((around >= _MOST) & (alike < _ENOUGH), 0, known).astype(depths.dtype)
+    alone = ((around >= 5) & (alike < 2)) | ((around >= 3) & (alike < 1))
+    return np.where(alone, 0, known).astype(depths.dtype)

@@ -88,7 +88,9 @@ def test_objects_of_a_few_gaussians_are_told_of(table):
     """They could go astray by 166 mm without a word."""
     _, frames, mask = table()
     coarse = TrackConfig(start=StartConfig(iterations=0, object_pixels=60.0))
-    with pytest.warns(UserWarning, match=r"gives \d+ to object \d.*fewer than 12 .*object_pixels, now 60"):
+    with pytest.warns(
+        UserWarning, match=r"object \d has \d+.*expected 12 or more; set --track.start.object-pixels"
+    ):
         start_scene(frames[0], mask, 0, coarse)
     with warnings.catch_warnings():
         warnings.simplefilter("error")

@@ -1,7 +1,7 @@
 """A run of `gsjax deform`: one camera's frames in, a folder with a scene over time, its scores and a report
 out."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields, replace
 from time import perf_counter
 from typing import Annotated, Any, Literal
@@ -42,7 +42,7 @@ from gsjax.engine.progress import (
 )
 from gsjax.engine.recording import located, open_recording
 from gsjax.engine.teaching.choice import NO_TEACHER, TeacherChoice, TeacherOptions
-from gsjax.methods.deform import PRESETS, Deform, DeformConfig, with_defaults
+from gsjax.methods.deform import PRESETS, Deform, DeformConfig
 from gsjax.methods.deform.method import PLAN
 from gsjax.methods.deform.update import LOSSES
 
@@ -72,8 +72,13 @@ class Options(TeacherOptions, OfDataset):
 
 
 @releasing_locks()
-def run(options: Options) -> int:
+def run(options: Options, by_preset: Callable[[str], Options] | None = None) -> int:
     """Reconstruct a deforming scene and report on it; returns the exit code.
+
+    Args:
+        options: those of the command.
+        by_preset: the same options with the defaults of a preset, for when none is named; None keeps
+            `options.deform` as it is.
 
     Raises:
         ValueError, OSError: the options cannot be followed; everything learned before that is on disk.
@@ -86,7 +91,12 @@ def run(options: Options) -> int:
         expect_dataset(options.dataset)
         folder = RunFolder.locked(options.out, overwrite=options.overwrite, resume=options.resume)
         sequence, source = _recording(options, notes)
-        options = _with_preset(options, source, notes)
+        if options.preset is None:
+            preset = _preset_for(options, source, folder)
+            suited = replace(options, preset=preset) if by_preset is None else by_preset(preset)
+            options = checked(suited)
+            if preset == "around":
+                console.print("settings of --preset around, as the scene starts within its hull")
         settings = replace(options, dataset=located(options.dataset), **choice.located())
         if options.resume:
             folder.check_config(settings, but=RESUME_MAY_CHANGE)
@@ -149,15 +159,12 @@ def run(options: Options) -> int:
     return exit_code(progress.stopped)
 
 
-def _with_preset(options: Options, source: DepthSource, notes: Notes) -> Options:
-    """The options with the preset that suits the recording, if none was named."""
+def _preset_for(options: Options, source: DepthSource, folder: RunFolder) -> str:
+    """The preset that was named; else the one of the run that is resumed, or the one for the recording."""
     if options.preset is not None:
-        return options
-    if source != "hull":
-        return replace(options, preset="surst")
-    notes.add("The camera goes around: --preset around, whose values replace all defaults of surst.")
-    suited = with_defaults(options.deform, PRESETS["around"], PRESETS["surst"])
-    return replace(options, preset="around", deform=suited)
+        return options.preset
+    begun = folder.setting("preset") if options.resume else None
+    return begun or ("around" if source == "hull" else "surst")
 
 
 def _warn_of_oddities(progress: Progress, judged: Mapping[str, Any], notes: Notes) -> None:

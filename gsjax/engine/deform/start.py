@@ -1,4 +1,4 @@
-"""The start of `gsjax.deform`: that of `gsjax deform`, but with all frames, and each kind of warning once."""
+"""The start of `gsjax.deform`: that of `gsjax deform`, but with all frames, and with warnings for notes."""
 
 import warnings
 from dataclasses import replace
@@ -11,46 +11,54 @@ from gsjax.engine.deform.data import Tools, deform_data
 from gsjax.engine.deform.depth import METRIC, with_depth
 from gsjax.engine.messages import Notes
 from gsjax.engine.teaching.choice import TeacherChoice
-from gsjax.methods.deform import Deform, Problem
+from gsjax.losses.extra import ExtraLosses
+from gsjax.methods.deform import PRESETS, Deform, DeformConfig, Problem
 from gsjax.optim.method import Run
 from gsjax.scene.gaussians import Gaussians
 
 
 def start_from(
-    method: Deform,
+    config: DeformConfig | None,
+    extra_losses: ExtraLosses,
     sequence: Sequence,
     teacher: TeacherChoice | str | None,
     tools: Tools,
     tool_values: tuple[int, ...],
     first: int | None,
     gaussians: Gaussians | None,
-) -> tuple[Problem, Run]:
-    """The problem and the run before its first step; oddities of the data become warnings.
+) -> tuple[Deform, Problem, Run]:
+    """The method, its problem, and the run before its first step; each kind of oddity of the data becomes one
+    warning.
 
     Args:
-        method: with its settings.
-        sequence, teacher, tools, tool_values, first, gaussians: as for `gsjax.deform`.
+        config, extra_losses, sequence, teacher, tools, tool_values, first, gaussians: as for `gsjax.deform`.
 
     Raises:
         ValueError, DataError, FileNotFoundError: as for `gsjax.deform`.
     """
     choice = teacher if isinstance(teacher, TeacherChoice) else TeacherChoice(teacher or "auto")
     choice.check(optional=True)
-    quiet, config = Console(quiet=True), method.config
-    notes = Notes(quiet)
+    quiet = Console(quiet=True)
+    notes = Notes(quiet, of_all=True)
     every = replace(sequence, splits=None)  # what is learned from is selected by whoever calls
-    with notes:
-        seen, source = with_depth(every, "auto", config.plane_depth, notes)
-        data = deform_data(seen, 0, tools, choice, config.channels, tool_values, notes, quiet)
+    try:
+        with notes:
+            plane = (config or DeformConfig()).plane_depth
+            seen, source = with_depth(every, "auto", plane, notes)
+            if config is None:
+                config = PRESETS["around"] if source == "hull" else DeformConfig()
+            data = deform_data(seen, 0, tools, choice, config.channels, tool_values, notes, quiet)
+    finally:
+        for text in notes.warnings:
+            warnings.warn(text, DataWarning, stacklevel=3)
     if first is not None and first not in data.train:
         raise ValueError(f"first: expected one of the training frames, {data.train}, found {first}")
-    for text in notes.warnings:
-        warnings.warn(text, DataWarning, stacklevel=3)
     if first is not None:
         first = data.train.index(first)
     elif source != "hull":
         first = data.first
-    return method.start(
+    method = Deform(config, extra_losses)
+    problem, run = method.start(
         data.frames,
         data.lesson,
         first=first,
@@ -59,3 +67,4 @@ def start_from(
         background=seen.background,
         hull=source == "hull",
     )
+    return method, problem, run

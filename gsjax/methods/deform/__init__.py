@@ -27,7 +27,6 @@ from gsjax.methods.deform.config import (
     DeformConfig,
     DeformRatesConfig,
     DeformWeightsConfig,
-    with_defaults,
 )
 from gsjax.methods.deform.facts import LabelledView, SceneFacts, facts_of_views, scene_facts
 from gsjax.methods.deform.graph import (
@@ -107,6 +106,5 @@ __all__ = [
     "step",
     "text_prompt",
     "times_of",
-    "with_defaults",
     "with_field",
 ]

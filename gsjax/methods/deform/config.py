@@ -1,8 +1,8 @@
-"""Configuration of a deforming scene, and the recipes of the two papers."""
+"""Configuration of a deforming scene, the two papers' recipes, and one for a camera around an object."""
 
-from dataclasses import dataclass, field, fields, is_dataclass, replace
+from dataclasses import dataclass, field
 from types import MappingProxyType
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
@@ -146,23 +146,5 @@ PRESETS = MappingProxyType(
 )
 """The two papers' recipes: GaussianClin (section A: Adam, 1k canonical and 3k joint iterations), and
 SurstSplat (section 3: AdamW, cosine, weight decay 1e-5). And this project's for a camera that goes around a
-moving object: random points in its hull have far to go, a warm-up would only blur what moves, and where each
-time has one view, a field with few vertices fits no view alone."""
-
-
-def with_defaults(config: DeformConfig, of: DeformConfig, instead_of: DeformConfig) -> DeformConfig:
-    """The configuration with the values of one preset wherever it has those of another.
-
-    Args:
-        config: settings.
-        of: the preset whose values are taken.
-        instead_of: the preset whose values are replaced.
-    """
-
-    def mixed(mine: Any, new: Any, old: Any) -> Any:
-        if not is_dataclass(mine):
-            return new if mine == old else mine
-        parts = {f.name: [getattr(one, f.name) for one in (mine, new, old)] for f in fields(mine)}
-        return replace(mine, **{name: mixed(*values) for name, values in parts.items()})
-
-    return mixed(config, of, instead_of)
+moving object: random points in its hull have far to go, a warm-up would only blur what moves, a field with
+few vertices fits no view alone where each time has one, and small pictures show first what moves far."""

@@ -25,7 +25,7 @@ from gsjax.methods.deform.update import Batch, DeformingScene, Moving, deform_st
 from gsjax.methods.sampling import shrink_at, shuffled_index
 from gsjax.optim.method import Run
 from gsjax.optim.step import Step, copied
-from gsjax.rasterize.plan import HEADROOM
+from gsjax.rasterize.plan import HEADROOM, Plan
 from gsjax.scene.deformation import init_deformation
 from gsjax.scene.frame import Frame, part_of
 from gsjax.scene.gaussians import Gaussians, cull_invalid
@@ -159,11 +159,7 @@ class Deform:
         timeline = timeline_of(frames) if timeline is None else timeline
         behind = None if background is None else jnp.array([background], jnp.result_type(float))
         problem = Problem(frames, lesson, seen, ids, codebook, first, radius, bounds, timeline, behind)
-        plans = {}
-        for shrink in _shrinks(config, seen[0]):
-            views = [smaller(frame, shrink).cameras for frame in seen]
-            cameras = jax.tree.map(lambda *arrays: jnp.concatenate(arrays), *views)
-            plans[_plan_name(shrink)] = plan_render(scene.gaussians, cameras, headroom=HEADROOM)
+        plans = {PLAN: _plan_of(scene, seen, 1)}
         return problem, Run(scene, jax.jit(self.step.init)(scene), plans=plans, kept=Kept())
 
     @property
@@ -180,8 +176,8 @@ class Deform:
         return len(problem.seen)
 
     def between(self, problem: Problem, run: Run, progress: float) -> Run:
-        """Adds the field after the warm-up, selects the Gaussians that keep moving, and makes the graph.
-        Arguments as for `Method.between`."""
+        """Adds the field after the warm-up, selects the Gaussians that keep moving, makes the graph, and
+        plans new sizes. Arguments as for `Method.between`."""
         config, step = self.config, run.step
         gate, graph = (
             config.warmup + round(share * config.iterations) for share in (_GATE_AFTER, config.graph.after)
@@ -190,9 +186,10 @@ class Deform:
             scene, moving = with_field(config, problem, run.params)
             run = run.having(params=scene, state=jax.jit(self.step.init)(scene), kept=Kept(moving))
         moving, graphs = run.kept
-        before = (step - 1) / max(1, self.total(problem))
-        if self._shrink(problem, progress) != self._shrink(problem, before):
-            run = run.having(guard=None)  # another size, another loss
+        shrink = self._shrink(problem, progress)
+        if run.plans.keys() != {PLAN, name := _plan_name(shrink)}:  # another size, another loss
+            plan = run.plans.get(name) or _plan_of(run.params, problem.seen, shrink)
+            run = run.having(plans={PLAN: run.plans[PLAN], name: plan}, guard=None)
         if step == gate and config.moving_share < 1 and moving is None:
             moving = _farthest_moved(run.params, problem.seen, config.moving_share)
         if step == graph and graphs is None:
@@ -209,7 +206,12 @@ class Deform:
         return batch_of(problem, run, i, shrink), (_plan_name(shrink),)
 
     def _shrink(self, problem: Problem, progress: float) -> int:
-        return min(shrink_at(self.config.coarse_until, progress), max(_shrinks(self.config, problem.seen[0])))
+        """The factor by which frames are downscaled now: so much that something is left of them."""
+        camera = problem.seen[0].cameras
+        most = min(camera.height, camera.width) / _LEAST_SIDE
+        return max(
+            f for f in (1, 2, 4) if f <= max(1, min(most, shrink_at(self.config.coarse_until, progress)))
+        )
 
     def result(self, problem: Problem, run: Run) -> DeformResult:
         """The scene over time. It shares the arrays of the run, which later steps may donate."""
@@ -244,14 +246,15 @@ def batch_of(problem: Problem, run: Run, i: int, shrink: int = 1) -> Batch:
     return Batch(smaller(problem.seen[i], shrink), view, ids, *given)
 
 
-def _shrinks(config: DeformConfig, frame: Frame) -> list[int]:
-    """The factors by which frames are downscaled over a run, as far as something is left of them."""
-    least = min(frame.cameras.height, frame.cameras.width)
-    return [1, *(shrink for shrink in (2, 4) if config.coarse_until and least >= _LEAST_SIDE * shrink)]
-
-
 def _plan_name(shrink: int) -> str:
     return PLAN if shrink == 1 else f"{PLAN} 1/{shrink}"
+
+
+def _plan_of(scene: DeformingScene, seen: Sequence[Frame], shrink: int) -> Plan:
+    """The plan for rendering the scene in all frames, downscaled."""
+    views = [smaller(frame, shrink).cameras for frame in seen]
+    cameras = jax.tree.map(lambda *arrays: jnp.concatenate(arrays), *views)
+    return plan_render(scene.gaussians, cameras, headroom=HEADROOM)
 
 
 def smaller(frame: Frame, shrink: int) -> Frame:

@@ -34,6 +34,7 @@ def start_gaussians(frames: Sequence[Frame], first: int, pixels: float) -> Gauss
         ValueError: no frame has depth where a pixel counts.
     """
     order = [first, *(i for i in range(len(frames)) if i != first)]
+    of_first = known_depth(frames[first])
     points, colors = np.zeros((0, 3), np.float32), np.zeros((0, 3), np.float32)
     pixel = 0.0  # its width at the median depth, metres
     for i in order:
@@ -45,7 +46,7 @@ def start_gaussians(frames: Sequence[Frame], first: int, pixels: float) -> Gauss
             pixel = float(np.median(known[known > 0])) / K[0, 0]
         some, shades = points_from_rgbd(frame.images[0], known, viewmat, K)
         if len(points):
-            new = _unseen(some, frames[first])
+            new = _unseen(some, frames[first], of_first)
             apart, _ = cKDTree(points).query(some, distance_upper_bound=_NEAR_PX * pixel)
             new &= ~np.isfinite(apart)
             some, shades = some[new], shades[new]
@@ -97,9 +98,11 @@ def known_depth(frame: Frame) -> Float[np.ndarray, "h w"]:
     return frame.known_depths[0].astype(np.float32)
 
 
-def _unseen(points: Float[np.ndarray, "n 3"], frame: Frame) -> Bool[np.ndarray, "n"]:
+def _unseen(
+    points: Float[np.ndarray, "n 3"], frame: Frame, known: Float[np.ndarray, "h w"]
+) -> Bool[np.ndarray, "n"]:
     """Which points project outside the frame or to a pixel without known depth, or lie far behind it."""
-    known, camera = known_depth(frame), frame.cameras
+    camera = frame.cameras
     at = pixels_of(points, camera.viewmat[0], camera.K[0], camera.width, camera.height)
     before = known[at.rows, at.columns]
     return ~at.inside | (before == 0) | (at.depths > (1 + _BEHIND) * before)

@@ -25,7 +25,8 @@ from gsjax.scene.render import plan_render, render
 # Depth has measured the means, so they hardly move; the other fields learn to blend into the images.
 RATES = {"means": 2e-5, "quats": 5e-3, "log_scales": 1e-2, "logit_opacities": 3e-2, "sh0": 1e-2}
 _DEPTH_WEIGHT, _DEPTH_LIMIT = 1.0, 0.05
-_FEW = 2 * MIN_POINTS
+_NOISY = 0.2  # share of depth that lies on no surface
+_FEW = 2 * MIN_POINTS  # Gaussians of an object, of which a camera sees about half
 
 
 def start_scene(
@@ -54,24 +55,40 @@ def start_scene(
     if broken:
         warnings.warn(f"the first frame has {broken} pixels that are not finite; ignored", stacklevel=2)
     if frame.depths is not None:
-        surfaces = jnp.asarray(on_surfaces(np.asarray(frame.depths)))
-        frame = eqx.tree_at(lambda f: f.depths, frame, surfaces)
+        frame = eqx.tree_at(lambda f: f.depths, frame, jnp.asarray(_surfaces(np.asarray(frame.depths))))
     scene = scene_from_cloud(labelled_cloud(frame, mask, mask_camera, config.start), config.start)
-    _warn_of_few(scene, config.start.object_pixels)
+    _warn_of_few(scene)
     if before_fit is not None:
         before_fit(scene)
     return fit_scene(scene, frame, config.start.iterations, config.headroom)[0]
 
 
-def _warn_of_few(scene: TrackedScene, pixels: float) -> None:
-    """Warns of objects that could go astray without a word."""
-    counts = np.bincount(np.asarray(scene.labels), minlength=len(scene.label_ids))[1:]
-    few = {label: n for label, n in zip(scene.label_ids[1:], counts.tolist(), strict=True) if n < _FEW}
-    if few:
-        words = ", ".join(f"{count} to object {label}" for label, count in few.items())
+def _surfaces(depths: np.ndarray) -> np.ndarray:
+    """Depths of surfaces; warns where much of it is not."""
+    surfaces = on_surfaces(depths)
+    known = (np.nan_to_num(depths) > 0).sum()
+    share = 1 - (surfaces > 0).sum() / max(known, 1)
+    if share > _NOISY:
         warnings.warn(
-            f"the first frame gives {words}: with fewer than {_FEW} Gaussians, hardly anything tells whether "
-            f"one is lost; lower track.start.object_pixels, now {pixels:g}, or leave them out of the mask",
+            f"depths: {share:.0%} of the first frame's are unlike those around them by more than 5 %, and "
+            "left out; is the depth noisy, or of another frame?",
+            stacklevel=3,
+        )
+    return surfaces
+
+
+def _warn_of_few(scene: TrackedScene) -> None:
+    """Warns of objects, and parts of large ones, that could go astray without a word."""
+    counts = np.bincount(np.asarray(scene.labels), minlength=len(scene.label_ids))[1:].tolist()
+    few = [
+        f"{'object' if scene.label_ids.count(label) == 1 else 'a part of object'} {label} has {count}"
+        for label, count in zip(scene.label_ids[1:], counts, strict=True)
+        if count < _FEW
+    ]
+    if few:
+        warnings.warn(
+            f"of so few Gaussians in the first frame hardly anything tells whether they are lost: "
+            f"{', '.join(few)}, expected {_FEW} or more; set --track.start.object-pixels lower",
             stacklevel=3,
         )
 
