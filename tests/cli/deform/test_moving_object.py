@@ -13,6 +13,7 @@ from rich.console import Console
 import gsjax as gs
 from gsjax.data import DataError, open_sequence, photographs_of
 from gsjax.data.ordered import open_as_sequence
+from gsjax.engine import progress
 from gsjax.engine.deform.data import deform_data
 from gsjax.engine.deform.depth import with_depth
 from gsjax.engine.deform.file import read_beside
@@ -20,7 +21,7 @@ from gsjax.engine.messages import Notes
 from gsjax.engine.pictures import frame_rate
 from gsjax.engine.teaching.choice import TeacherChoice
 from gsjax.engine.viewables import open_viewable
-from gsjax.methods.deform import PRESETS, Deform, DeformConfig, goes_around, hull_gaussians
+from gsjax.methods.deform import PRESETS, Deform, DeformConfig, goes_around, hull_gaussians, method
 from tests.data.moving_object import write_dnerf
 
 SIZE, COUNTS = 40, {"train": 12, "val": 3, "test": 4}
@@ -122,14 +123,17 @@ def test_poses_are_interpolated_between_different_times_only(sequence, data):
 
 def test_a_run_is_learned_and_scored_on_white(gsjax, folder, tmp_path):
     run = tmp_path / "run"
-    code, said = gsjax("deform", folder, "--out", run, *SMALL)
+    code, said = gsjax("deform", folder, "--out", run, *SMALL, "--deform.rates.quats", 1e-3)
     assert code == 0, said
+    assert "settings of --preset around" in said
     found = json.loads((run / "metrics.json").read_text())
     assert found["frames"] == {"learned": 12, "held_out": 4}
     assert found["depth"] == {"source": "hull", "metric": False}
     assert found["preset"] == "around"
     settings = yaml.safe_load((run / "config.yml").read_text())
-    assert settings["deform"]["rates"] == vars(PRESETS["around"].rates)
+    given = {"quats": 1e-3}  # though it is the default of surst
+    assert settings["deform"]["rates"] == vars(PRESETS["around"].rates) | given
+    assert "words" not in settings
     assert (settings["deform"]["warmup"], settings["deform"]["deformation"]["resolution"]) == (6, 8)
     assert found["num_gaussians"] == 600
     splits = open_as_sequence(str(folder)).splits
@@ -146,6 +150,46 @@ def test_a_run_is_learned_and_scored_on_white(gsjax, folder, tmp_path):
     assert scene.num_frames == 19
 
 
+@pytest.mark.slow
+def test_a_run_of_an_earlier_version_goes_on_as_it_was_begun(gsjax, folder, monkeypatch, tmp_path):
+    told, heard = ("deform", folder, "--out", tmp_path / "run", *SMALL), []
+
+    def raise_if_interrupted():  # after each step
+        heard.append(1)
+        if len(heard) == 8:
+            raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(progress, "raise_if_interrupted", raise_if_interrupted)
+        assert gsjax(*told, "--preset", "surst")[0] == 130
+    config = tmp_path / "run" / "config.yml"
+    config.write_text(config.read_text().replace("  coarse_until: 0.0\n", ""))
+    code, said = gsjax(*told, "--resume")
+    assert code == 0, said
+    assert json.loads((tmp_path / "run" / "metrics.json").read_text())["preset"] == "surst"
+
+
+@pytest.mark.slow
+def test_a_run_of_smaller_pictures_goes_on_to_the_same_bits(gsjax, folder, monkeypatch, tmp_path):
+    options, heard = (*SMALL, "--deform.coarse-until", 0.7), []
+    monkeypatch.setattr(method, "_LEAST_SIDE", 8)  # of the 40 that they have
+
+    def raise_if_interrupted():
+        heard.append(1)
+        if len(heard) == 9:  # at half the size
+            raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(progress, "raise_if_interrupted", raise_if_interrupted)
+        assert gsjax("deform", folder, "--out", tmp_path / "a", *options)[0] == 130
+    assert gsjax("deform", folder, "--out", tmp_path / "a", *options, "--resume")[0] == 0
+    assert gsjax("deform", folder, "--out", tmp_path / "b", *options)[0] == 0
+    resumed, whole = (np.load(tmp_path / run / "deformation.npz") for run in "ab")
+    for name in whole.files:
+        if not name.startswith("__"):
+            np.testing.assert_array_equal(resumed[name], whole[name], err_msg=name)
+
+
 def test_the_verb_learns_from_all_frames_that_it_is_given(sequence):
     train = sequence.select([t for t, split in enumerate(sequence.splits) if split == "train"])
     for given in (sequence, train):
@@ -153,3 +197,11 @@ def test_the_verb_learns_from_all_frames_that_it_is_given(sequence):
         assert len(problem.frames) == given.num_frames
         assert problem.first is None
         np.testing.assert_array_equal(problem.background, [[1, 1, 1]])
+
+
+def test_without_settings_the_verb_takes_those_that_suit(sequence):
+    assert gs.deform(sequence).method.config == PRESETS["around"]
+    assert (
+        gs.deform(open_sequence("simulated:tissue?width=32&height=26&frames=2")).method.config
+        == DeformConfig()
+    )
