@@ -1,4 +1,4 @@
-"""Which view a step sees, one view per step, and how large."""
+"""The order in which steps visit views, one view per step."""
 
 import numpy as np
 
@@ -13,15 +13,3 @@ def shuffled_index(seed: int, step: int, count: int) -> int:
     """
     epoch, place = divmod(step, count)
     return int(np.random.default_rng((seed, epoch)).permutation(count)[place])
-
-
-def shrink_at(coarse_until: float, progress: float) -> int:
-    """The factor by which pictures are downscaled: first 4, then 2, then 1.
-
-    Args:
-        coarse_until: share of the steps that see smaller pictures; with 0, none does.
-        progress: position in the schedule, 0 to 1.
-    """
-    if progress >= coarse_until:
-        return 1
-    return 4 if progress < coarse_until / 3 else 2

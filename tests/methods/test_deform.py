@@ -21,7 +21,7 @@ from gsjax.methods.deform import (
     prompt_probabilities,
     start_gaussians,
 )
-from gsjax.methods.deform.method import PLAN, smaller
+from gsjax.methods.deform.method import PLAN
 from gsjax.methods.deform.start import known_depth
 from gsjax.metrics.image import psnr
 from gsjax.scene.render import render
@@ -239,34 +239,6 @@ class TestLearning:
         given, method = start_gaussians(frames, 0, CONFIG.start_pixels), Deform(CONFIG)
         next(drive(method, *method.start(frames, lesson, gaussians=given)))
         assert not given.means.is_deleted()
-
-
-class TestSmallerPictures:
-    def test_blocks_have_the_mean_colour_and_count_as_a_whole(self, frames):
-        problem, _ = Deform(CONFIG).start(frames)
-        seen = problem.seen[1]
-        small = smaller(seen, 2)
-        assert small.images.shape == (1, 26, 32, 3)
-        blocks = np.asarray(frames[1].images[0], float).reshape(26, 2, 32, 2, 3) / 255
-        np.testing.assert_allclose(small.images[0], blocks.mean((1, 3)), atol=1e-6)
-        masks = np.asarray(frames[1].masks[0]).reshape(26, 2, 32, 2)
-        np.testing.assert_array_equal(small.masks[0], masks.all((1, 3)))
-        np.testing.assert_allclose(small.cameras.K[0, 0], seen.cameras.K[0, 0] / 2)
-        assert smaller(seen, 1) is seen
-
-    def test_a_run_sees_them_first_and_losses_are_compared_anew(self, frames):
-        method = Deform(replace(CONFIG, warmup=4, iterations=36, coarse_until=0.5))
-        sizes, begun = [], []
-        ticks = drive(method, *method.start(frames))
-        for now in ticks:
-            batch, _ = method.batch(ticks.problem, now.run, now.step / 40)
-            sizes.append(batch.frame.cameras.width)
-            begun.append(now.run.guard.steps)
-        assert sizes[:19] == [32] * 19  # a quarter would leave less than 24 pixels
-        assert sizes[19:] == [64] * 21
-        assert begun[20] == 1
-        last = ticks.problem, ticks.run
-        assert np.mean([sight(*last, i) for i in range(len(frames))]) > 20
 
 
 def test_the_class_of_a_trained_scene_is_the_teachers(learned):

@@ -81,9 +81,6 @@ class DeformConfig:
     warmup_frames: Literal["first", "all"] = "first"
     """Frames of the warm-up: the one that the canonical scene is initialized from, or all; all too where it
     is initialized within its visual hull, from all."""
-    coarse_until: float = 0.0
-    """Share of all steps that see smaller pictures, a quarter and then half as wide and high: they take less
-    time, and what moves far is found more easily."""
     refine_poses: bool = False
     """Optimize the poses of the cameras of all frames but the first."""
     nodes: int = 2048
@@ -113,7 +110,6 @@ class DeformConfig:
             start_pixels=(0.25, np.inf),
             plane_depth=(1e-6, np.inf),
             hull_points=(8, np.inf),
-            coarse_until=(0, 1),
             channels=(1, 4096),
             nodes=(0, np.inf),
             moving_share=(1e-3, 1),
@@ -134,7 +130,6 @@ PRESETS = MappingProxyType(
         "around": DeformConfig(
             warmup=200,
             iterations=3800,
-            coarse_until=0.5,
             optimizer="adamw",
             schedule="cosine",
             deformation=DeformationConfig(resolution=32, time_resolution=15),
@@ -146,5 +141,5 @@ PRESETS = MappingProxyType(
 )
 """The two papers' recipes: GaussianClin (section A: Adam, 1k canonical and 3k joint iterations), and
 SurstSplat (section 3: AdamW, cosine, weight decay 1e-5). And this project's for a camera that goes around a
-moving object: random points in its hull have far to go, a warm-up would only blur what moves, a field with
-few vertices fits no view alone where each time has one, and small pictures show first what moves far."""
+moving object: random points in its hull have far to go, a warm-up would only blur what moves, and a field
+with few vertices fits no view alone where each time has one."""

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from functools import partial
 from typing import NamedTuple
 
 import equinox as eqx
@@ -22,12 +21,12 @@ from gsjax.methods.deform.poses import refined_viewmats, times_of
 from gsjax.methods.deform.result import DeformResult, Timeline, timeline_of
 from gsjax.methods.deform.start import can_start_from, known_depth, start_gaussians, with_plane_depths
 from gsjax.methods.deform.update import Batch, DeformingScene, Moving, deform_step
-from gsjax.methods.sampling import shrink_at, shuffled_index
+from gsjax.methods.sampling import shuffled_index
 from gsjax.optim.method import Run
 from gsjax.optim.step import Step, copied
-from gsjax.rasterize.plan import HEADROOM, Plan
+from gsjax.rasterize.plan import HEADROOM
 from gsjax.scene.deformation import init_deformation
-from gsjax.scene.frame import Frame, part_of
+from gsjax.scene.frame import Frame
 from gsjax.scene.gaussians import Gaussians, cull_invalid
 from gsjax.scene.render import plan_render
 
@@ -36,7 +35,6 @@ PLAN = "view"
 _OUTSIDE = 0.005  # share of the Gaussians that may lie outside of the field's box at either end of an axis
 _GATE_AFTER = 0.25  # share of the joint steps in which all Gaussians may move
 _LEAST_EDGE = 0.2  # radii; least extent along an axis, for a flat scene
-_LEAST_SIDE = 24  # pixels that a downscaled frame keeps
 _MARGIN = 0.05  # of the field's box around the scene, relative to its edges
 
 
@@ -159,7 +157,8 @@ class Deform:
         timeline = timeline_of(frames) if timeline is None else timeline
         behind = None if background is None else jnp.array([background], jnp.result_type(float))
         problem = Problem(frames, lesson, seen, ids, codebook, first, radius, bounds, timeline, behind)
-        plans = {PLAN: _plan_of(scene, seen, 1)}
+        cameras = jax.tree.map(lambda *arrays: jnp.concatenate(arrays), *(frame.cameras for frame in seen))
+        plans = {PLAN: plan_render(scene.gaussians, cameras, headroom=HEADROOM)}
         return problem, Run(scene, jax.jit(self.step.init)(scene), plans=plans, kept=Kept())
 
     @property
@@ -176,8 +175,8 @@ class Deform:
         return len(problem.seen)
 
     def between(self, problem: Problem, run: Run, progress: float) -> Run:
-        """Adds the field after the warm-up, selects the Gaussians that keep moving, makes the graph, and
-        plans new sizes. Arguments as for `Method.between`."""
+        """Adds the field after the warm-up, selects the Gaussians that keep moving, and makes the graph.
+        Arguments as for `Method.between`."""
         config, step = self.config, run.step
         gate, graph = (
             config.warmup + round(share * config.iterations) for share in (_GATE_AFTER, config.graph.after)
@@ -186,10 +185,6 @@ class Deform:
             scene, moving = with_field(config, problem, run.params)
             run = run.having(params=scene, state=jax.jit(self.step.init)(scene), kept=Kept(moving))
         moving, graphs = run.kept
-        shrink = self._shrink(problem, progress)
-        if run.plans.keys() != {PLAN, name := _plan_name(shrink)}:  # another size, another loss
-            plan = run.plans.get(name) or _plan_of(run.params, problem.seen, shrink)
-            run = run.having(plans={PLAN: run.plans[PLAN], name: plan}, guard=None)
         if step == gate and config.moving_share < 1 and moving is None:
             moving = _farthest_moved(run.params, problem.seen, config.moving_share)
         if step == graph and graphs is None:
@@ -202,16 +197,7 @@ class Deform:
         i = problem.first if self.config.warmup_frames == "first" else None
         if i is None or run.step >= self.config.warmup:
             i = shuffled_index(self.config.seed, run.step, len(problem.seen))
-        shrink = self._shrink(problem, progress)
-        return batch_of(problem, run, i, shrink), (_plan_name(shrink),)
-
-    def _shrink(self, problem: Problem, progress: float) -> int:
-        """The factor by which frames are downscaled now: so much that something is left of them."""
-        camera = problem.seen[0].cameras
-        most = min(camera.height, camera.width) / _LEAST_SIDE
-        return max(
-            f for f in (1, 2, 4) if f <= max(1, min(most, shrink_at(self.config.coarse_until, progress)))
-        )
+        return batch_of(problem, run, i), (PLAN,)
 
     def result(self, problem: Problem, run: Run) -> DeformResult:
         """The scene over time. It shares the arrays of the run, which later steps may donate."""
@@ -226,14 +212,13 @@ class Deform:
         return DeformResult(still, run.kept.moving, meaning, timeline)
 
 
-def batch_of(problem: Problem, run: Run, i: int, shrink: int = 1) -> Batch:
+def batch_of(problem: Problem, run: Run, i: int) -> Batch:
     """The input of a step on one frame.
 
     Args:
         problem: from `Deform.start`.
         run: the run before the step.
         i: index of the frame.
-        shrink: factor by which the frame is downscaled.
     """
     view = None
     if run.params.twists is not None:
@@ -241,39 +226,8 @@ def batch_of(problem: Problem, run: Run, i: int, shrink: int = 1) -> Batch:
     ids = None if problem.ids is None else problem.ids[i]
     moving, graphs = run.kept
     graph = None if graphs is None else graphs[i]
-    plan = run.plans[_plan_name(shrink)]
-    given = (problem.codebook, moving, graph, problem.radius, plan, problem.background)
-    return Batch(smaller(problem.seen[i], shrink), view, ids, *given)
-
-
-def _plan_name(shrink: int) -> str:
-    return PLAN if shrink == 1 else f"{PLAN} 1/{shrink}"
-
-
-def _plan_of(scene: DeformingScene, seen: Sequence[Frame], shrink: int) -> Plan:
-    """The plan for rendering the scene in all frames, downscaled."""
-    views = [smaller(frame, shrink).cameras for frame in seen]
-    cameras = jax.tree.map(lambda *arrays: jnp.concatenate(arrays), *views)
-    return plan_render(scene.gaussians, cameras, headroom=HEADROOM)
-
-
-def smaller(frame: Frame, shrink: int) -> Frame:
-    """A frame of one camera on the device with colours averaged over blocks of pixels. A block counts if all
-    of its pixels do, and has the depth of the one in its middle.
-
-    Args:
-        frame: with a mask.
-        shrink: edge of the blocks, pixels.
-    """
-    return frame if shrink == 1 else _shrunk(frame, shrink)
-
-
-@partial(jax.jit, static_argnums=1)
-def _shrunk(frame: Frame, shrink: int) -> Frame:
-    part = part_of(eqx.tree_at(lambda f: f.images, frame, frame.colors), shrink=shrink)
-    height, width = part.cameras.height, part.cameras.width
-    blocks = frame.masks[:, : height * shrink, : width * shrink].reshape(-1, height, shrink, width, shrink)
-    return eqx.tree_at(lambda f: f.masks, part, blocks.all((2, 4)))
+    given = (problem.codebook, moving, graph, problem.radius, run.plans[PLAN], problem.background)
+    return Batch(problem.seen[i], view, ids, *given)
 
 
 def with_field(

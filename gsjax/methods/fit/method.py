@@ -20,7 +20,7 @@ from gsjax.methods.fit.model import Model, carried_over, model_of, refined, with
 from gsjax.methods.fit.padding import with_common_sizes
 from gsjax.methods.fit.start import initial_gaussians, start_points
 from gsjax.methods.fit.update import Batch, fit_step, grow, slots_wanted, split
-from gsjax.methods.sampling import shrink_at, shuffled_index
+from gsjax.methods.sampling import shuffled_index
 from gsjax.optim.compiler import host_options
 from gsjax.optim.densification import is_alive
 from gsjax.optim.method import Run
@@ -107,13 +107,7 @@ class Fit:
         model = model_of(gaussians, config, len(frames))
         shown, shares = with_common_sizes(frames)
         problem = Problem(
-            shown,
-            shares,
-            extent,
-            behind[config.background],
-            source,
-            partial(shrink_at, config.coarse_until),
-            {},
+            shown, shares, extent, behind[config.background], source, partial(shrink_at, config), {}
         )
         return problem, Run(model, jax.jit(self.step.init)(model))
 
@@ -213,6 +207,13 @@ def _compiled_growth(config: FitConfig) -> Callable:
         return split(model, optimizer, key, config, radius, reset, step > every, all_seen)
 
     return densify
+
+
+def shrink_at(config: FitConfig, progress: float) -> int:
+    """The factor by which photographs are downscaled: first 4, then 2, then 1."""
+    if progress >= config.coarse_until:
+        return 1
+    return 4 if progress < config.coarse_until / 3 else 2
 
 
 def _all_seen_since(config: FitConfig, step: int, views: int) -> bool:

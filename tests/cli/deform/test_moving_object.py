@@ -21,7 +21,7 @@ from gsjax.engine.messages import Notes
 from gsjax.engine.pictures import frame_rate
 from gsjax.engine.teaching.choice import TeacherChoice
 from gsjax.engine.viewables import open_viewable
-from gsjax.methods.deform import PRESETS, Deform, DeformConfig, goes_around, hull_gaussians, method
+from gsjax.methods.deform import PRESETS, Deform, DeformConfig, goes_around, hull_gaussians
 from tests.data.moving_object import write_dnerf
 
 SIZE, COUNTS = 40, {"train": 12, "val": 3, "test": 4}
@@ -163,31 +163,10 @@ def test_a_run_of_an_earlier_version_goes_on_as_it_was_begun(gsjax, folder, monk
         patch.setattr(progress, "raise_if_interrupted", raise_if_interrupted)
         assert gsjax(*told, "--preset", "surst")[0] == 130
     config = tmp_path / "run" / "config.yml"
-    config.write_text(config.read_text().replace("  coarse_until: 0.0\n", ""))
+    config.write_text(config.read_text().replace("    rigidity: 0.01\n", ""))
     code, said = gsjax(*told, "--resume")
     assert code == 0, said
     assert json.loads((tmp_path / "run" / "metrics.json").read_text())["preset"] == "surst"
-
-
-@pytest.mark.slow
-def test_a_run_of_smaller_pictures_goes_on_to_the_same_bits(gsjax, folder, monkeypatch, tmp_path):
-    options, heard = (*SMALL, "--deform.coarse-until", 0.7), []
-    monkeypatch.setattr(method, "_LEAST_SIDE", 8)  # of the 40 that they have
-
-    def raise_if_interrupted():
-        heard.append(1)
-        if len(heard) == 9:  # at half the size
-            raise KeyboardInterrupt
-
-    with monkeypatch.context() as patch:
-        patch.setattr(progress, "raise_if_interrupted", raise_if_interrupted)
-        assert gsjax("deform", folder, "--out", tmp_path / "a", *options)[0] == 130
-    assert gsjax("deform", folder, "--out", tmp_path / "a", *options, "--resume")[0] == 0
-    assert gsjax("deform", folder, "--out", tmp_path / "b", *options)[0] == 0
-    resumed, whole = (np.load(tmp_path / run / "deformation.npz") for run in "ab")
-    for name in whole.files:
-        if not name.startswith("__"):
-            np.testing.assert_array_equal(resumed[name], whole[name], err_msg=name)
 
 
 def test_the_verb_learns_from_all_frames_that_it_is_given(sequence):
