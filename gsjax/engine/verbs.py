@@ -82,8 +82,8 @@ def deform(
         sequence: from `gsjax.open_sequence`; trains on all frames of its first camera (see `select`).
             Depth is the camera's own, else from stereo matching with the second camera; without either, the
             scene starts within its visual hull if the camera goes around it, else as a plane.
-        config: settings (default: `PRESETS["around"]` of `gsjax.methods.deform` for a hull, else those of
-            `DeformConfig`).
+        config: settings (default: `PRESETS["around"]` of `gsjax.methods.deform` for the hull of an object in
+            transparent pictures, else those of `DeformConfig`).
         teacher: source of the features learned beside colours: "classes" of masks, "closed", a folder of
             feature files, "none", or a `TeacherChoice` with weights and masks (default: classes, if there are
             two or more among the pixels that count).

@@ -57,7 +57,7 @@ class Options(TeacherOptions, OfDataset):
     preset: Literal["surst", "clin", "around"] | None = None
     """Recipe whose settings are the defaults of --deform: SurstSplat's, GaussianClin's, or the one for a
     camera that goes around a moving object, as in D-NeRF's scenes. Default: around if the scene starts within
-    its visual hull (--depth), else surst."""
+    its visual hull (--depth) and pictures are transparent around it, else surst."""
     tools: Tools = "leave-out"
     """Leave tools out, or draw them too. Tools are recognised by the names of mask values; without
     names, all values but 0 are tools."""
@@ -92,11 +92,12 @@ def run(options: Options, by_preset: Callable[[str], Options] | None = None) -> 
         folder = RunFolder.locked(options.out, overwrite=options.overwrite, resume=options.resume)
         sequence, source = _recording(options, notes)
         if options.preset is None:
-            preset = _preset_for(options, source, folder)
+            is_alone = source == "hull" and sequence.background is not None
+            preset = _preset_for(options, is_alone, folder)
             suited = replace(options, preset=preset) if by_preset is None else by_preset(preset)
             options = checked(suited)
             if preset == "around":
-                console.print("settings of --preset around, as the scene starts within its hull")
+                console.print("settings of --preset around, as a camera goes around an object")
         settings = replace(options, dataset=located(options.dataset), **choice.located())
         if options.resume:
             folder.check_config(settings, but=RESUME_MAY_CHANGE)
@@ -159,12 +160,10 @@ def run(options: Options, by_preset: Callable[[str], Options] | None = None) -> 
     return exit_code(progress.stopped)
 
 
-def _preset_for(options: Options, source: DepthSource, folder: RunFolder) -> str:
-    """The preset that was named; else the one of the run that is resumed, or the one for the recording."""
-    if options.preset is not None:
-        return options.preset
+def _preset_for(options: Options, is_alone: bool, folder: RunFolder) -> str:
+    """The preset of the run that is resumed, or the one for the recording, which may show an object alone."""
     begun = folder.setting("preset") if options.resume else None
-    return begun or ("around" if source == "hull" else "surst")
+    return begun or ("around" if is_alone else "surst")
 
 
 def _warn_of_oddities(progress: Progress, judged: Mapping[str, Any], notes: Notes) -> None:

@@ -46,7 +46,8 @@ def start_from(
             plane = (config or DeformConfig()).plane_depth
             seen, source = with_depth(every, "auto", plane, notes)
             if config is None:
-                config = PRESETS["around"] if source == "hull" else DeformConfig()
+                is_alone = source == "hull" and seen.background is not None
+                config = PRESETS["around"] if is_alone else DeformConfig()
             data = deform_data(seen, 0, tools, choice, config.channels, tool_values, notes, quiet)
     finally:
         for text in notes.warnings:
