@@ -284,10 +284,10 @@ class RunFolder:
         an earlier version did not have."""
         stored = _flat(read_values(self.config, parse_yaml))
         given = _flat(plain(dataclasses.asdict(config)))
-        names = [n for n in dict.fromkeys([*given, *stored]) if n.split(".")[0] not in but]
-        others = [name for name in names if name in stored and stored[name] != given.get(name)]
+        names = [name for name in stored if name.split(".")[0] not in but]
+        others = [name for name in names if stored[name] != given.get(name)]
         if others:
-            words = [f"{n} {stored.get(n)!r}, now it is {given.get(n)!r}" for n in others]
+            words = [f"{n} {stored[n]!r}, now it is {given.get(n)!r}" for n in others]
             raise ValueError(
                 f"--resume: the run in {self.path} was started with {'; with '.join(words)}. Use the same, "
                 "or replace the run with --overwrite instead"

@@ -2,6 +2,8 @@
 
 import json
 import shutil
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -13,6 +15,7 @@ import pytest
 from gsjax.cli import main
 from gsjax.data import open_sequence, write_panoptic
 from gsjax.data.simulated import tabletop
+from gsjax.engine import progress
 from gsjax.engine.distill.scene import SceneOptions
 from gsjax.engine.drive import Tick
 from gsjax.engine.folder import RunFolder, plain
@@ -54,6 +57,26 @@ def photographs(tmp_path_factory) -> Path:
     frames.append({"file_path": "images/lost.png", "transform_matrix": np.eye(4).tolist()})
     (folder / "transforms.json").write_text(json.dumps({"frames": frames}))
     return folder
+
+
+@pytest.fixture
+def interrupted(monkeypatch) -> Callable[[int], AbstractContextManager]:
+    """`with interrupted(25): ...` is Ctrl-C after the 25th step that a run takes within the block."""
+
+    @contextmanager
+    def after(count: int) -> Iterator[None]:
+        heard = []
+
+        def raise_if_interrupted():  # after each step
+            heard.append(1)
+            if len(heard) == count:
+                raise KeyboardInterrupt
+
+        with monkeypatch.context() as patch:
+            patch.setattr(progress, "raise_if_interrupted", raise_if_interrupted)
+            yield
+
+    return after
 
 
 @pytest.fixture

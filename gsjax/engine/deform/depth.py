@@ -17,6 +17,15 @@ METRIC: tuple[DepthSource, ...] = ("data", "stereo")
 """Sources by which lengths are in the unit of the data, metres."""
 
 
+def shows_one_object(sequence: Sequence, source: DepthSource) -> bool:
+    """Whether a camera goes around an object with nothing behind it, for which `PRESETS["around"]` is.
+
+    Args:
+        sequence, source: from `with_depth`.
+    """
+    return source == "hull" and sequence.background is not None
+
+
 def with_depth(sequence: Sequence, wanted: Depth, plane: float, notes: Notes) -> tuple[Sequence, DepthSource]:
     """The recording with depth of camera 0, and its source: the recording's own, else matched with camera 1,
     else none: the scene then begins within its visual hull if the camera goes around it, else on a plane.

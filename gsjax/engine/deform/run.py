@@ -18,7 +18,7 @@ from gsjax.data.open import is_photographs, is_recording, open_photographs
 from gsjax.data.ordered import open_as_sequence
 from gsjax.engine.budget import Budget, note_if_few
 from gsjax.engine.deform.data import Tools, deform_data
-from gsjax.engine.deform.depth import METRIC, Depth, DepthSource, with_depth
+from gsjax.engine.deform.depth import METRIC, Depth, DepthSource, shows_one_object, with_depth
 from gsjax.engine.deform.file import NAME, write_deformation
 from gsjax.engine.deform.poses import as_refined
 from gsjax.engine.deform.results import summarize
@@ -92,10 +92,11 @@ def run(options: Options, by_preset: Callable[[str], Options] | None = None) -> 
         folder = RunFolder.locked(options.out, overwrite=options.overwrite, resume=options.resume)
         sequence, source = _recording(options, notes)
         if options.preset is None:
-            is_alone = source == "hull" and sequence.background is not None
-            preset = _preset_for(options, is_alone, folder)
-            suited = replace(options, preset=preset) if by_preset is None else by_preset(preset)
-            options = checked(suited)
+            stored = folder.setting("preset") if options.resume else None
+            preset = stored or ("around" if shows_one_object(sequence, source) else "surst")
+            if by_preset is not None and preset != "surst":  # which the options have already
+                options = checked(by_preset(preset))
+            options = replace(options, preset=preset)
             if preset == "around":
                 console.print("settings of --preset around, as a camera goes around an object")
         settings = replace(options, dataset=located(options.dataset), **choice.located())
@@ -158,12 +159,6 @@ def run(options: Options, by_preset: Callable[[str], Options] | None = None) -> 
         }
         finish(folder, found, summarize)
     return exit_code(progress.stopped)
-
-
-def _preset_for(options: Options, is_alone: bool, folder: RunFolder) -> str:
-    """The preset of the run that is resumed, or the one for the recording, which may show an object alone."""
-    begun = folder.setting("preset") if options.resume else None
-    return begun or ("around" if is_alone else "surst")
 
 
 def _warn_of_oddities(progress: Progress, judged: Mapping[str, Any], notes: Notes) -> None:

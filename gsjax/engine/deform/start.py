@@ -8,7 +8,7 @@ from rich.console import Console
 from gsjax.data.errors import DataWarning
 from gsjax.data.sequence import Sequence
 from gsjax.engine.deform.data import Tools, deform_data
-from gsjax.engine.deform.depth import METRIC, with_depth
+from gsjax.engine.deform.depth import METRIC, shows_one_object, with_depth
 from gsjax.engine.messages import Notes
 from gsjax.engine.teaching.choice import TeacherChoice
 from gsjax.losses.extra import ExtraLosses
@@ -46,8 +46,7 @@ def start_from(
             plane = (config or DeformConfig()).plane_depth
             seen, source = with_depth(every, "auto", plane, notes)
             if config is None:
-                is_alone = source == "hull" and seen.background is not None
-                config = PRESETS["around"] if is_alone else DeformConfig()
+                config = PRESETS["around"] if shows_one_object(seen, source) else DeformConfig()
             data = deform_data(seen, 0, tools, choice, config.channels, tool_values, notes, quiet)
     finally:
         for text in notes.warnings:

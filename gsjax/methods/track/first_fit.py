@@ -66,8 +66,7 @@ def start_scene(
 def _surfaces(depths: np.ndarray) -> np.ndarray:
     """Depths of surfaces; warns where much of it is not."""
     surfaces = on_surfaces(depths)
-    known = (np.nan_to_num(depths) > 0).sum()
-    share = 1 - (surfaces > 0).sum() / max(known, 1)
+    share = 1 - (surfaces > 0).sum() / max((depths > 0).sum(), 1)
     if share > _NOISY:
         warnings.warn(
             f"depths: {share:.0%} of the first frame's are unlike those around them by more than 5 %, and "

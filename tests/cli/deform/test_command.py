@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from gsjax.cli import main
-from gsjax.engine import progress
 from gsjax.engine.deform.file import read_deformation
 from gsjax.engine.deform.scores import OVER_TIME
 from gsjax.io.ply import read_ply
@@ -74,16 +73,9 @@ def test_scores_over_time_and_of_classes(deformed):
 
 
 @pytest.mark.slow
-def test_resumed_it_is_the_same_scene(gsjax, deformed, monkeypatch, tmp_path):
-    told, heard = ("deform", SCENE, "--out", tmp_path / "run", "--tools", "draw", *SMALL), []
-
-    def raise_if_interrupted():  # after each step
-        heard.append(1)
-        if len(heard) == 25:  # after the graph was made
-            raise KeyboardInterrupt
-
-    with monkeypatch.context() as patch:
-        patch.setattr(progress, "raise_if_interrupted", raise_if_interrupted)
+def test_resumed_it_is_the_same_scene(gsjax, deformed, interrupted, tmp_path):
+    told = ("deform", SCENE, "--out", tmp_path / "run", "--tools", "draw", *SMALL)
+    with interrupted(25):  # after the graph was made
         code, said = gsjax(*told)
     assert code == 130, said
     assert metrics(tmp_path / "run")["complete"] is False

@@ -13,7 +13,6 @@ from rich.console import Console
 import gsjax as gs
 from gsjax.data import DataError, open_sequence, photographs_of
 from gsjax.data.ordered import open_as_sequence
-from gsjax.engine import progress
 from gsjax.engine.deform.data import deform_data
 from gsjax.engine.deform.depth import with_depth
 from gsjax.engine.deform.file import read_beside
@@ -151,16 +150,9 @@ def test_a_run_is_learned_and_scored_on_white(gsjax, folder, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_run_of_an_earlier_version_goes_on_as_it_was_begun(gsjax, folder, monkeypatch, tmp_path):
-    told, heard = ("deform", folder, "--out", tmp_path / "run", *SMALL), []
-
-    def raise_if_interrupted():  # after each step
-        heard.append(1)
-        if len(heard) == 8:
-            raise KeyboardInterrupt
-
-    with monkeypatch.context() as patch:
-        patch.setattr(progress, "raise_if_interrupted", raise_if_interrupted)
+def test_a_run_of_an_earlier_version_goes_on_as_it_was_begun(gsjax, folder, interrupted, tmp_path):
+    told = ("deform", folder, "--out", tmp_path / "run", *SMALL)
+    with interrupted(8):
         assert gsjax(*told, "--preset", "surst")[0] == 130
     config = tmp_path / "run" / "config.yml"
     config.write_text(config.read_text().replace("    rigidity: 0.01\n", ""))
@@ -180,7 +172,5 @@ def test_the_verb_learns_from_all_frames_that_it_is_given(sequence):
 
 def test_without_settings_the_verb_takes_those_that_suit(sequence):
     assert gs.deform(sequence).method.config == PRESETS["around"]
-    assert (
-        gs.deform(open_sequence("simulated:tissue?width=32&height=26&frames=2")).method.config
-        == DeformConfig()
-    )
+    tissue = open_sequence("simulated:tissue?width=32&height=26&frames=2")
+    assert gs.deform(tissue).method.config == DeformConfig()

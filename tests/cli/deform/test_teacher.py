@@ -15,7 +15,6 @@ from rich.console import Console
 
 from gsjax.cli import main
 from gsjax.data import open_sequence
-from gsjax.engine import progress
 from gsjax.engine.deform.data import deform_data
 from gsjax.engine.deform.file import read_deformation, write_deformation
 from gsjax.engine.deform.teacher import GROUPS, basis_of, groups_of
@@ -208,16 +207,9 @@ def test_files_are_found_by_the_names_of_pictures(tmp_path):
     np.testing.assert_allclose(codes[ids], feature_map(2) / scale @ found.meaning.basis, atol=1e-5)
 
 
-def test_a_run_of_features_goes_on_to_the_same_bits(files, learned, tmp_path, monkeypatch):
-    options, heard = ("--features", files, "--deform.rates.features", 0.03), []
-
-    def raise_if_interrupted():  # after each step
-        heard.append(1)
-        if len(heard) == 25:
-            raise KeyboardInterrupt
-
-    with monkeypatch.context() as patch:
-        patch.setattr(progress, "raise_if_interrupted", raise_if_interrupted)
+def test_a_run_of_features_goes_on_to_the_same_bits(files, learned, tmp_path, interrupted):
+    options = ("--features", files, "--deform.rates.features", 0.03)
+    with interrupted(25):
         assert main(told(tmp_path / "run", *options)) == 130
     assert main(told(tmp_path / "run", *options, "--resume")) == 0
     ours, theirs = (read_deformation(run / "deformation.npz") for run in (tmp_path / "run", learned))

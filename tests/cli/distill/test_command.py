@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 import yaml
 
-from gsjax.engine import progress
 from gsjax.engine.distill.run import Options, with_paths
 from gsjax.engine.teaching import teaching as field_teacher
 from gsjax.io.ply import read_ply, write_ply
@@ -85,7 +84,7 @@ def test_views_that_are_odd_cost_nothing_but_themselves(gsjax, recording, scene,
 
 
 def test_a_run_goes_on_with_what_it_was_begun_with_or_not_at_all(
-    gsjax, monkeypatch, recording, scene, tmp_path
+    gsjax, interrupted, recording, scene, tmp_path
 ):
     file, out = Path(shutil.copy(scene, tmp_path / "scene.ply")), tmp_path / "field"
     told = (
@@ -102,15 +101,7 @@ def test_a_run_goes_on_with_what_it_was_begun_with_or_not_at_all(
         *SMALL,
     )
     told += ("--distill.iterations", 20)
-    steps = []
-
-    def raise_if_interrupted():
-        steps.append(1)
-        if len(steps) == 5:
-            raise KeyboardInterrupt
-
-    with monkeypatch.context() as patch:
-        patch.setattr(progress, "raise_if_interrupted", raise_if_interrupted)
+    with interrupted(5):
         assert gsjax(*told)[0] == 130
     before, mask = (out / "field.npz").read_bytes(), recording / "seg/0/000000.png"
     gaussians = read_ply(file)[0]

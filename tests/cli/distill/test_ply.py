@@ -98,19 +98,10 @@ def test_what_was_distilled_can_be_asked(gsjax, field, pristine):
 
 
 @pytest.mark.slow
-def test_resumed_it_is_the_same_field(gsjax, monkeypatch, pristine, scene, distilled, tmp_path):
-    from gsjax.engine import progress
-
-    steps, heard = ("--distill.iterations", STEPS, *TABLE), []
+def test_resumed_it_is_the_same_field(gsjax, interrupted, pristine, scene, distilled, tmp_path):
+    steps = ("--distill.iterations", STEPS, *TABLE)
     told = ("distill", scene, "--out", tmp_path / "again", *images(pristine), *SMALL, *steps)
-
-    def raise_if_interrupted():  # after each step
-        heard.append(1)
-        if len(heard) == 105:  # between two rows
-            raise KeyboardInterrupt
-
-    with monkeypatch.context() as patch:
-        patch.setattr(progress, "raise_if_interrupted", raise_if_interrupted)
+    with interrupted(105):  # between two rows
         code, said = gsjax(*told)
     assert code == 130, said
     assert (tmp_path / "again" / "field.npz").is_file()  # what was learned so far can be asked
