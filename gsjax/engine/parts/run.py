@@ -103,7 +103,7 @@ def run(options: Options) -> int:
         with stage(console, "discovering parts in all views"):
             key = jax.random.key(options.parts.seed)
             start = begin(tracked, gaussians, anchor, moved, options.parts, segmenter, key, masks)
-        _warn_if_doubtful(start, moved.mean(), options, notes)
+        _warn_if_doubtful(start, moved.any(1).mean(), options, notes)
         method = Parts(options.parts)
         problem, first = method.start(tracked, start)
         seconds["discovery"] = perf_counter() - at
@@ -153,7 +153,7 @@ def _check(options: Options, recording: Recording) -> None:
 
 
 def _masks(
-    sequence: Sequence, anchor: Anchor, moved: Bool[np.ndarray, "C H W"], options: Options
+    sequence: Sequence, anchor: Anchor, moved: Bool[np.ndarray, "C F H W"], options: Options
 ) -> Int[np.ndarray, "C H W"] | None:
     """The moving pieces by the recording's own masks; None if a segmenter finds them."""
     if options.masks == "segment":
@@ -166,7 +166,7 @@ def _masks(
             f"found none for {', '.join(map(str, missing))}; name other --cameras, or use --masks segment"
         )
     known = [label for label in labels if label is not None]
-    masks = masks_from_labels(np.stack(known), moved, options.parts.discover.most_parts)
+    masks = masks_from_labels(np.stack(known), moved.any(1), options.parts.discover.most_parts)
     if not masks.any():
         raise ValueError(
             "--masks files: expected a label with at least a third of its pixels changed in other frames, "

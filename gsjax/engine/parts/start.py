@@ -13,8 +13,8 @@ FIT = FitConfig(steps=3_000, cap=15_000, sh_degree=0, depth_weight=0.5, start=St
 
 def detect_motion(
     tracked: Sequence, config: PartsConfig, anchor: int | None
-) -> tuple[Anchor, Bool[np.ndarray, "C H W"]]:
-    """The anchor frame, and the pixels of its pictures that change in other frames.
+) -> tuple[Anchor, Bool[np.ndarray, "C F H W"]]:
+    """The anchor frame, and the pixels of its pictures that change in each of F other frames.
 
     Args:
         tracked: the tracked cameras.
@@ -23,5 +23,7 @@ def detect_motion(
     """
     cameras, discover = tracked.num_cameras, config.discover
     chosen = choose_anchor(tracked.image, tracked.num_frames, cameras, anchor)
-    how = {"frames": discover.frames, "threshold": discover.threshold}
-    return chosen, moved_pixels(tracked.image, chosen, cameras, **how)
+    depth = tracked.depth if tracked.has_depth else None
+    return chosen, moved_pixels(
+        tracked.image, chosen, cameras, frames=discover.frames, threshold=discover.threshold, depth=depth
+    )

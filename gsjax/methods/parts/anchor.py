@@ -10,11 +10,14 @@ from jaxtyping import Bool, Float
 
 Load = Callable[[int, int], np.ndarray]
 """(frame, camera) -> RGB picture, uint8."""
+LoadDepth = Callable[[int, int], np.ndarray | None]
+"""(frame, camera) -> depths, metres, 0 where unknown; None for a camera without depth."""
 
 _WIDTH = 96  # pixels of the thumbnails by which frames are compared
 _BLUR = 1.0  # pixels; suppresses camera noise and the aliasing of hard edges
 _NOISE_FACTOR = 4.0  # differences above this many times the noise level are motion
 _MOST_FRAMES = 16  # compared with the anchor at full size
+_NEARER = 0.02  # share of its depth by which what comes before something is nearer
 _LEAST_MOVED = 1e-3  # share of the pixels that must change for anything to have moved
 
 
@@ -65,10 +68,16 @@ def choose_anchor(load: Load, frames: int, cameras: int, anchor: int | None = No
 
 
 def moved_pixels(
-    load: Load, anchor: Anchor, cameras: int, *, frames: int | None = None, threshold: float = 0.06
-) -> Bool[np.ndarray, "C H W"]:
-    """The pixels of the anchor's pictures that change in other frames: I_d exceeds a threshold, or four times
-    the noise level if that is higher.
+    load: Load,
+    anchor: Anchor,
+    cameras: int,
+    *,
+    frames: int | None = None,
+    threshold: float = 0.06,
+    depth: LoadDepth | None = None,
+) -> Bool[np.ndarray, "C F H W"]:
+    """The pixels of the anchor's pictures that change in each of F other frames: I_d exceeds a threshold, or
+    four times the noise level if that is higher.
 
     Args:
         load: loads a picture.
@@ -78,6 +87,8 @@ def moved_pixels(
             paper, only the frame that differs most is compared, so objects that return to their places are
             missed.
         threshold: least difference of colours, which range from 0 to 1.
+        depth: loads depths, if cameras measure them: where something nearer is seen, nothing has moved away,
+            something has come before it.
 
     Raises:
         ValueError: nothing moves.
@@ -93,15 +104,24 @@ def moved_pixels(
     ]
     limit, moved = max(threshold, _NOISE_FACTOR * float(np.median(steps))), []
     for c, here in enumerate(heres):
-        largest = np.max([difference_image(_blurred(load(t, c)), here) for t in sorted(others)], axis=0)
-        moved.append(largest > limit)
-    share = np.mean(moved)
+        changed = np.array([difference_image(_blurred(load(t, c)), here) > limit for t in sorted(others)])
+        if depth is not None and (before := depth(anchor.frame, c)) is not None:
+            changed &= np.array([~_is_covered(before, depth(t, c)) for t in sorted(others)])
+        moved.append(changed)
+    share = np.mean(np.any(moved, axis=1))
     if share < _LEAST_MOVED:
         raise ValueError(
             f"frames: expected something that moves, found {share:.3%} of the pixels of frame {anchor.frame} "
             f"changing by {limit:.2g} of the range or more; choose other frames or a lower threshold"
         )
-    return np.stack(moved)
+    return np.array(moved)
+
+
+def _is_covered(
+    before: Float[np.ndarray, "H W"], now: Float[np.ndarray, "H W"] | None
+) -> Bool[np.ndarray, "H W"]:
+    """Where something nearer than before is seen; nowhere without depth."""
+    return np.zeros(before.shape, bool) if now is None else (now > 0) & (now < (1 - _NEARER) * before)
 
 
 def difference_image(

@@ -19,6 +19,9 @@ class DiscoverConfig:
     """Smallest difference of colours, from 0 to 1, that counts as a change."""
     frames: int = 16
     """Number of frames to compare with the anchor; 1, as in the paper: the one that differs most."""
+    moving: float = 0.5
+    """Share of what a Gaussian shows, over all cameras, that must change in half of the frames for it to join
+    the part that it touches, if no mask shows it."""
     difference: bool = True
     """Restrict parts to segments that changed (I_d); otherwise every segment may move."""
     lift_iterations: int = 32
@@ -26,7 +29,7 @@ class DiscoverConfig:
 
     def __post_init__(self):
         counts = dict.fromkeys(("most_parts", "frames", "lift_iterations"), (1, np.inf))
-        expect(self, "discover.", threshold=(1e-6, 1), **counts)
+        expect(self, "discover.", threshold=(1e-6, 1), moving=(1e-6, 1), **counts)
 
 
 @dataclass(frozen=True)
@@ -60,6 +63,8 @@ class StreamConfig:
     """Learning rates in a frame's last step, relative to its first."""
     field_rate: float = 1e-3
     """Learning rate of the skinning-weight field; 0.01 suits tables."""
+    search: bool = True
+    """Look for parts that jump, by farther than they are wide, before a frame's first step."""
     past: int = 1
     """Images of past frames in each step, from which only the weights learn (temporal consistency)."""
     blend: Literal["quaternion", "polar", "dual"] = "quaternion"

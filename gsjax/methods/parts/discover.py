@@ -13,6 +13,7 @@ from gsjax.methods.parts.anchor import Anchor
 from gsjax.methods.parts.config import PartsConfig
 from gsjax.methods.parts.lift import label_votes, lift_masks
 from gsjax.methods.parts.masks import propagate_masks, view_order
+from gsjax.methods.parts.motion import changes_of, changing_views, with_what_moves
 from gsjax.methods.parts.stream import Canonical
 from gsjax.methods.parts.trajectory import BACKGROUND
 from gsjax.methods.parts.weights import Field, fit_field_to_weights, new_field
@@ -52,13 +53,14 @@ def begin(
     sequence: SequenceLike,
     gaussians: Gaussians,
     anchor: Anchor,
-    moved: Bool[np.ndarray, "C H W"],
+    moved: Bool[np.ndarray, "C F H W"],
     config: PartsConfig,
     segmenter: Segmenter | None,
     key: PRNGKeyArray,
     masks: Int[np.ndarray, "C H W"] | None = None,
 ) -> Start:
-    """Candidate parts: image regions that differ from the anchor's pictures, lifted to the scene's Gaussians.
+    """Candidate parts: Gaussians that show what changes in other frames, divided as segments of the anchor's
+    pictures are.
 
     Args:
         sequence: the recording of synchronised cameras.
@@ -83,12 +85,16 @@ def begin(
         )
     frame = sequence.frame(anchor.frame)
     plan = plan_render(gaussians, frame.cameras, headroom=config.headroom)
+    means, moves = np.asarray(gaussians.means), None
     if masks is None:
-        if not config.discover.difference:
-            moved = np.ones_like(moved)
         if segmenter is None:
             raise ValueError("segmenter, masks: expected one of them, found none")
-        masks = _find_masks(sequence, gaussians, frame, plan, anchor, moved, config, segmenter)
+        shown = np.ones((moved.shape[0], *moved.shape[2:]), bool)
+        if config.discover.difference:
+            changes = changes_of(gaussians, frame.cameras, plan, moved)
+            moves = changes.usual >= config.discover.moving
+            shown = moved.any(1) & changing_views(gaussians, frame.cameras, plan, changes)
+        masks = _find_masks(sequence, gaussians, frame, plan, anchor, shown, config, segmenter)
     if not (masks > 0).any():
         raise ValueError(
             "masks: expected a segment with at least a third of its pixels changed in other frames, found "
@@ -99,7 +105,9 @@ def begin(
         gaussians, frame.cameras, plan, masks, slots, config.discover.lift_iterations
     )
     weights = softmax(np.asarray(logits), axis=-1)
-    order, count = _movable_first(np.asarray(gaussians.means), weights)
+    if moves is not None:
+        weights = with_what_moves(weights, gaussians, moves)
+    order, count = _movable_first(means, weights)
     weights = weights[order[:count]]
     labels = weights.argmax(-1)
     if not (labels != BACKGROUND).any():
@@ -113,7 +121,7 @@ def begin(
     weights /= weights.sum(-1, keepdims=True)
     field, located = new_field(key, config, movable.means, slots)
     field, warming = fit_field_to_weights(field, located, jnp.asarray(weights), jnp.asarray(alive))
-    means = np.asarray(gaussians.means)[order]
+    means = means[order]
     centers = centers_of(means[:count], labels, slots)
     canonical = Canonical(
         movable,

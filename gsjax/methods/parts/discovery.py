@@ -129,9 +129,14 @@ def open_frame(run: Run, t: int) -> Run:
     pose = before
     if 0 <= earlier < len(discovery.done) and discovery.done[earlier]:
         pose = _extrapolated(discovery.pose(earlier), before)
-    weights, predicted = copied((weights_of_run(run), pose))
-    kept = discovery._replace(frame=t, weights=weights, predicted=predicted)
-    return run.having(params=run.params._replace(pose=pose), state=run.state.for_new_frame(), kept=kept)
+    kept = discovery._replace(frame=t, weights=copied(weights_of_run(run)))
+    return with_prediction(run.having(state=run.state.for_new_frame(), kept=kept), pose)
+
+
+def with_prediction(run: Run, pose: HandlePose) -> Run:
+    """The run before the first step of its frame, which begins at a pose."""
+    kept = run.kept._replace(predicted=copied(pose))
+    return run.having(params=run.params._replace(pose=pose), kept=kept)
 
 
 @jax.jit

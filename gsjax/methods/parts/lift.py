@@ -27,11 +27,19 @@ def label_votes(
     """Votes of the masks' pixels for labels 0 to `count` - 1 of each Gaussian: the sum over the pixels of a
     label of the Gaussian's compositing weight, w_i = alpha_i T_i; the transpose of rendering features."""
     total = np.zeros((gaussians.num, count), np.float32)
-    zeros = jax.device_put(np.zeros((gaussians.num, count), gaussians.means.dtype))
     for c, mask in enumerate(masks):
-        labels = (mask[None, ..., None] == np.arange(count)).astype(zeros.dtype)
-        total += np.asarray(_votes(zeros, gaussians, one_camera(cameras, c), plan, labels))
+        labels = (mask[None, ..., None] == np.arange(count)).astype(np.float32)
+        total += pixel_votes(gaussians, one_camera(cameras, c), plan, labels)
     return total
+
+
+def pixel_votes(
+    gaussians: Gaussians, camera: Camera, plan: Plan, values: Float[np.ndarray, "1 H W K"]
+) -> Float[np.ndarray, "N K"]:
+    """The sum over the pixels of one camera of their values, weighted by what each Gaussian contributes to
+    them, w_i = alpha_i T_i."""
+    zeros = jax.device_put(np.zeros((gaussians.num, values.shape[-1]), gaussians.means.dtype))
+    return np.asarray(_votes(zeros, gaussians, camera, plan, values.astype(zeros.dtype)))
 
 
 @partial(host_jit, static_argnames="plan")

@@ -66,7 +66,7 @@ def propagate_masks(
         pictures: RGB pictures of the anchor frame.
         depths: rendered from the canonical scene, metres, 0 where it is empty.
         Ks: intrinsics.
-        moved: from `moved_pixels`.
+        moved: pixels that show something that moves.
         order: indices of the views, from `view_order`.
         segmenter: finds the segments of a picture.
         known: (view, previous view, its mask) -> labels of the view that earlier views imply, [H, W]; -1
@@ -101,7 +101,7 @@ def masks_from_labels(
 
     Args:
         labels: 0 and below is background.
-        moved: from `moved_pixels`.
+        moved: pixels that show something that moves.
         most: largest number of labels; those with the fewest pixels are dropped.
     """
     flat = np.maximum(labels, 0).reshape(-1, labels.shape[-1])

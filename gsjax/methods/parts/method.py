@@ -15,6 +15,7 @@ from gsjax.methods.parts.discovery import (
     open_frame,
     order_of_frames,
     weights_of_run,
+    with_prediction,
 )
 from gsjax.methods.parts.finish import begin_refinement, scene_and_trajectory
 from gsjax.methods.parts.pictures import (
@@ -24,11 +25,13 @@ from gsjax.methods.parts.pictures import (
     current_frame,
     draws_of,
     full_picture,
+    half_frame,
     order_of_pictures,
     past_picture,
 )
 from gsjax.methods.parts.refine import RefineBatch, RefineParams, parts_step
 from gsjax.methods.parts.result import PartsResult
+from gsjax.methods.parts.search import searched
 from gsjax.methods.parts.stream import StreamBatch, posed
 from gsjax.methods.protocols import SequenceLike
 from gsjax.optim.method import Run
@@ -94,7 +97,7 @@ class Parts:
             discovery: Discovery = run.kept
             if discovery.is_between_frames:
                 order = order_of_frames(problem.sequence.num_frames, discovery.anchor)
-                run = open_frame(run, order[discovery.count])
+                run = self._opened(problem, run, order[discovery.count])
             elif self._size(run) != self._size(run.having(step=run.step - 1)):
                 run = run.having(guard=None)  # losses of larger pictures are others
         return run.having(plans=run.plans | self._missing_plans(problem, run))
@@ -149,6 +152,16 @@ class Parts:
         scene, trajectory = scene_and_trajectory(discovery, weights, problem.sequence.times)
         pixel, blend = float(discovery.canonical.pixel), self.config.stream.blend
         return PartsResult(scene, trajectory, discovery.done, discovery.anchor, pixel, blend)
+
+    def _opened(self, problem: Problem, run: Run, t: int) -> Run:
+        """The run before the first step of frame t, after a search for parts that jumped."""
+        run = open_frame(run, t)
+        discovery: Discovery = run.kept
+        if not self.config.stream.search:
+            return run
+        views = half_frame(problem, t), half_frame(problem, discovery.anchor)
+        place = discovery.canonical, discovery.weights, discovery.predicted
+        return with_prediction(run, searched(*place, *views, self.config.stream.blend))
 
     def _step_of_frame(self, run: Run) -> int:
         """Number of steps that a run has made in its frame."""

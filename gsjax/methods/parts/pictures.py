@@ -129,13 +129,15 @@ def past_picture(
         camera: index of the camera.
         blend: how rotations are blended.
     """
-    if t not in problem.past:
-        problem.past[t] = _on_host(part_of(problem.sequence.frame(t), (), HALF))
-    frame = one_camera(problem.past[t], camera)
-    frame = eqx.tree_at(lambda f: f.images, frame, frame.images / np.float32(255))
+    frame = _in_floats(one_camera(_half_in_bytes(problem, t), camera))
     pose = discovery.pose(t)
     seen = with_part_masks(frame, discovery.canonical, discovery.weights, pose, TILE // HALF, blend=blend)
     return seen, pose
+
+
+def half_frame(problem: Problem, t: int) -> Frame:
+    """All cameras of frame t at half size, on the host."""
+    return _in_floats(_half_in_bytes(problem, t))
 
 
 def full_picture(problem: Problem, t: int, camera: int) -> Frame:
@@ -176,6 +178,16 @@ def with_part_masks(
     if frame.masks is not None:
         counts &= frame.masks
     return Frame(frame.images, frame.depths, frame.cameras, counts, frame.time)
+
+
+def _half_in_bytes(problem: Problem, t: int) -> Frame:
+    if t not in problem.past:
+        problem.past[t] = _on_host(part_of(problem.sequence.frame(t), (), HALF))
+    return problem.past[t]
+
+
+def _in_floats(frame: Frame) -> Frame:
+    return eqx.tree_at(lambda f: f.images, frame, frame.images / np.float32(255))
 
 
 def _on_host(frame: Frame) -> Frame:

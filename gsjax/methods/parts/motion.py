@@ -1,0 +1,119 @@
+"""Which Gaussians move: those of which what they show changes in most cameras at once. A pixel also changes
+where something else passes in front, but only for the few cameras that look along that line; what something
+comes to rest on changes for all of them, but only for a while."""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from gsjax.geometry.cameras import Camera
+from gsjax.methods.parts.lift import pixel_votes
+from gsjax.methods.parts.trajectory import BACKGROUND
+from gsjax.rasterize.plan import Plan
+from gsjax.scene.frame import one_camera
+from gsjax.scene.gaussians import Gaussians
+from gsjax.scene.render import render
+
+_SMOOTH = 8  # Gaussians next to each other that are judged together
+_OFTEN = 8  # one in so many frames shows the change of what may move
+_SEEN = 1e-3  # pixels of which a Gaussian shows less are no evidence
+_TOUCHING = 16  # neighbours that may touch a Gaussian
+_LEAST_WEIGHT = 0.1  # of all parts, below which the masks do not tell the part
+_LEAST_CHANGE = 0.35  # share below which what a Gaussian shows hardly changes in any frame
+
+
+class Changes(NamedTuple):
+    """The share of what each Gaussian shows, in all cameras, that has changed, 0 to 1.
+
+    Attributes:
+        most: in an eighth of the frames, or more.
+        usual: in half of the frames, or more.
+    """
+
+    most: Float[np.ndarray, "N"]
+    usual: Float[np.ndarray, "N"]
+
+
+def changes_of(
+    gaussians: Gaussians, cameras: Camera, plan: Plan, moved: Bool[np.ndarray, "C F H W"]
+) -> Changes:
+    """What changes in the places of Gaussians, averaged over neighbours.
+
+    Args:
+        gaussians: the scene at the anchor frame.
+        cameras: C cameras.
+        plan: for one camera.
+        moved: from `moved_pixels`.
+    """
+    votes = np.zeros((gaussians.num, moved.shape[1] + 1), np.float32)
+    for c, changed in enumerate(moved):
+        values = np.concatenate([changed, np.ones_like(changed[:1])]).transpose(1, 2, 0)
+        votes += pixel_votes(gaussians, one_camera(cameras, c), plan, values[None].astype(np.float32))
+    means = np.asarray(gaussians.means)
+    near = cKDTree(means).query(means, k=min(_SMOOTH, len(means)))[1].reshape(len(means), -1)
+    votes = votes[near].sum(1)
+    seen = votes[:, -1:]
+    shares = np.where(seen > _SEEN, votes[:, :-1] / np.maximum(seen, _SEEN), 0.0)
+    shares, frames = np.sort(shares, axis=1), moved.shape[1]
+    return Changes(shares[:, -max(1, frames // _OFTEN)], shares[:, (frames - 1) // 2])
+
+
+def changing_views(
+    gaussians: Gaussians, cameras: Camera, plan: Plan, changes: Changes
+) -> Bool[np.ndarray, "C H W"]:
+    """The pixels of the anchor's pictures that show Gaussians in whose places much changes in some frames.
+
+    Args:
+        gaussians: the scene at the anchor frame.
+        cameras: C cameras.
+        plan: for one camera.
+        changes: from `changes_of`.
+    """
+    features, views = jnp.asarray(changes.most[:, None], gaussians.means.dtype), []
+    for c in range(cameras.viewmat.shape[0]):
+        drawn = render(gaussians, one_camera(cameras, c), plan, features=features)
+        assert drawn.features is not None
+        views.append(np.asarray(drawn.features[0, ..., 0]) >= _LEAST_CHANGE)
+    return np.stack(views)
+
+
+def with_what_moves(
+    weights: Float[np.ndarray, "N P"], gaussians: Gaussians, moves: Bool[np.ndarray, "N"]
+) -> Float[np.ndarray, "N P"]:
+    """The weights of parts, after what moves but shows in no mask has joined the nearest part that it is
+    connected to; it would stay behind as a ghost.
+
+    Args:
+        weights: from the lifted masks; rows sum to 1.
+        gaussians: the scene at the anchor frame.
+        moves: which Gaussians move.
+    """
+    means, weights = np.asarray(gaussians.means), weights.copy()
+    known = weights[:, BACKGROUND] < 1 - _LEAST_WEIGHT
+    for group in _connected(gaussians, np.flatnonzero(moves)):
+        told, untold = group[known[group]], group[~known[group]]
+        if len(told):
+            weights[untold] = weights[told[cKDTree(means[told]).query(means[untold])[1]]]
+    belongs = moves & (weights[:, BACKGROUND] < 1 - _LEAST_WEIGHT)
+    weights[belongs, BACKGROUND] = 0
+    return weights / weights.sum(-1, keepdims=True)
+
+
+def _connected(gaussians: Gaussians, chosen: Int[np.ndarray, "n"]) -> list[Int[np.ndarray, "m"]]:
+    """The chosen Gaussians, as groups of those that touch, the largest first. Two touch if they are no
+    farther apart than the sum of their largest scales."""
+    if not len(chosen):
+        return []
+    means, sizes = np.asarray(gaussians.means)[chosen], np.asarray(gaussians.scales).max(-1)[chosen]
+    apart, near = cKDTree(means).query(means, k=min(_TOUCHING + 1, len(chosen)))
+    apart, near = apart.reshape(len(chosen), -1), near.reshape(len(chosen), -1)
+    touch = apart <= sizes[:, None] + sizes[near]
+    rows = np.repeat(np.arange(len(chosen)), touch.sum(1))
+    links = coo_array((np.ones(len(rows), bool), (rows, near[touch])), shape=(len(chosen), len(chosen)))
+    count, group_of = connected_components(links, directed=False)
+    return sorted((chosen[group_of == i] for i in range(count)), key=len, reverse=True)

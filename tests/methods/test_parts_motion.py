@@ -1,0 +1,121 @@
+"""What moves, told from many views, and parts that jump."""
+
+import jax
+import numpy as np
+import pytest
+
+from gsjax.methods.parts import BACKGROUND, PartsConfig, begin, choose_anchor, moved_pixels
+from gsjax.methods.parts.anchor import Anchor
+from gsjax.methods.parts.motion import changes_of, changing_views, with_what_moves
+from gsjax.methods.parts.search import groups_of, searched
+from gsjax.methods.parts.stream import skinning_weights
+from gsjax.scene.feature_grid import FeatureGridConfig
+from gsjax.scene.handles import HandlePose, at_rest
+from gsjax.scene.render import plan_render
+from tests.methods.moving_boxes import Box, MovingBoxes, linear
+
+FRAMES = 5
+
+
+@pytest.fixture(scope="module")
+def boxes():
+    """One that slides, and one that jumps by several times its width in each frame."""
+    slides = Box(
+        (-0.15, -0.05, 0.05), (0.12, 0.08, 0.1), linear(FRAMES, (0, 0, 0)), linear(FRAMES, (0, 0.12, 0))
+    )
+    jumps = Box(
+        (0.15, 0.25, 0.03), (0.06, 0.06, 0.06), linear(FRAMES, (0, 0, 0)), linear(FRAMES, (0, -0.5, 0))
+    )
+    return MovingBoxes([slides, jumps], cameras=5)
+
+
+@pytest.fixture(scope="module")
+def plan(boxes):
+    return plan_render(boxes.gaussians, boxes.cameras, headroom=2.0)
+
+
+@pytest.fixture(scope="module")
+def moved(boxes):
+    anchor = choose_anchor(boxes.image, FRAMES, boxes.num_cameras, 0)
+    return moved_pixels(boxes.image, anchor, boxes.num_cameras)
+
+
+@pytest.fixture(scope="module")
+def changes(boxes, plan, moved):
+    return changes_of(boxes.gaussians, boxes.cameras, plan, moved)
+
+
+def test_what_leaves_changes_and_what_is_covered_for_a_while_does_not(boxes, changes):
+    usual = changes.usual >= 0.5
+    assert usual[boxes.bodies > 0].mean() > 0.8  # the one that slides slowly is still there in part
+    assert usual[boxes.bodies == 0].mean() < 0.12
+    assert (changes.most >= 0.5)[boxes.bodies == 0].mean() > 0.3
+    assert (changes.most >= changes.usual).all()
+
+
+def test_pixels_show_what_may_move(boxes, plan, changes):
+    shown = changing_views(boxes.gaussians, boxes.cameras, plan, changes)
+    true = boxes.masks(boxes.bodies) > 0
+    assert shown[true].mean() > 0.9
+
+
+def test_what_moves_joins_the_part_that_it_touches(boxes):
+    """The masks know half of the first box, and nothing of the second, which touches no part."""
+    left = np.asarray(boxes.gaussians.means)[:, 1] < boxes.boxes[0].center[1]
+    known = (boxes.bodies == 1) & left
+    weights = np.eye(4, dtype=np.float32)[np.where(known, 1, 0)]
+    found = with_what_moves(weights, boxes.gaussians, boxes.bodies > 0)
+    np.testing.assert_allclose(found.sum(-1), 1, rtol=1e-6)
+    labels = found.argmax(-1)
+    assert set(labels[boxes.bodies == 1]) == {1}
+    assert set(labels[boxes.bodies != 1]) == {BACKGROUND}
+
+
+def test_what_came_before_something_did_not_move_it():
+    """With depth, the place that is covered does not count as changed."""
+    pictures, depths = np.full((2, 12, 16, 3), 100, np.uint8), np.full((2, 12, 16), 2.0, np.float32)
+    pictures[0, 4:8, 2:6], depths[0, 4:8, 2:6] = 250, 1.5
+    pictures[1, 4:8, 10:14], depths[1, 4:8, 10:14] = 250, 1.5
+    anchor = Anchor(0, 1, np.array([0.0, 0.1]))
+    both = moved_pixels(lambda t, c: pictures[t], anchor, 1)[0, 0]
+    left = moved_pixels(lambda t, c: pictures[t], anchor, 1, depth=lambda t, c: depths[t])[0, 0]
+    before, after = (slice(5, 7), slice(3, 5)), (slice(5, 7), slice(11, 13))
+    assert both[before].all()
+    assert both[after].all()
+    assert left[before].all()
+    assert not left[after].any()
+
+
+@pytest.fixture(scope="module")
+def start(boxes, moved):
+    config = PartsConfig(grid=FeatureGridConfig(4, 4, 32, 12, 2, 16))
+    anchor = choose_anchor(boxes.image, FRAMES, boxes.num_cameras, 0)
+    masks = boxes.masks(boxes.bodies)
+    return begin(boxes, boxes.gaussians, anchor, moved, config, None, jax.random.key(0), masks)
+
+
+def test_parts_that_touch_are_one_group(boxes, start):
+    weights = np.asarray(skinning_weights(start.field, start.canonical))
+    assert [group.parts.tolist() for group in groups_of(start.canonical, weights)] == [[1], [2]]
+    labels = weights.argmax(-1)
+    half = np.asarray(start.canonical.movable.means)[:, 1] < boxes.boxes[0].center[1]
+    weights = np.eye(weights.shape[1], dtype=np.float32)[np.where((labels == 1) & half, 3, labels)]
+    assert [group.parts.tolist() for group in groups_of(start.canonical, weights)] == [[1, 3], [2]]
+
+
+@pytest.mark.parametrize("t", [1, 4])
+def test_what_jumped_is_found(boxes, start, t):
+    weights = skinning_weights(start.field, start.canonical)
+    shifts = [box.shifts[t] for box in boxes.boxes]
+    rest = at_rest(len(start.canonical.alive))
+    predicted = np.array([shifts[0], boxes.boxes[1].shifts[t - 1]], np.float32)
+    pose = HandlePose(rest.quats, rest.translations.at[1:3].set(predicted))
+    found = searched(start.canonical, weights, pose, boxes.frame(t), boxes.frame(0), "quaternion")
+    assert np.linalg.norm(found.translations[2] - shifts[1]) < 0.025  # of 0.125 m
+    np.testing.assert_array_equal(found.translations[1], pose.translations[1])
+
+
+def test_what_is_where_it_should_be_stays_to_the_bit(boxes, start):
+    weights, pose = skinning_weights(start.field, start.canonical), at_rest(len(start.canonical.alive))
+    here = boxes.frame(0)
+    assert searched(start.canonical, weights, pose, here, here, "quaternion") is pose
