@@ -7,7 +7,9 @@ from gsjax.data.sequence import Sequence
 from gsjax.methods.fit import FitConfig, StartConfig
 from gsjax.methods.parts import Anchor, PartsConfig, choose_anchor, moved_pixels
 
-FIT = FitConfig(steps=3_000, cap=15_000, sh_degree=0, depth_weight=0.5, start=StartConfig(count=10_000))
+FIT = FitConfig(
+    steps=3_000, cap=15_000, sh_degree=0, depth_weight=0.5, exposure=True, start=StartConfig(count=10_000)
+)
 """Default settings of the fit of the canonical scene."""
 
 

@@ -11,6 +11,7 @@ from scipy.special import softmax
 from gsjax.geometry.cameras import Camera
 from gsjax.methods.parts.anchor import Anchor
 from gsjax.methods.parts.config import PartsConfig
+from gsjax.methods.parts.exposure import exposures_of
 from gsjax.methods.parts.lift import label_votes, lift_masks
 from gsjax.methods.parts.masks import propagate_masks, view_order
 from gsjax.methods.parts.motion import changes_of, changing_views, with_what_moves
@@ -37,6 +38,7 @@ class Start(NamedTuple):
         order: rows of the given Gaussians, movable ones first.
         canonical: the scene in that order.
         field: the skinning weights, fitted to the lifted masks.
+        exposures: maps of each camera's colours to those of the scene.
         masks: candidate parts in every view of the anchor frame, [C,H,W].
         losses: losses of lifting the masks (`lifting`) and of fitting the field (`warming`).
     """
@@ -45,6 +47,7 @@ class Start(NamedTuple):
     order: Int[np.ndarray, "N"]
     canonical: Canonical
     field: Field
+    exposures: Float[np.ndarray, "C 3 4"]
     masks: Int[np.ndarray, "C H W"]
     losses: dict[str, np.ndarray]
 
@@ -134,7 +137,8 @@ def begin(
         jnp.asarray(cKDTree(means).query(means[:count], k=_NEIGHBORS + 1)[1][:, 1:], jnp.int32),
     )
     losses = {"lifting": lifting, "warming": warming}
-    return Start(anchor, order, canonical, field, masks, losses)
+    exposures = exposures_of(gaussians, frame, plan)
+    return Start(anchor, order, canonical, field, exposures, masks, losses)
 
 
 def _find_masks(

@@ -34,6 +34,7 @@ class Discovery(NamedTuple):
         canonical: the scene and its handles.
         order: rows of the given Gaussians, movable ones first.
         anchor: the canonical frame.
+        exposures: maps of each camera's colours to those of the scene.
         quats, translations: poses at all frames, [T,P,4] and [T,P,3]; at rest where not yet found.
         found: rank of each frame in the order of discovery; 0 is the anchor, -1 is not yet found.
         born: number of found frames when each part's own motion began.
@@ -48,6 +49,7 @@ class Discovery(NamedTuple):
     canonical: Canonical
     order: Int[np.ndarray, "N"]
     anchor: int
+    exposures: Float[np.ndarray, "C 3 4"]
     quats: Float[np.ndarray, "T P 4"]
     translations: Float[np.ndarray, "T P 3"]
     found: Int[np.ndarray, "T"]
@@ -109,6 +111,7 @@ def initial_run(start: Start, frames: int, config: PartsConfig) -> Run:
         canonical=start.canonical,
         order=start.order,
         anchor=start.anchor.frame,
+        exposures=start.exposures,
         quats=quats,
         translations=np.zeros((frames, slots, 3), np.float32),
         found=np.where(np.arange(frames) == start.anchor.frame, 0, -1),

@@ -12,6 +12,7 @@ from gsjax.geometry.rotations import quats_to_matrices
 from gsjax.methods.parts.config import PartsConfig, StreamConfig
 from gsjax.methods.parts.discover import centers_of
 from gsjax.methods.parts.discovery import Discovery, join_parts, weights_of_run
+from gsjax.methods.parts.exposure import corrected
 from gsjax.methods.parts.pictures import with_part_masks
 from gsjax.methods.parts.refine import RefineParams, refine_step
 from gsjax.methods.parts.stream import Canonical, picture_loss, posed
@@ -132,7 +133,7 @@ class _MeanLoss:
         frames = done[np.linspace(0, len(done) - 1, min(_FRAMES, len(done))).round().astype(int)]
         self._pictures: list[tuple[HandlePose, Frame]] = []
         for i, t in enumerate(frames.tolist()):
-            frame = part_of(sequence.frame(t), (), _SHRINK)
+            frame = part_of(corrected(sequence.frame(t), discovery.exposures), (), _SHRINK)
             cameras = {(i + k * count // _CAMERAS) % count for k in range(_CAMERAS)}
             place = self._canonical, jnp.asarray(weights), discovery.pose(t)
             seen = with_part_masks(frame, *place, TILE // _SHRINK, blend=config.stream.blend)

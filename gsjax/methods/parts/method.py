@@ -159,7 +159,7 @@ class Parts:
         discovery: Discovery = run.kept
         if not self.config.stream.search:
             return run
-        views = half_frame(problem, t), half_frame(problem, discovery.anchor)
+        views = [half_frame(problem, discovery, at) for at in (t, discovery.anchor)]
         place = discovery.canonical, discovery.weights, discovery.predicted
         return with_prediction(run, searched(*place, *views, self.config.stream.blend))
 
@@ -180,7 +180,7 @@ class Parts:
         batch = RefineBatch(
             discovery.canonical,
             discovery.weights,
-            full_picture(problem, t, camera),
+            full_picture(problem, discovery, t, camera),
             jnp.asarray(t),
             jnp.asarray(discovery.anchor),
             i / self.config.refine.iterations,

@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from gsjax.methods.parts.discovery import Discovery
+from gsjax.methods.parts.exposure import corrected
 from gsjax.methods.parts.stream import Canonical, valid_pixels
 from gsjax.methods.parts.trajectory import BACKGROUND
 from gsjax.methods.protocols import SequenceLike
@@ -105,7 +106,7 @@ def current_frame(problem: Problem, discovery: Discovery, size: int, blend: Blen
     weights, frame = problem.now.get(size, (None, None))
     if frame is None or weights is not discovery.weights:
         t = discovery.frame
-        pictures = problem.sequence.frame(t)
+        pictures = corrected(problem.sequence.frame(t), discovery.exposures)
         for other in (HALF, FULL):
             smaller = part_of(pictures, (), other)
             if other == HALF:
@@ -129,22 +130,22 @@ def past_picture(
         camera: index of the camera.
         blend: how rotations are blended.
     """
-    frame = _in_floats(one_camera(_half_in_bytes(problem, t), camera))
+    frame = _in_floats(one_camera(_half_in_bytes(problem, discovery, t), camera))
     pose = discovery.pose(t)
     seen = with_part_masks(frame, discovery.canonical, discovery.weights, pose, TILE // HALF, blend=blend)
     return seen, pose
 
 
-def half_frame(problem: Problem, t: int) -> Frame:
-    """All cameras of frame t at half size, on the host."""
-    return _in_floats(_half_in_bytes(problem, t))
+def half_frame(problem: Problem, discovery: Discovery, t: int) -> Frame:
+    """All cameras of frame t at half size, on the host, with the colours of the scene."""
+    return _in_floats(_half_in_bytes(problem, discovery, t))
 
 
-def full_picture(problem: Problem, t: int, camera: int) -> Frame:
+def full_picture(problem: Problem, discovery: Discovery, t: int, camera: int) -> Frame:
     """The picture of one camera in frame t, with all pixels that the data does not mask out."""
     if t not in problem.whole:
         problem.whole.clear()
-        problem.whole[t] = problem.sequence.frame(t)
+        problem.whole[t] = corrected(problem.sequence.frame(t), discovery.exposures)
     frame = one_camera(problem.whole[t], camera)
     return Frame(frame.images, frame.depths, frame.cameras, valid_pixels(frame), frame.time)
 
@@ -180,9 +181,10 @@ def with_part_masks(
     return Frame(frame.images, frame.depths, frame.cameras, counts, frame.time)
 
 
-def _half_in_bytes(problem: Problem, t: int) -> Frame:
+def _half_in_bytes(problem: Problem, discovery: Discovery, t: int) -> Frame:
     if t not in problem.past:
-        problem.past[t] = _on_host(part_of(problem.sequence.frame(t), (), HALF))
+        pictures = corrected(problem.sequence.frame(t), discovery.exposures)
+        problem.past[t] = _on_host(part_of(pictures, (), HALF))
     return problem.past[t]
 
 

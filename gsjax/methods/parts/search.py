@@ -20,9 +20,11 @@ from gsjax.scene.handles import Blend, HandlePose, skin
 _POINTS = 64  # Gaussians by which a group of parts is recognised
 _TOUCH = 0.05  # share of a part's neighbours in another one with which it moves as a group
 _MOST = 0.3  # difference of colours, 0 to 1, that counts as entirely wrong
-_ASTRAY = 1.5, 0.03  # a group is looked for if its difference is so much larger than at the anchor
-_BETTER = 0.7  # share of its difference at the predicted place that a better place may have
-_GRIDS = (8.0, 1.0), (1.0, 0.5), (0.5, 0.25)  # reach and spacing of the places, in radii of the group
+_ASTRAY = 1.25, 0.02  # a group is looked for if its difference is so much larger than at the anchor
+_BETTER = 0.75  # share of its difference at the predicted place that a better place may have
+_AS_USUAL = 1.1  # share of its difference at the anchor that a better place may have
+_GRIDS = (6.0, 1.0), (1.0, 0.5), (0.5, 0.25)  # reach and spacing of the places, in radii of the group
+_INSIDE = 0.5  # share of the points that a place must keep in the pictures
 
 
 class Group(NamedTuple):
@@ -31,7 +33,7 @@ class Group(NamedTuple):
     Attributes:
         parts: indices of the parts.
         rows: rows of the movable Gaussians, the most visible ones.
-        radius: root mean square distance from its middle, metres.
+        radius: distance from its middle that nearly all of its Gaussians keep, metres.
     """
 
     parts: Int[np.ndarray, "p"]
@@ -63,7 +65,7 @@ def groups_of(canonical: Canonical, weights: Float[np.ndarray, "M P"]) -> list[G
             new += [q for q in np.flatnonzero(near).tolist() if q in left - parts]
         left -= parts
         rows = np.flatnonzero(np.isin(labels, sorted(parts)))
-        radius = float(np.sqrt(np.sum((means[rows] - means[rows].mean(0)) ** 2, -1).mean()))
+        radius = float(np.quantile(np.linalg.norm(means[rows] - means[rows].mean(0), axis=-1), 0.95))
         groups.append(Group(np.array(sorted(parts)), rows[np.argsort(-sizes[rows])[:_POINTS]], radius))
     return groups
 
@@ -106,17 +108,19 @@ def searched(
             places = best + np.float32(group.radius) * _grid(reach, spacing)
             at = costs(moved, now, places)
             best, there = places[at.argmin()][None], at.min()
-        if there <= _BETTER * here:
+        if there <= min(_BETTER * here, _AS_USUAL * usual):
             translations[group.parts] += best[0]
             found = True
     return HandlePose(predicted.quats, jnp.asarray(translations)) if found else predicted
 
 
 def _grid(reach: float, spacing: float) -> Float[np.ndarray, "K 3"]:
-    """Places within a reach of the origin, which is one of them."""
+    """Places within a reach of the origin, which is the first of them."""
     steps = spacing * np.arange(-int(reach / spacing), int(reach / spacing) + 1)
     grid = np.stack(np.meshgrid(steps, steps, steps), -1).reshape(-1, 3)
-    return grid[np.linalg.norm(grid, axis=-1) <= reach + 1e-6].astype(np.float32)
+    distances = np.linalg.norm(grid, axis=-1)
+    near = np.argsort(distances, kind="stable")
+    return grid[near[distances[near] <= reach + 1e-6]].astype(np.float32)
 
 
 @host_jit
@@ -128,7 +132,8 @@ def _costs(
     shifts: Float[Array, "K 3"],
 ) -> Float[Array, "K"]:
     """The mean difference between the colours of points and of the pixels that they project to, for each
-    shift of the points; points outside a picture do not count."""
+    shift of the points; points outside a picture do not count, unless most are that the first shift has
+    inside."""
     height, width = images.shape[1:3]
 
     def of_camera(image, viewmat, K):
@@ -143,4 +148,5 @@ def _costs(
         return jax.lax.map(of_shift, shifts, batch_size=128)
 
     off, counts = jax.lax.map(lambda one: of_camera(*one), (images, cameras.viewmat, cameras.K))
-    return off.sum(0) / jnp.maximum(counts.sum(0), 1)
+    total = counts.sum(0)
+    return jnp.where(total > _INSIDE * total[0], off.sum(0) / jnp.maximum(total, 1), _MOST)
