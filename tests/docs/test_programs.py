@@ -77,7 +77,7 @@ def test_all_use_the_same_words(verb):
 def test_it_runs(verb, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(first_fit, "TrackConfig", lambda: TRACK)
-    monkeypatch.setattr(parts_start, "FIT", replace(parts_start.FIT, steps=4, cap=4000, coarse_until=0.0))
+    monkeypatch.setattr(parts_start, "FIT", replace(parts_start.FIT, steps=40, cap=4000, coarse_until=0.0))
     text = program(verb).text
     for long, short in SHORTER[verb].items():
         assert long in text, f"gsjax.{verb}: expected {long!r}, which is shortened here"

@@ -66,7 +66,8 @@ def changes_of(
 def changing_views(
     gaussians: Gaussians, cameras: Camera, plan: Plan, changes: Changes
 ) -> Bool[np.ndarray, "C H W"]:
-    """The pixels of the anchor's pictures that show Gaussians in whose places much changes in some frames.
+    """The pixels of the anchor's pictures that show Gaussians in whose places much changes in some frames, or
+    none at all.
 
     Args:
         gaussians: the scene at the anchor frame.
@@ -78,7 +79,7 @@ def changing_views(
     for c in range(cameras.viewmat.shape[0]):
         drawn = render(gaussians, one_camera(cameras, c), plan, features=features)
         assert drawn.features is not None
-        views.append(np.asarray(drawn.features[0, ..., 0]) >= _LEAST_CHANGE)
+        views.append(np.asarray(drawn.features[0, ..., 0] >= _LEAST_CHANGE * drawn.alphas[0]))
     return np.stack(views)
 
 
