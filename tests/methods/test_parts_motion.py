@@ -1,17 +1,20 @@
 """What moves, told from many views, and parts that jump."""
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from gsjax.methods.parts import BACKGROUND, PartsConfig, begin, choose_anchor, moved_pixels
 from gsjax.methods.parts.anchor import Anchor
+from gsjax.methods.parts.discovery import initial_run
+from gsjax.methods.parts.exposure import corrected, exposures_of
 from gsjax.methods.parts.motion import changes_of, changing_views, with_what_moves
 from gsjax.methods.parts.search import groups_of, searched
-from gsjax.methods.parts.stream import skinning_weights
 from gsjax.scene.feature_grid import FeatureGridConfig
+from gsjax.scene.frame import Frame, one_camera
 from gsjax.scene.handles import HandlePose, at_rest
-from gsjax.scene.render import plan_render
+from gsjax.scene.render import plan_render, render
 from tests.methods.moving_boxes import Box, MovingBoxes, linear
 
 FRAMES = 5
@@ -95,27 +98,53 @@ def start(boxes, moved):
 
 
 def test_parts_that_touch_are_one_group(boxes, start):
-    weights = np.asarray(skinning_weights(start.field, start.canonical))
-    assert [group.parts.tolist() for group in groups_of(start.canonical, weights)] == [[1], [2]]
+    discovery = initial_run(start, FRAMES, PartsConfig()).kept
+    weights = np.asarray(discovery.weights)
+    assert [group.parts.tolist() for group in groups_of(discovery)] == [[1], [2]]
     labels = weights.argmax(-1)
     half = np.asarray(start.canonical.movable.means)[:, 1] < boxes.boxes[0].center[1]
     weights = np.eye(weights.shape[1], dtype=np.float32)[np.where((labels == 1) & half, 3, labels)]
-    assert [group.parts.tolist() for group in groups_of(start.canonical, weights)] == [[1, 3], [2]]
+    discovery = discovery._replace(weights=jnp.asarray(weights))
+    assert [group.parts.tolist() for group in groups_of(discovery)] == [[1, 3], [2]]
 
 
 @pytest.mark.parametrize("t", [1, 4])
 def test_what_jumped_is_found(boxes, start, t):
-    weights = skinning_weights(start.field, start.canonical)
     shifts = [box.shifts[t] for box in boxes.boxes]
     rest = at_rest(len(start.canonical.alive))
     predicted = np.array([shifts[0], boxes.boxes[1].shifts[t - 1]], np.float32)
     pose = HandlePose(rest.quats, rest.translations.at[1:3].set(predicted))
-    found = searched(start.canonical, weights, pose, boxes.frame(t), boxes.frame(0), "quaternion")
+    discovery = initial_run(start, FRAMES, PartsConfig()).kept._replace(predicted=pose)
+    found = searched(discovery, boxes.frame(t), boxes.frame(0), "quaternion")
     assert np.linalg.norm(found.translations[2] - shifts[1]) < 0.025  # of 0.125 m
     np.testing.assert_array_equal(found.translations[1], pose.translations[1])
 
 
 def test_what_is_where_it_should_be_stays_to_the_bit(boxes, start):
-    weights, pose = skinning_weights(start.field, start.canonical), at_rest(len(start.canonical.alive))
-    here = boxes.frame(0)
-    assert searched(start.canonical, weights, pose, here, here, "quaternion") is pose
+    discovery, here = initial_run(start, FRAMES, PartsConfig()).kept, boxes.frame(0)
+    assert searched(discovery, here, here, "quaternion") is discovery.predicted
+    empty = np.zeros_like(discovery.weights)
+    empty[:, BACKGROUND] = 1
+    nothing = discovery._replace(weights=jnp.asarray(empty))
+    assert searched(nothing, here, here, "quaternion") is discovery.predicted
+
+
+def test_the_exposure_of_each_camera_is_found_whatever_stands_before_it(boxes, plan):
+    """Cameras of other gains and tints; the fourth has something in a corner that the scene has not."""
+    drawn = [render(boxes.gaussians, one_camera(boxes.cameras, c), plan) for c in range(5)]
+    rng = np.random.default_rng(0)
+    maps = np.eye(3, 4) + rng.uniform(-0.05, 0.05, (5, 3, 4))
+    maps += np.eye(3, 4) - maps.mean(0)
+    colors = np.concatenate([np.asarray(view.colors) for view in drawn])
+    exposed = np.einsum("cij,chwj->chwi", np.linalg.inv(maps[..., :3]), colors - maps[:, None, None, :, 3])
+    strange = exposed.copy()
+    strange[3, 20:28, 28:36] = [1.0, 0.0, 1.0]
+    frames = [Frame(jnp.asarray(images, jnp.float32), None, boxes.cameras) for images in (exposed, strange)]
+    for frame in frames:
+        found = exposures_of(drawn, frame)
+        np.testing.assert_allclose(found.mean(0), np.eye(3, 4), atol=1e-6)
+        shown = np.concatenate([np.asarray(view.alphas) for view in drawn]) > 0.5
+        off = np.abs(np.asarray(corrected(frame, found).images) - np.clip(colors, 0, 1)).max(-1)
+        assert np.median(off[shown]) < 0.01
+    without = np.abs(np.clip(exposed, 0, 1) - np.clip(colors, 0, 1)).max(-1)
+    assert np.median(without[shown]) > 0.03

@@ -22,7 +22,7 @@ from gsjax.methods.protocols import Segmenter, SequenceLike
 from gsjax.rasterize.plan import Plan
 from gsjax.scene.frame import Frame, one_camera
 from gsjax.scene.gaussians import Gaussians, take
-from gsjax.scene.render import plan_render, render
+from gsjax.scene.render import Rendered, plan_render, render
 
 _SURELY_FIXED = 0.9  # background weight above which a Gaussian is fixed ...
 _NEAR = 3.0  # ... unless a moving one is this near, in typical distances between Gaussians
@@ -88,6 +88,7 @@ def begin(
         )
     frame = sequence.frame(anchor.frame)
     plan = plan_render(gaussians, frame.cameras, headroom=config.headroom)
+    drawn = [render(gaussians, one_camera(frame.cameras, c), plan) for c in range(sequence.num_cameras)]
     means, moves = np.asarray(gaussians.means), None
     if masks is None:
         if segmenter is None:
@@ -97,7 +98,7 @@ def begin(
             changes = changes_of(gaussians, frame.cameras, plan, moved)
             moves = changes.usual >= config.discover.moving
             shown = moved.any(1) & changing_views(gaussians, frame.cameras, plan, changes)
-        masks = _find_masks(sequence, gaussians, frame, plan, anchor, shown, config, segmenter)
+        masks = _find_masks(sequence, gaussians, frame, drawn, plan, anchor, shown, config, segmenter)
     if not (masks > 0).any():
         raise ValueError(
             "masks: expected a segment with at least a third of its pixels changed in other frames, found "
@@ -137,7 +138,7 @@ def begin(
         jnp.asarray(cKDTree(means).query(means[:count], k=_NEIGHBORS + 1)[1][:, 1:], jnp.int32),
     )
     losses = {"lifting": lifting, "warming": warming}
-    exposures = exposures_of(gaussians, frame, plan)
+    exposures = exposures_of(drawn, frame)
     return Start(anchor, order, canonical, field, exposures, masks, losses)
 
 
@@ -145,6 +146,7 @@ def _find_masks(
     sequence: SequenceLike,
     gaussians: Gaussians,
     frame: Frame,
+    drawn: list[Rendered],
     plan: Plan,
     anchor: Anchor,
     moved: Bool[np.ndarray, "C H W"],
@@ -152,7 +154,6 @@ def _find_masks(
     segmenter: Segmenter,
 ) -> Int[np.ndarray, "C H W"]:
     """Labels of the segments that changed, which agree between views; see `gsjax.methods.parts.masks`."""
-    drawn = [render(gaussians, one_camera(frame.cameras, c), plan) for c in range(sequence.num_cameras)]
     depths = np.stack([np.where(np.asarray(d.alphas[0]) > 0.5, np.asarray(d.depths[0]), 0.0) for d in drawn])
     pictures = [sequence.image(anchor.frame, c) for c in range(sequence.num_cameras)]
     first = int(moved.mean((1, 2)).argmax())

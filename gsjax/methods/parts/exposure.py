@@ -1,16 +1,16 @@
 """Exposure and white balance of each camera, against the canonical scene. Where cameras differ, a scene can
 only agree with all of them if their pictures are corrected first."""
 
+from collections.abc import Sequence
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from gsjax.rasterize.plan import Plan
-from gsjax.scene.frame import Frame, one_camera
-from gsjax.scene.gaussians import Gaussians
-from gsjax.scene.render import render
+from gsjax.scene.frame import Frame
+from gsjax.scene.render import Rendered
 
 _LEAST_ALPHA = 0.5  # pixels with a lower rendered alpha are ignored
 _TRUSTED = 0.2  # difference of colours, 0 to 1, above which something else is seen
@@ -18,24 +18,19 @@ _ROUNDS = 3  # fits, each without what the one before explains badly
 _PRIOR = 1e-3  # weight of no correction at all, relative to the pixels
 
 
-def exposures_of(gaussians: Gaussians, frame: Frame, plan: Plan) -> Float[np.ndarray, "C 3 4"]:
+def exposures_of(drawn: Sequence[Rendered], frame: Frame) -> Float[np.ndarray, "C 3 4"]:
     """The affine map of each camera's colours to those of the scene, [colour; 1] -> colour. Their mean is
     [I | 0]: an exposure that all cameras share belongs to the scene.
 
     Args:
-        gaussians: the scene at the anchor frame.
+        drawn: the scene at the anchor frame, as each camera sees it.
         frame: all cameras in that frame; its masks select the pixels that count.
-        plan: for one camera.
     """
     same, maps = np.eye(3, 4), []
-    for c in range(len(frame.images)):
-        one = one_camera(frame, c)
-        drawn = render(gaussians, one.cameras, plan)
-        counts = np.asarray(drawn.alphas[0]) > _LEAST_ALPHA
-        if one.masks is not None:
-            counts &= np.asarray(one.masks[0])
-        seen = np.asarray(one.images[0], np.float64)[counts]
-        true, seen = np.asarray(drawn.colors[0])[counts], np.insert(seen, 3, 1.0, axis=-1)
+    masks = [True] * len(drawn) if frame.masks is None else np.asarray(frame.masks)
+    for view, picture, mask in zip(drawn, np.asarray(frame.images, np.float64), masks, strict=True):
+        counts = (np.asarray(view.alphas[0]) > _LEAST_ALPHA) & mask
+        true, seen = np.asarray(view.colors[0])[counts], np.insert(picture[counts], 3, 1.0, axis=-1)
         found = same
         for _ in range(_ROUNDS):
             trusted = np.abs(seen @ found.T - true).max(-1, initial=0.0) < _TRUSTED

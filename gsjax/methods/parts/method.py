@@ -159,9 +159,8 @@ class Parts:
         discovery: Discovery = run.kept
         if not self.config.stream.search:
             return run
-        views = [half_frame(problem, discovery, at) for at in (t, discovery.anchor)]
-        place = discovery.canonical, discovery.weights, discovery.predicted
-        return with_prediction(run, searched(*place, *views, self.config.stream.blend))
+        anchor, now = (half_frame(problem, discovery, at) for at in (discovery.anchor, t))
+        return with_prediction(run, searched(discovery, now, anchor, self.config.stream.blend))
 
     def _step_of_frame(self, run: Run) -> int:
         """Number of steps that a run has made in its frame."""

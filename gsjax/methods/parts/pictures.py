@@ -33,7 +33,7 @@ class Problem:
         sequence: the recording of synchronised cameras.
         past: past frames at half size, on the host, with colours in bytes.
         now: the current frame by size, with the weights by which its pixels were selected.
-        whole: the full frame of the refinement's current step, by its index.
+        whole: the newest full frame, with the colours of the scene, by its index.
     """
 
     sequence: SequenceLike
@@ -106,9 +106,8 @@ def current_frame(problem: Problem, discovery: Discovery, size: int, blend: Blen
     weights, frame = problem.now.get(size, (None, None))
     if frame is None or weights is not discovery.weights:
         t = discovery.frame
-        pictures = corrected(problem.sequence.frame(t), discovery.exposures)
         for other in (HALF, FULL):
-            smaller = part_of(pictures, (), other)
+            smaller = part_of(_whole(problem, discovery, t), (), other)
             if other == HALF:
                 problem.past[t] = _on_host(smaller)
             place = discovery.canonical, discovery.weights, discovery.predicted
@@ -143,10 +142,7 @@ def half_frame(problem: Problem, discovery: Discovery, t: int) -> Frame:
 
 def full_picture(problem: Problem, discovery: Discovery, t: int, camera: int) -> Frame:
     """The picture of one camera in frame t, with all pixels that the data does not mask out."""
-    if t not in problem.whole:
-        problem.whole.clear()
-        problem.whole[t] = corrected(problem.sequence.frame(t), discovery.exposures)
-    frame = one_camera(problem.whole[t], camera)
+    frame = one_camera(_whole(problem, discovery, t), camera)
     return Frame(frame.images, frame.depths, frame.cameras, valid_pixels(frame), frame.time)
 
 
@@ -181,10 +177,17 @@ def with_part_masks(
     return Frame(frame.images, frame.depths, frame.cameras, counts, frame.time)
 
 
+def _whole(problem: Problem, discovery: Discovery, t: int) -> Frame:
+    """All cameras of frame t, with the colours of the scene."""
+    if t not in problem.whole:
+        problem.whole.clear()
+        problem.whole[t] = corrected(problem.sequence.frame(t), discovery.exposures)
+    return problem.whole[t]
+
+
 def _half_in_bytes(problem: Problem, discovery: Discovery, t: int) -> Frame:
     if t not in problem.past:
-        pictures = corrected(problem.sequence.frame(t), discovery.exposures)
-        problem.past[t] = _on_host(part_of(pictures, (), HALF))
+        problem.past[t] = _on_host(part_of(_whole(problem, discovery, t), (), HALF))
     return problem.past[t]
 
 

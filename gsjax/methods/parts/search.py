@@ -8,17 +8,19 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from gsjax.geometry.cameras import Camera, project
 from gsjax.geometry.spherical_harmonics import SH_C0
-from gsjax.methods.parts.stream import Canonical
+from gsjax.methods.parts.discovery import Discovery
+from gsjax.methods.parts.finish import touched_parts
 from gsjax.methods.parts.trajectory import BACKGROUND
 from gsjax.optim.compiler import host_jit
 from gsjax.scene.frame import Frame
 from gsjax.scene.handles import Blend, HandlePose, skin
 
 _POINTS = 64  # Gaussians by which a group of parts is recognised
-_TOUCH = 0.05  # share of a part's neighbours in another one with which it moves as a group
 _MOST = 0.3  # difference of colours, 0 to 1, that counts as entirely wrong
 _ASTRAY = 1.25, 0.02  # a group is looked for if its difference is so much larger than at the anchor
 _BETTER = 0.75  # share of its difference at the predicted place that a better place may have
@@ -41,65 +43,49 @@ class Group(NamedTuple):
     radius: float
 
 
-def groups_of(canonical: Canonical, weights: Float[np.ndarray, "M P"]) -> list[Group]:
+def groups_of(discovery: Discovery) -> list[Group]:
     """The parts in groups of those that touch at the anchor frame.
 
     Args:
-        canonical: the scene at rest, with neighbours.
-        weights: weights of its movable Gaussians.
+        discovery: the scene at rest, with neighbours, and the weights.
     """
-    labels, slots = weights.argmax(-1), weights.shape[1]
-    around = np.concatenate([labels, np.full(canonical.fixed.num, BACKGROUND)])[canonical.neighbors]
-    touching = np.zeros((slots, slots))
-    np.add.at(touching, (np.repeat(labels, around.shape[1]), around.ravel()), 1)
-    touching /= np.maximum(touching.sum(-1, keepdims=True), 1)
-    left, groups = set(np.unique(labels).tolist()) - {BACKGROUND}, []
+    canonical, weights = discovery.canonical, np.asarray(discovery.weights)
+    labels = weights.argmax(-1)
+    parts = np.setdiff1d(labels, [BACKGROUND])
+    if not len(parts):
+        return []
+    touching = [np.isin(parts, touched_parts(discovery, weights, part)) for part in parts.tolist()]
+    count, group_of = connected_components(coo_array(touching), directed=False)
     means = np.asarray(canonical.movable.means)
     sizes = np.asarray(canonical.movable.opacities) * np.sort(canonical.movable.scales, -1)[:, 1:].prod(-1)
-    while left:
-        parts, new = set(), [min(left)]
-        while new:
-            part = new.pop()
-            parts.add(part)
-            near = (touching[part] > _TOUCH) | (touching[:, part] > _TOUCH)
-            new += [q for q in np.flatnonzero(near).tolist() if q in left - parts]
-        left -= parts
-        rows = np.flatnonzero(np.isin(labels, sorted(parts)))
+    groups = []
+    for members in (parts[group_of == i] for i in range(count)):
+        rows = np.flatnonzero(np.isin(labels, members))
         radius = float(np.quantile(np.linalg.norm(means[rows] - means[rows].mean(0), axis=-1), 0.95))
-        groups.append(Group(np.array(sorted(parts)), rows[np.argsort(-sizes[rows])[:_POINTS]], radius))
+        groups.append(Group(members, rows[np.argsort(-sizes[rows])[:_POINTS]], radius))
     return groups
 
 
-def searched(
-    canonical: Canonical,
-    weights: Float[Array, "M P"],
-    predicted: HandlePose,
-    now: Frame,
-    anchor: Frame,
-    blend: Blend,
-) -> HandlePose:
-    """The predicted pose, with groups of parts shifted that look wrong there and right elsewhere.
+def searched(discovery: Discovery, now: Frame, anchor: Frame, blend: Blend) -> HandlePose:
+    """The predicted pose of a frame, with groups of parts shifted that look wrong there and right elsewhere.
 
     Args:
-        canonical: the scene at rest.
-        weights: weights of its movable Gaussians.
-        predicted: poses of the handles in this frame.
+        discovery: the scene, its weights and the predicted pose.
         now: all cameras in this frame.
         anchor: all cameras in the anchor frame.
         blend: how rotations are blended.
     """
-    moved = np.asarray(skin(canonical.movable, weights, canonical.centers, predicted, blend).means)
-    means, colors = np.asarray(canonical.movable.means), 0.5 + SH_C0 * np.asarray(canonical.movable.sh0)[:, 0]
-    translations, found = np.array(predicted.translations), False
-    for group in groups_of(canonical, np.asarray(weights)):
-        if group.radius == 0:
-            continue
+    canonical, predicted = discovery.canonical, discovery.predicted
+    moved = skin(canonical.movable, discovery.weights, canonical.centers, predicted, blend)
+    moved, means = np.asarray(moved.means), np.asarray(canonical.movable.means)
+    colors = 0.5 + SH_C0 * np.asarray(canonical.movable.sh0)[:, 0]
+    nowhere, shifts = np.zeros((1, 3), np.float32), {}
+    for group in groups_of(discovery):
         rows = np.resize(group.rows, _POINTS)
 
-        def costs(points, frame, shifts, rows=rows):
-            return np.asarray(_costs(frame.images, frame.cameras, points[rows], colors[rows], shifts))
+        def costs(points, frame, places, rows=rows):
+            return np.asarray(_costs(frame.images, frame.cameras, points[rows], colors[rows], places))
 
-        nowhere = np.zeros((1, 3), np.float32)
         usual, here = costs(means, anchor, nowhere)[0], costs(moved, now, nowhere)[0]
         if here <= _ASTRAY[0] * usual + _ASTRAY[1]:
             continue
@@ -109,9 +95,12 @@ def searched(
             at = costs(moved, now, places)
             best, there = places[at.argmin()][None], at.min()
         if there <= min(_BETTER * here, _AS_USUAL * usual):
-            translations[group.parts] += best[0]
-            found = True
-    return HandlePose(predicted.quats, jnp.asarray(translations)) if found else predicted
+            shifts |= dict.fromkeys(group.parts.tolist(), best[0])
+    if not shifts:
+        return predicted
+    translations = np.array(predicted.translations)
+    translations[list(shifts)] += np.stack(list(shifts.values()))
+    return HandlePose(predicted.quats, jnp.asarray(translations))
 
 
 def _grid(reach: float, spacing: float) -> Float[np.ndarray, "K 3"]:
@@ -132,8 +121,8 @@ def _costs(
     shifts: Float[Array, "K 3"],
 ) -> Float[Array, "K"]:
     """The mean difference between the colours of points and of the pixels that they project to, for each
-    shift of the points; points outside a picture do not count, unless most are that the first shift has
-    inside."""
+    shift of the points. Points outside a picture do not count, but a shift that keeps only half as many
+    inside as the first one is entirely wrong."""
     height, width = images.shape[1:3]
 
     def of_camera(image, viewmat, K):
