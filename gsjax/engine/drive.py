@@ -124,8 +124,8 @@ class Drive(Iterator[Tick]):
         return self.method.result(self.problem, self.run) if self.tick is None else self.tick.result
 
     def settle(self) -> None:
-        """End at the best parameters, if the latest are worse. The last step does it by itself, so that it
-        is for runs that end before."""
+        """End at the best parameters, if the latest are worse. The last of all steps does so by itself; a
+        run that ends earlier has to be told to."""
         guard = self.run.guard
         if guard is None:
             return
@@ -150,7 +150,7 @@ class Drive(Iterator[Tick]):
                 break
             self.run = self.run.grown(names, info["needed"], self._headroom)
         loss = np.nan if skipped else float(loss)
-        guard, params = guard.watched(loss, params, run.step + 1, self._window)
+        guard, params = guard.watched(loss, params, self._window)
         self.run = self.run.having(params=params, guard=guard, step=run.step + 1)
         if self._progress(self.run.step) >= 1:
             self.settle()

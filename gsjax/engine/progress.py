@@ -45,7 +45,8 @@ class Progress:
         seconds: time of all steps, without compiling.
         compile_seconds: time of tracing and compiling.
         skipped: number of steps up to the last row that changed nothing, because a number was not finite.
-        returns: number of returns to the best parameters, because the loss was lost.
+        returns: number of returns to the best parameters, because the loss grew.
+        is_settled: whether the result is the best parameters rather than the latest.
         stopped: what ended the run early, or None.
         pace: recent steps per second; 0 before any is known.
     """
@@ -57,6 +58,7 @@ class Progress:
     compile_seconds: float = 0.0
     skipped: int = 0
     returns: int = 0
+    is_settled: bool = False
     stopped: BaseException | None = None
     pace: float = field(default=0.0, init=False)
 
@@ -76,9 +78,10 @@ class Progress:
         self.recent.append(scalars)
 
     @property
-    def mishaps(self) -> dict[str, int]:
-        """What went wrong and was mended, for metrics.json: numbers of skipped steps and of returns."""
-        return {"skipped": self.skipped, "returns": self.returns}
+    def mishaps(self) -> dict[str, int | bool]:
+        """What went wrong and was mended, for metrics.json: numbers of skipped steps and of returns, and
+        whether the last steps were undone."""
+        return {"skipped": self.skipped, "returns": self.returns, "settled": self.is_settled}
 
     def metadata(self) -> dict[str, Any]:
         """The metadata of a checkpoint."""
@@ -198,7 +201,7 @@ def watch(
     if not is_enough:
         shielded(ticks.settle)
     if (guard := ticks.run.guard) is not None:
-        progress.returns = guard.returns
+        progress.returns, progress.is_settled = guard.returns, guard.is_settled
     return progress
 
 
@@ -225,12 +228,14 @@ def warn_of_mishaps(progress: Progress, notes: Notes) -> None:
 
 
 def warn_of_returns(progress: Progress, notes: Notes) -> None:
-    """Warn of returns to the best parameters, because the loss was lost."""
+    """Warn of returns to the best parameters, because the optimisation diverged."""
     if progress.returns:
         notes.warn(
-            f"the loss was lost {counted(progress.returns, 'time')}, and the run went back to the best it "
-            "had, with smaller steps; if the result is poor, try lower learning rates"
+            f"the optimisation diverged {counted(progress.returns, 'time')}, and continued from its best "
+            "parameters with smaller steps; if the result is poor, try lower learning rates"
         )
+    if progress.is_settled:
+        notes.add("The last steps had made the loss worse, so the result is from the best steps before them.")
 
 
 def save_run(folder: Path, run: Run, progress: Progress) -> None:

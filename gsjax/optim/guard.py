@@ -1,10 +1,12 @@
 """A guard over the steps of any method: when the loss is lost, it goes back to the best parameters and takes
 smaller steps from there; and a run ends with the best that it had.
 
-Losses are compared by their mean over a window of whole passes over the views, so that each view counts in
-each, and beyond the standard error that they have in the best window. A stretch is the time during which
-losses can be compared: it begins anew when parameters or constants are replaced, such as by densification,
-or when a method says that its loss has become another.
+Losses are compared by their mean over a window of steps, and beyond the standard error that they have in the
+best window. It has whole passes over the views, so that each view counts in each; where those would be a large
+part of the run, it has some of the views, in their random order. A stretch is the time during which losses
+can be compared: it begins anew when parameters or constants are replaced, such as by densification, or when a
+method says that its loss has become another. One shorter than a window, such as a frame of parts, is not
+guarded.
 
 That a step is finite is the step's own promise (`gsjax.optim.step`), as is that none is far longer than usual
 (`steady_adam`).
@@ -20,7 +22,8 @@ from jaxtyping import Array, Float, PyTree
 
 LEAST_WINDOW = 100
 """Fewest steps whose losses are compared."""
-_WINDOWS = 50  # of a run, at most
+_WINDOWS, _MOST_STEPS = 50, 200  # windows of a run, at most, unless they have so many steps
+_LEAST_WINDOWS = 8  # of a run, if whole passes are compared
 _TAIL = 20  # steps by which a candidate is confirmed, and of which most must not be worse at the end
 _LOST, _LOST_SIGMA = 0.25, 4.0  # by how much a loss is lost: relative, and in standard errors
 _WORSE, _WORSE_SIGMA = 0.02, 3.0  # by how much it must be worse at the end to go back
@@ -39,7 +42,7 @@ class Level(eqx.Module):
     deviation: float
     params: PyTree
 
-    def is_below(self, loss: float, count: int, relative: float, sigma: float) -> bool:
+    def is_exceeded(self, loss: float, count: int, relative: float, sigma: float) -> bool:
         """Whether a mean or median of losses is larger by a relative and a significant amount.
 
         Args:
@@ -62,6 +65,7 @@ class Guard(eqx.Module):
         best: the best window; None before the first.
         candidate: a better one, until the steps after it confirm its parameters, which no loss has seen.
         returns: number of returns to the best parameters, in all stretches.
+        is_settled: whether the parameters at the end of the run are the best rather than the latest.
     """
 
     share: Float[Array, ""]
@@ -70,30 +74,31 @@ class Guard(eqx.Module):
     best: Level | None = None
     candidate: Level | None = None
     returns: int = 0
+    is_settled: bool = False
 
-    def watched(self, loss: float, params: PyTree, step: int, window: int) -> tuple["Guard", PyTree]:
+    def watched(self, loss: float, params: PyTree, window: int) -> tuple["Guard", PyTree]:
         """The guard after a step, and the parameters to continue from: those given or, where the loss is
         lost, the best.
 
         Args:
             loss: loss of the step; NaN if it was skipped.
             params: parameters after the step.
-            step: number of steps of the run so far.
             window: number of steps that are compared.
         """
-        guard = replace(self, losses=np.append(self.losses, loss)[-window:], steps=self.steps + 1)
+        losses = np.append(self.losses, loss)[-window:]
+        guard = replace(self, losses=losses, steps=self.steps + 1, is_settled=False)
         best, candidate = guard.best, guard.candidate
-        if candidate is not None and guard.steps >= _TAIL and step % window == _TAIL:
-            is_confirmed = not candidate.is_below(_median(guard.losses[-_TAIL:]), _TAIL, _LOST, _LOST_SIGMA)
+        if candidate is not None and guard.steps % window == _TAIL:
+            is_confirmed = not candidate.is_exceeded(_median(losses[-_TAIL:]), _TAIL, _LOST, _LOST_SIGMA)
             guard = replace(guard, best=candidate if is_confirmed else best, candidate=None)
-        if step % window or guard.steps < window:
+        if guard.steps % window:
             return guard, params
-        mean = _mean(guard.losses)
-        if best is not None and best.is_below(mean, window, _LOST, _LOST_SIGMA):
+        mean = _mean(losses)
+        if best is not None and best.is_exceeded(mean, window, _LOST, _LOST_SIGMA):
             state = {"share": _SMALLER * self.share, "candidate": None, "returns": self.returns + 1}
             return replace(guard, losses=np.zeros(0), steps=0, **state), _restored(best)
         if mean < (np.inf if best is None else best.mean):
-            level = Level(mean, float(np.nanstd(guard.losses)), jax.tree.map(np.array, params))
+            level = Level(mean, float(np.nanstd(losses)), jax.tree.map(np.array, params))
             guard = replace(guard, candidate=level)
         return guard, params
 
@@ -108,8 +113,9 @@ class Guard(eqx.Module):
         if best is None or count < _TAIL:
             return self, params
         latest = ((_mean(self.losses), count), (_median(self.losses[-_TAIL:]), _TAIL))
-        if any(best.is_below(*some, _WORSE, _WORSE_SIGMA) for some in latest):
-            return replace(self, losses=np.zeros(0), steps=0, candidate=None), _restored(best)
+        if any(best.is_exceeded(*some, _WORSE, _WORSE_SIGMA) for some in latest):
+            settled = replace(self, losses=np.zeros(0), steps=0, candidate=None, is_settled=True)
+            return settled, _restored(best)
         return self, params
 
 
@@ -123,13 +129,15 @@ def begun(before: Guard | None = None) -> Guard:
 
 
 def window_of(total: int, period: int) -> int:
-    """Number of steps that are compared: whole passes.
+    """Number of steps that are compared: whole passes over the views, unless they would leave too few windows.
 
     Args:
         total: number of steps of the run.
         period: number of steps of a pass over the views.
     """
-    return period * -(-max(LEAST_WINDOW, total // _WINDOWS) // period)
+    steps = max(LEAST_WINDOW, min(total // _WINDOWS, _MOST_STEPS))
+    passes = period * -(-steps // period)
+    return passes if _LEAST_WINDOWS * passes <= total else steps
 
 
 def part_of_step(new: PyTree, old: PyTree, share: Float[Array, ""]) -> PyTree:

@@ -55,8 +55,8 @@ def gradient_step(
 ) -> Step:
     """One step down the gradient of `loss(params, batch, *, step, key) -> (scalar, aux)`.
 
-    A step whose loss or gradient is not finite, or whose aux has a true `overflow`, returns params and state
-    unchanged; `info["skipped"]` reports it. `info` is aux with `loss` and `skipped`. Without a plan, aux need
+    A step whose loss or gradient is not finite or too large to be squared, or whose aux has a true `overflow`,
+    returns params and state unchanged; `info["skipped"]` reports it. `info` is aux with `loss` and `skipped`. Without a plan, aux need
     not have `overflow` and `needed`, which default to False and 0.
     """
 
@@ -65,7 +65,8 @@ def gradient_step(
         updates, new_state = optimizer.update(gradients, state, params)
         new_params = optax.apply_updates(params, updates)
         overflow = jnp.asarray(aux.get("overflow", False)).any()
-        sound = all_finite((value, gradients)) & ~overflow
+        squares = jax.tree.map(jnp.square, gradients)  # an infinite second moment would freeze a parameter
+        sound = all_finite((value, squares)) & ~overflow
         params, state = keep_if(sound, (new_params, new_state), (params, state))
         reported = {"needed": jnp.int32(0), **aux, "overflow": overflow}
         return params, state, {**reported, "loss": value, "skipped": ~sound}

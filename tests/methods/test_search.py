@@ -106,8 +106,10 @@ def test_without_turns_only_translations_are_tried_and_found(moved):
     config = replace(CONFIG, max_turn=0.0)
     shift = np.float32([0.006, -0.004, 0.003])
     behind, start = points._replace(means=points.means - shift[:, None]), center - shift
-    twist = look(behind, start, images, config)
+    result = search_one(behind, start, images, config)
+    twist = np.asarray(result.estimate.twists)[0]
     np.testing.assert_array_equal(twist[3:], 0)
+    assert result.leads[0] == 1  # no other orientation is possible, so this one is known
     after = carried(behind, twist, start)
     behind = jax.tree.map(jnp.asarray, behind)
     assert gap(after, images, config) < gap(behind, images, config)

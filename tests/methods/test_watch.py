@@ -104,6 +104,15 @@ def test_what_was_found_is_on_probation_until_searches_find_nothing_better_and_t
     assert not after(told, agreement=0.55).lost[0]
 
 
+def test_where_nothing_can_be_searched_for_elsewhere_probation_ends_once_the_turn_is_told():
+    """Without depth: it lasted to the end, and what agreed in half of its points was lost again and again."""
+    none, one = jnp.zeros(1), jnp.array([True])
+    sure, watch = Confidence(none + 0.9, none + 0.9, one), first_watch(jnp.ones(1))._replace(lost=one)
+    for result in (empty_result([False]), empty_result([True], leads=0.2)):
+        watch = watch.after(none, result, none, sure, ~one, ~one, searches=0)
+        assert bool(watch.turn_known[0]) == bool(watch.probation[0] == 0) == bool(result.searched[0])
+
+
 def test_a_lost_group_is_found_only_when_enough_of_it_shows():
     """Behind an occluder, the little that is visible may agree, and the group is still lost. Half of the
     points that faced a camera were visible at first, and no more need be visible now."""

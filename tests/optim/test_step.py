@@ -84,6 +84,16 @@ def test_a_gradient_that_is_not_finite_is_refused_though_its_loss_is(params):
     assert_same(new, zero)
 
 
+def test_a_gradient_too_large_to_be_squared_freezes_nothing(params):
+    """Its second moment would be infinite, and every later move 0, though each number is finite."""
+    step = gradient_step(lambda p, batch, *, step, key: (jnp.sum(p.a * batch), {}), per_field_adam({"a": 0.1}))
+    state, key = step.init(params), jax.random.key(0)
+    after, state, info = step.update(params, state, jnp.float32(1e20), step=0, key=key)
+    assert bool(info["skipped"])
+    assert_same(after, params)
+    assert (step.update(after, state, jnp.float32(1), step=1, key=key)[0].a < params.a).all()
+
+
 def test_after_a_skipped_step_it_goes_on_as_if_nothing_had_been(params):
     step = gradient_step(quadratic, optax.adam(0.1))
 

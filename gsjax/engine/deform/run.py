@@ -72,13 +72,12 @@ class Options(TeacherOptions, OfDataset):
 
 
 @releasing_locks()
-def run(options: Options, by_preset: Callable[[str], Options] | None = None) -> int:
+def run(options: Options, by_preset: Callable[[str], Options]) -> int:
     """Reconstruct a deforming scene and report on it; returns the exit code.
 
     Args:
         options: those of the command.
-        by_preset: the same options with the defaults of a preset, for when none is named; None keeps
-            `options.deform` as it is.
+        by_preset: the same options with the defaults of a preset, for when none is named.
 
     Raises:
         ValueError, OSError: the options cannot be followed; everything learned before that is on disk.
@@ -94,7 +93,7 @@ def run(options: Options, by_preset: Callable[[str], Options] | None = None) -> 
         if options.preset is None:
             stored = folder.setting("preset") if options.resume else None
             preset = stored or ("around" if shows_one_object(sequence, source) else "surst")
-            if by_preset is not None and preset != "surst":  # which the options have already
+            if preset != "surst":  # which the options have already
                 options = checked(by_preset(preset))
             options = replace(options, preset=preset)
             if preset == "around":

@@ -294,8 +294,9 @@ def _note_what_was_lost(
         lost = 1 + np.flatnonzero(lost_over_frames(tracking, values, label))
         to_the_end = len(lost) > 0 and lost[-1] == tracking.num_frames - 1
         if len(lost):
-            last = "to the end" if to_the_end else f"to {lost[-1]}"
-            notes.add(f"{names[label]}: lost in {counted(len(lost), 'frame')}, from {lost[0]} {last}.")
+            last = "the end" if to_the_end else str(lost[-1])
+            between = f"between {lost[0]} and {last}" if len(lost) > 1 or to_the_end else f"number {lost[0]}"
+            notes.add(f"{names[label]}: lost in {counted(len(lost), 'frame')}, {between}.")
         unknown = turn_unknown_from(tracking, values, label)
         if unknown is not None and not to_the_end:
             why = "it was lost then" if unknown in lost else "other rotations agree as well"
@@ -304,4 +305,5 @@ def _note_what_was_lost(
         frames = unseen[groups == label].max()
         if frames:
             name = names.get(label, f"object {label}")
-            notes.add(f"{name}: no camera saw it, or a part of it, in {frames} frames; it stood still then.")
+            unseen_in = counted(int(frames), "frame")
+            notes.add(f"{name}: no camera saw it, or a part of it, in {unseen_in}; it stood still then.")

@@ -69,8 +69,8 @@ def _surfaces(depths: np.ndarray) -> np.ndarray:
     share = 1 - (surfaces > 0).sum() / max((depths > 0).sum(), 1)
     if share > _NOISY:
         warnings.warn(
-            f"depths: {share:.0%} of the first frame's are unlike those around them by more than 5 %, and "
-            "left out; is the depth noisy, or of another frame?",
+            f"depths: {share:.0%} of those in the first frame differ from all around them by more than 5%, "
+            "and are ignored; is the depth noisy, or of another frame?",
             stacklevel=3,
         )
     return surfaces
@@ -79,15 +79,15 @@ def _surfaces(depths: np.ndarray) -> np.ndarray:
 def _warn_of_few(scene: TrackedScene) -> None:
     """Warns of objects, and parts of large ones, that could go astray without a word."""
     counts = np.bincount(np.asarray(scene.labels), minlength=len(scene.label_ids))[1:].tolist()
-    few = [
-        f"{'object' if scene.label_ids.count(label) == 1 else 'a part of object'} {label} has {count}"
-        for label, count in zip(scene.label_ids[1:], counts, strict=True)
-        if count < _FEW
-    ]
+    fewest: dict[int, int] = {}
+    for label, count in zip(scene.label_ids[1:], counts, strict=True):
+        fewest[label] = min(count, fewest.get(label, count))
+    few = [f"object {label} has {count}" for label, count in fewest.items() if count < _FEW]
     if few:
         warnings.warn(
-            f"of so few Gaussians in the first frame hardly anything tells whether they are lost: "
-            f"{', '.join(few)}, expected {_FEW} or more; set --track.start.object-pixels lower",
+            "too few Gaussians in the first frame to tell whether an object, or a part of a large one, is lost: "
+            f"{', '.join(few)}, expected {_FEW} or more; lower start.object_pixels "
+            "(--track.start.object-pixels)",
             stacklevel=3,
         )
 

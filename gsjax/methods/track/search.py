@@ -115,7 +115,7 @@ def search_turns(
     spin from one frame to the next, and a round object may roll without changing its shape. Half the points
     choose among these hypotheses; all points make the final decision. If another orientation agrees nearly as
     well, the images do not determine the orientation. The lead is a fraction of the agreement, because hidden
-    points agree with no orientation. It is infinite if little agrees or no turn was tried.
+    points agree with no orientation: 1 if all hypotheses end at the same one, and infinite if little agrees.
 
     Args:
         known: the estimate so far.
@@ -141,7 +141,7 @@ def search_turns(
     best = _better(known, last, points, center, images, config)
     apart = jaxlie.SO3.exp(best.twists[3:]).inverse() @ jaxlie.SO3.exp(tried[:, 3:])
     distinct = jnp.linalg.norm(apart.log(), axis=-1) > _DISTINCT_TURN
-    rival = jnp.min(jnp.where(distinct, residuals, jnp.inf))
+    rival = jnp.min(jnp.where(distinct, residuals, 1.0))
     own = disagreement(best.twists, half, center, images, config)
     return best, jnp.where(own < _MAX_OWN_RESIDUAL, (rival - own) / (1 - own), jnp.inf)
 

@@ -81,6 +81,8 @@ class Watch(NamedTuple):
         confidence: Confidence,
         elsewhere: Bool[Array, "k"],
         relocated: Bool[Array, "k"],
+        *,
+        searches: int = PROBATION,
     ) -> "Watch":
         """The record one frame later.
 
@@ -97,6 +99,8 @@ class Watch(NamedTuple):
             confidence: confidence that each group is where it is believed to be.
             elsewhere: groups of which more shows in another place than in their own.
             relocated: those of them that were moved there.
+            searches: number of searches elsewhere that a group on probation has to pass; 0 where none is
+                possible, so that it passes once its turn is told.
         """
         agreement, conclusive = confidence.agreement, confidence.conclusive
         there = is_found(confidence, self.showed)
@@ -112,7 +116,7 @@ class Watch(NamedTuple):
         told &= agreement > _FOUND_TURN_AGREEMENT
         passed = (self.probation > 1) & result.relocation_tried & ~elsewhere
         probation = self.probation - (passed | told)
-        probation = jnp.where(self.lost | relocated, 1.0 + PROBATION, probation)
+        probation = jnp.where(self.lost | relocated, 1.0 + searches, probation)
         probation = jnp.where(lost, 0.0, probation)
         turn_known = (self.turn_known | told) & (probation == 0) & (result.leads > TURN_KNOWN) & ~lost
 

@@ -76,6 +76,7 @@ def test_a_loss_that_is_lost_is_mended_counted_and_told(tmp_path):
     progress = watch(ticks, Progress(), schedule, RunFolder(tmp_path / "run"), Console(quiet=True))
     assert progress.returns == ticks.run.guard.returns >= 1
     assert progress.found(1000, 0.0)["returns"] == progress.returns
+    assert progress.found(1000, 0.0)["settled"] == ticks.run.guard.is_settled
     notes = Notes(Console(quiet=True))
     warn_of_mishaps(progress, notes)
-    assert "went back to the best it had" in notes.all[-1]
+    assert "continued from its best parameters" in notes.all[-1]

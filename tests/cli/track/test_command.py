@@ -219,9 +219,9 @@ def test_a_run_says_what_was_lost_and_whose_turn_is_not_known(
     assert gsjax_track(pristine, "--cameras", "1")[0] == 0
     found = json.loads((tmp_path / "run" / "metrics.json").read_text())
     assert [note for note in found["notes"] if note.startswith(("carton:", "can:", "ball:"))] == [
-        "carton: lost in 1 frame, from 2 to 2.",
+        "carton: lost in 1 frame, number 2.",
         "carton: its rotation is unknown from frame 2 on: it was lost then.",
-        "can: lost in 1 frame, from 1 to 1.",
+        "can: lost in 1 frame, number 1.",
         "ball: lost in 1 frame, from 1 to 1.",
         "ball: its rotation is unknown from frame 3 on: other rotations agree as well.",
     ]

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 
 from gsjax.methods.track.config import TrackConfig
 from gsjax.methods.track.layers import Shown
-from gsjax.methods.track.lost import SURELY_FOUND, Confidence, group_confidence, is_found
+from gsjax.methods.track.lost import PROBATION, SURELY_FOUND, Confidence, group_confidence, is_found
 from gsjax.methods.track.motion import Motion, Pose, move, select_motion
 from gsjax.methods.track.plan import Needed
 from gsjax.methods.track.points import carry, carry_keyframe, pixels_of_groups, renewed, where_groups
@@ -91,7 +91,13 @@ def remember(
     keyframe = carry_keyframe(state.keyframe, motion.twists, now.centers)
     keyframe = renewed(keyframe, pixels, config.align.keyframe_turn, relocated | state.is_blank)
     watch = state.watch.after(
-        refined.residuals, alignment.search, past.counts, settled.confidence, settled.elsewhere, relocated
+        refined.residuals,
+        alignment.search,
+        past.counts,
+        settled.confidence,
+        settled.elsewhere,
+        relocated,
+        searches=0 if now.images.depths is None else PROBATION,
     )
     at_first = first_watch(settled.confidence.coverage)
     watch = jax.tree.map(partial(jnp.where, state.is_blank), at_first, watch)
