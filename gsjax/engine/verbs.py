@@ -11,8 +11,6 @@ scene so far:
 from collections.abc import Sequence as Indices
 from typing import TYPE_CHECKING, Any, Literal
 
-import jax
-
 from gsjax.data.photographs import Photographs, photographs_of
 from gsjax.data.sequence import Sequence
 from gsjax.engine.drive import Drive, Tick, drive
@@ -21,7 +19,7 @@ from gsjax.losses.extra import ExtraLosses
 from gsjax.methods.deform import DeformConfig
 from gsjax.methods.distill import Distill, DistillConfig, Teacher
 from gsjax.methods.fit import Fit, FitConfig, prune
-from gsjax.methods.parts import Parts, PartsConfig, begin
+from gsjax.methods.parts import Parts, PartsConfig
 from gsjax.methods.parts.pictures import Problem as PartsProblem
 from gsjax.methods.protocols import Segmenter
 from gsjax.optim.method import Method, Run
@@ -167,7 +165,8 @@ def parts(
     """Find the parts of a moving scene by their motion, without annotation (MotionSplicer).
 
     Args:
-        sequence: from `gsjax.open_sequence`, of synchronised cameras.
+        sequence: from `gsjax.open_sequence`, of synchronised cameras; or two frames with depth, each by
+            cameras of its own, which are two states.
         config: settings (default: those of `PartsConfig`).
         eval_cameras: ids of the cameras to hold out.
         anchor: index of the canonical frame (default: the one that differs most from the others).
@@ -185,14 +184,15 @@ def parts(
             nothing is found that moves.
         DataError: a picture cannot be read.
     """
-    from gsjax.engine.parts.start import FIT, detect_motion
+    from gsjax.engine.parts.start import FIT, detect_motion, discover, has_two_states
     from gsjax.perception.segmenters import PieceSegmenter  # slow to import
 
     method = Parts(PartsConfig() if config is None else config, extra_losses)
     config, eval_cameras = method.config, tuple(eval_cameras)
     tracked = sequence.select(cameras=[c for c in sequence.camera_ids if c not in eval_cameras])
     if after is not None:
-        return drive(method, PartsProblem(tracked), _going_on(after, method), headroom=config.headroom)
+        problem = PartsProblem(tracked, at_once=has_two_states(tracked))
+        return drive(method, problem, _going_on(after, method), headroom=config.headroom)
     if gaussians is not None and anchor is None:
         raise ValueError("anchor: expected the frame that the given Gaussians show, found none; name it")
     chosen, moved = detect_motion(tracked, config, anchor)
@@ -202,8 +202,7 @@ def parts(
         for _ in fitting:
             pass
         gaussians, _ = prune(fitting.result, fitting.problem.frames, FIT)
-    segmenter, key = segmenter or PieceSegmenter(), jax.random.key(config.seed)
-    start = begin(tracked, gaussians, chosen, moved, config, segmenter, key)
+    start = discover(tracked, gaussians, chosen, moved, config, segmenter or PieceSegmenter())
     problem, run = method.start(tracked, start)
     return drive(method, problem, run, headroom=config.headroom)
 

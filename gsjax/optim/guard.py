@@ -2,11 +2,11 @@
 smaller steps from there; and a run ends with the best that it had.
 
 Losses are compared by their mean over a window of steps, and beyond the standard error that they have in the
-best window. It has whole passes over the views, so that each view counts in each; where those would be a large
-part of the run, it has some of the views, in their random order. A stretch is the time during which losses
-can be compared: it begins anew when parameters or constants are replaced, such as by densification, or when a
-method says that its loss has become another. One shorter than a window, such as a frame of parts, is not
-guarded.
+best window. It has whole passes over the views, so that each view counts in each; where those would be a
+large part of the run, it has some of the views, in their random order. A stretch is the time during which
+losses can be compared: it begins anew when parameters or constants are replaced, such as by densification, or
+when a method says that its loss has become another. One shorter than a window, such as a frame of parts, is
+not guarded.
 
 That a step is finite is the step's own promise (`gsjax.optim.step`), as is that none is far longer than usual
 (`steady_adam`).
@@ -129,7 +129,7 @@ def begun(before: Guard | None = None) -> Guard:
 
 
 def window_of(total: int, period: int) -> int:
-    """Number of steps that are compared: whole passes over the views, unless they would leave too few windows.
+    """Number of steps that are compared: whole passes over the views, unless windows would be too few.
 
     Args:
         total: number of steps of the run.

@@ -55,9 +55,9 @@ def gradient_step(
 ) -> Step:
     """One step down the gradient of `loss(params, batch, *, step, key) -> (scalar, aux)`.
 
-    A step whose loss or gradient is not finite or too large to be squared, or whose aux has a true `overflow`,
-    returns params and state unchanged; `info["skipped"]` reports it. `info` is aux with `loss` and `skipped`. Without a plan, aux need
-    not have `overflow` and `needed`, which default to False and 0.
+    A step whose loss or gradient is not finite, whose gradient is too large to be squared, or whose aux has a
+    true `overflow`, returns params and state unchanged; `info["skipped"]` reports it. `info` is aux with
+    `loss` and `skipped`. Without a plan, aux need not have `overflow` and `needed`: False and 0 by default.
     """
 
     def update(params, state, batch, *, step, key):

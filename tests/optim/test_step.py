@@ -86,7 +86,9 @@ def test_a_gradient_that_is_not_finite_is_refused_though_its_loss_is(params):
 
 def test_a_gradient_too_large_to_be_squared_freezes_nothing(params):
     """Its second moment would be infinite, and every later move 0, though each number is finite."""
-    step = gradient_step(lambda p, batch, *, step, key: (jnp.sum(p.a * batch), {}), per_field_adam({"a": 0.1}))
+    step = gradient_step(
+        lambda p, batch, *, step, key: (jnp.sum(p.a * batch), {}), per_field_adam({"a": 0.1})
+    )
     state, key = step.init(params), jax.random.key(0)
     after, state, info = step.update(params, state, jnp.float32(1e20), step=0, key=key)
     assert bool(info["skipped"])

@@ -23,7 +23,7 @@ from gsjax.engine.options import RESUME_MAY_CHANGE, OfRecording, SamWeights, See
 from gsjax.engine.parts.loop import Loop, resumed
 from gsjax.engine.parts.outputs import finished
 from gsjax.engine.parts.results import summarize
-from gsjax.engine.parts.start import FIT, detect_motion
+from gsjax.engine.parts.start import FIT, detect_motion, discover
 from gsjax.engine.progress import Progress
 from gsjax.engine.recording import Recording, chosen_recording, located, parse_frames
 from gsjax.engine.records import digest
@@ -33,7 +33,6 @@ from gsjax.methods.parts import (
     Parts,
     PartsConfig,
     Start,
-    begin,
     masks_from_labels,
 )
 from gsjax.methods.protocols import Segmenter
@@ -88,7 +87,7 @@ def run(options: Options) -> int:
         seconds: dict[str, float] = {}
         with stage(console, "detecting motion"):
             anchor, moved = detect_motion(tracked, options.parts, options.anchor)
-        masks = _masks(tracked, anchor, moved, options)
+        masks = None if moved is None else _masks(tracked, anchor, moved, options)
         folder.write_config(settings)  # from here on an earlier run is gone
         notes.add(
             f"The canonical frame is {anchor.frame}, frame {tracked.frame_ids[anchor.frame]} of the data."
@@ -101,9 +100,11 @@ def run(options: Options) -> int:
             gaussians = _read_scene(scene, tracked, notes)
         seconds["canonical"], at = perf_counter() - at, perf_counter()
         with stage(console, "discovering parts in all views"):
-            key = jax.random.key(options.parts.seed)
-            start = begin(tracked, gaussians, anchor, moved, options.parts, segmenter, key, masks)
-        _warn_if_doubtful(start, moved.any(1).mean(), options, notes)
+            start = discover(tracked, gaussians, anchor, moved, options.parts, segmenter, masks)
+        if moved is None:
+            notes.add("Two states, each by cameras of its own: motions were searched for between them.")
+        else:
+            _warn_if_doubtful(start, moved.any(1).mean(), options, notes)
         method = Parts(options.parts)
         problem, first = method.start(tracked, start)
         seconds["discovery"] = perf_counter() - at

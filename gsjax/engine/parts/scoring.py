@@ -6,10 +6,11 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
+from gsjax.data.objects import Truth
 from gsjax.engine.messages import Notes
 from gsjax.engine.recording import Recording
 from gsjax.engine.scores import motion_metrics, true_labels_at
-from gsjax.geometry.joints import FittedJoint
+from gsjax.geometry.joints import FittedJoint, Joint
 from gsjax.methods.parts import BACKGROUND, PartScene, Trajectory, gaussians_at, moment, motions_in_world
 from gsjax.metrics.parts import adjusted_rand_index, joint_error, match_parts
 from gsjax.metrics.tracking import relative_motion, score_tracks
@@ -84,6 +85,8 @@ def score_parts(
         return {}
     has_both = sequence.has_masks and sequence.has_depth
     labels = true_labels_at(sequence, anchor, np.asarray(scene.gaussians.means)) if has_both else None
+    if labels is None and truth.joints:
+        return _score_joints(scene, trajectory, joints, rows, truth, anchor, notes)
     if labels is None:
         notes.add("Parts were not scored: assigning Gaussians to true parts requires masks and depth.")
         return {}
@@ -112,11 +115,7 @@ def score_parts(
         row = rows[part - 1]
         row |= {"true_name": names[label], "iou": match.ious[label], **motion_metrics(scores[label])}
         row["moved_mm"] = scores[label].moved_mm
-        joint, fitted = joint_of[label], joints[part]
-        if joint is not None and fitted.joint is not None:
-            middle = means[found == part].mean(0)
-            row |= joint_error(fitted.joint, joint, middle, anchor)._asdict()
-            row["value"] = row["value_deg"] if joint.kind == "revolute" else row["value_mm"]
+        _score_joint(row, joints[part], joint_of[label], means[found == part], anchor)
     missed = [names[label] for label in moving if label not in pairs]
     if missed:
         notes.warn(f"moving objects that no part was found for: {', '.join(missed)}")
@@ -125,6 +124,54 @@ def score_parts(
         "true_parts": len(moving),
         "missed": missed,
     }
+
+
+def _score_joint(
+    row: dict[str, Any],
+    fitted: FittedJoint,
+    joint: Joint | None,
+    points: Float[np.ndarray, "n 3"],
+    anchor: int,
+) -> None:
+    """Add the errors of a part's joint to its row, if there is a joint to compare with."""
+    if joint is not None and fitted.joint is not None:
+        row |= joint_error(fitted.joint, joint, points.mean(0), anchor)._asdict()
+        row["value"] = row["value_deg"] if joint.kind == "revolute" else row["value_mm"]
+
+
+def _score_joints(
+    scene: PartScene,
+    trajectory: Trajectory,
+    joints: dict[int, FittedJoint],
+    rows: list[dict[str, Any]],
+    truth: Truth,
+    anchor: int,
+    notes: Notes,
+) -> dict[str, Any]:
+    """Scores where nothing tells which Gaussians are truly of which part: each part is compared with the true
+    motion that moves it most alike, if the two differ by less than half of its way."""
+    notes.add("Each part is compared with the true joint that moves it most alike; there are no masks.")
+    means, labels = np.asarray(scene.gaussians.means, np.float64), np.asarray(scene.labels)
+    motions = motions_in_world(scene, trajectory)
+    ways = {k: relative_motion(truth.poses[:, k], anchor) for k in range(len(truth.names))}
+    found: set[str] = set()
+    for row in sorted(rows, key=lambda row: -row["gaussians"]):
+        points = means[labels == row["part"]]
+        left = {k: way for k, way in ways.items() if truth.names[k] not in found}
+        if not len(points) or not left:
+            continue
+        off = {
+            k: _farthest_mm(way @ np.linalg.inv(motions[:, row["part"]]), points) for k, way in left.items()
+        }
+        best = min(off, key=off.__getitem__)
+        if off[best] < 0.5 * row["moved_mm"]:
+            found.add(truth.names[best])
+            row |= {"true_name": truth.names[best], "point_error_mm": off[best]}
+            _score_joint(row, joints[row["part"]], truth.joints[best], points, anchor)
+    missed = [name for name in truth.names if name not in found]
+    if missed:
+        notes.warn(f"moving objects that no part was found for: {', '.join(missed)}")
+    return {"true_parts": len(truth.names), "missed": missed}
 
 
 def _tracks(scene: PartScene, trajectory: Trajectory, blend: Blend) -> Float[np.ndarray, "T N 3"]:

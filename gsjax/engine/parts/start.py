@@ -1,11 +1,15 @@
 """The start of a discovery of parts: the anchor frame, motion, and the fit of the canonical scene."""
 
+import jax
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Int
 
 from gsjax.data.sequence import Sequence
 from gsjax.methods.fit import FitConfig, StartConfig
-from gsjax.methods.parts import Anchor, PartsConfig, choose_anchor, moved_pixels
+from gsjax.methods.parts import Anchor, PartsConfig, Start, begin, choose_anchor, moved_pixels
+from gsjax.methods.parts.states import begin_with_states
+from gsjax.methods.protocols import Segmenter
+from gsjax.scene.gaussians import Gaussians
 
 FIT = FitConfig(
     steps=3_000, cap=15_000, sh_degree=0, depth_weight=0.5, exposure=True, start=StartConfig(count=10_000)
@@ -13,19 +17,58 @@ FIT = FitConfig(
 """Default settings of the fit of the canonical scene."""
 
 
+def has_two_states(tracked: Sequence) -> bool:
+    """Whether a recording shows two states, each by cameras of its own, and no motion between them."""
+    stands = np.allclose(tracked.viewmats[0], tracked.viewmats[-1], atol=1e-6)
+    return tracked.num_frames == 2 and tracked.has_depth and not stands
+
+
 def detect_motion(
     tracked: Sequence, config: PartsConfig, anchor: int | None
-) -> tuple[Anchor, Bool[np.ndarray, "C F H W"]]:
-    """The anchor frame, and the pixels of its pictures that change in each of F other frames.
+) -> tuple[Anchor, Bool[np.ndarray, "C F H W"] | None]:
+    """The anchor frame, and the pixels of its pictures that change in each of F other frames; None for two
+    states, which are compared in space.
 
     Args:
         tracked: the tracked cameras.
         config: settings of the discovery.
-        anchor: index of the frame (default: the one that differs most from the others).
+        anchor: index of the frame (default: the one that differs most from the others; of two states, the
+            first).
     """
+    if has_two_states(tracked):
+        chosen = anchor or 0
+        return Anchor(chosen, 1 - chosen, np.zeros(2)), None
     cameras, discover = tracked.num_cameras, config.discover
     chosen = choose_anchor(tracked.image, tracked.num_frames, cameras, anchor)
     depth = tracked.depth if tracked.has_depth else None
     return chosen, moved_pixels(
         tracked.image, chosen, cameras, frames=discover.frames, threshold=discover.threshold, depth=depth
     )
+
+
+def discover(
+    tracked: Sequence,
+    gaussians: Gaussians,
+    anchor: Anchor,
+    moved: Bool[np.ndarray, "C F H W"] | None,
+    config: PartsConfig,
+    segmenter: Segmenter | None,
+    masks: Int[np.ndarray, "C H W"] | None = None,
+) -> Start:
+    """Candidate parts; of two states, the parts themselves and their motions.
+
+    Args:
+        tracked: the tracked cameras.
+        gaussians: the scene at the anchor frame.
+        anchor, moved: from `detect_motion`.
+        config: settings of the discovery.
+        segmenter: finds the segments of a picture; not used if masks are given, or for two states.
+        masks: labels of the candidate parts in every view, if known; not used for two states.
+
+    Raises:
+        ValueError: as `begin` and `begin_with_states` do.
+    """
+    key = jax.random.key(config.seed)
+    if moved is None:
+        return begin_with_states(tracked, gaussians, anchor, config, key)
+    return begin(tracked, gaussians, anchor, moved, config, segmenter, key, masks)

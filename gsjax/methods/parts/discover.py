@@ -41,6 +41,7 @@ class Start(NamedTuple):
         exposures: maps of each camera's colours to those of the scene.
         masks: candidate parts in every view of the anchor frame, [C,H,W].
         losses: losses of lifting the masks (`lifting`) and of fitting the field (`warming`).
+        motions: of each part, in the world, to the other of two states; None if it is followed.
     """
 
     anchor: Anchor
@@ -50,6 +51,7 @@ class Start(NamedTuple):
     exposures: Float[np.ndarray, "C 3 4"]
     masks: Int[np.ndarray, "C H W"]
     losses: dict[str, np.ndarray]
+    motions: Float[np.ndarray, "P 4 4"] | None = None
 
 
 def begin(
@@ -89,7 +91,7 @@ def begin(
     frame = sequence.frame(anchor.frame)
     plan = plan_render(gaussians, frame.cameras, headroom=config.headroom)
     drawn = [render(gaussians, one_camera(frame.cameras, c), plan) for c in range(sequence.num_cameras)]
-    means, moves = np.asarray(gaussians.means), None
+    moves = None
     if masks is None:
         if segmenter is None:
             raise ValueError("segmenter, masks: expected one of them, found none")
@@ -111,6 +113,40 @@ def begin(
     weights = softmax(np.asarray(logits), axis=-1)
     if moves is not None:
         weights = with_what_moves(weights, gaussians, moves)
+    exposures = exposures_of(drawn, frame)
+    return start_from(anchor, gaussians, weights, frame.cameras, exposures, masks, config, key, lifting)
+
+
+def start_from(
+    anchor: Anchor,
+    gaussians: Gaussians,
+    weights: Float[np.ndarray, "N P"],
+    cameras: Camera,
+    exposures: Float[np.ndarray, "C 3 4"],
+    masks: Int[np.ndarray, "C H W"],
+    config: PartsConfig,
+    key: PRNGKeyArray,
+    lifting: Float[np.ndarray, "steps"],
+    motions: Float[np.ndarray, "P 4 4"] | None = None,
+) -> Start:
+    """The start, from the weights that each Gaussian has of each part.
+
+    Args:
+        anchor: the canonical frame.
+        gaussians: the scene at the anchor frame.
+        weights: of the parts; rows sum to 1.
+        cameras: all cameras at the anchor frame.
+        exposures: from `exposures_of`.
+        masks: candidate parts in every view of the anchor frame.
+        config: settings.
+        key: random key for the initial values of the field.
+        lifting: losses of lifting the masks; empty if they were not lifted.
+        motions: of each part to the other of two states; None if it is followed.
+
+    Raises:
+        ValueError: no Gaussian is of a part.
+    """
+    means, slots = np.asarray(gaussians.means), weights.shape[1]
     order, count = _movable_first(means, weights)
     weights = weights[order[:count]]
     labels = weights.argmax(-1)
@@ -133,13 +169,12 @@ def begin(
         located,
         jnp.asarray(centers),
         jnp.asarray(radii_of(means[:count], labels, centers)),
-        jnp.asarray(pixel_width(means[:count][labels != BACKGROUND], frame.cameras), means.dtype),
+        jnp.asarray(pixel_width(means[:count][labels != BACKGROUND], cameras), means.dtype),
         jnp.asarray(alive),
         jnp.asarray(cKDTree(means).query(means[:count], k=_NEIGHBORS + 1)[1][:, 1:], jnp.int32),
     )
     losses = {"lifting": lifting, "warming": warming}
-    exposures = exposures_of(drawn, frame)
-    return Start(anchor, order, canonical, field, exposures, masks, losses)
+    return Start(anchor, order, canonical, field, exposures, masks, losses, motions)
 
 
 def _find_masks(

@@ -11,6 +11,7 @@ from jaxtyping import Array, Bool, Float, Int
 from gsjax.geometry.rotations import normalize_quats, quats_to_matrices
 from gsjax.methods.parts.config import PartsConfig
 from gsjax.methods.parts.discover import Start, radii_of
+from gsjax.methods.parts.screws import pose_from
 from gsjax.methods.parts.stream import Canonical, StreamParams, skinning_weights, stream_step
 from gsjax.methods.parts.trajectory import BACKGROUND
 from gsjax.methods.parts.unify import Motions, best_cut, motions_of, unified
@@ -94,7 +95,7 @@ def order_of_frames(frames: int, anchor: int) -> list[int]:
 
 
 def initial_run(start: Start, frames: int, config: PartsConfig) -> Run:
-    """The run before the first frame: all parts are at rest.
+    """The run before the first frame: all parts are at rest. Of two states, the run after the second.
 
     Args:
         start: from `begin`.
@@ -121,7 +122,18 @@ def initial_run(start: Start, frames: int, config: PartsConfig) -> Run:
         weights=skinning_weights(start.field, start.canonical),
         predicted=at_rest(slots),
     )
+    if start.motions is not None:
+        discovery = _with_other_state(discovery, start.motions)
     return Run(params, jax.jit(stream_step(config.stream).init)(params), kept=discovery)
+
+
+def _with_other_state(discovery: Discovery, motions: Float[np.ndarray, "P 4 4"]) -> Discovery:
+    """The discovery with the other of its two frames found."""
+    other, centers = 1 - discovery.anchor, discovery.canonical.centers
+    pose = pose_from(jnp.asarray(motions, centers.dtype), centers)
+    quats, translations, found = discovery.quats.copy(), discovery.translations.copy(), discovery.found.copy()
+    quats[other], translations[other], found[other] = pose.quats, pose.translations, 1
+    return discovery._replace(quats=quats, translations=translations, found=found, frame=other)
 
 
 def open_frame(run: Run, t: int) -> Run:

@@ -27,7 +27,7 @@ from gsjax.scene.handles import HandlePose
 from gsjax.scene.region import TILE
 from gsjax.scene.render import plan_render, render
 
-_FRAMES, _CAMERAS, _SHRINK = 6, 2, 2  # pictures by which parts are evaluated, at half size
+_PICTURES, _CAMERAS, _SHRINK = 12, 2, 2  # by which parts are evaluated, those of a frame at least, half size
 _LEAST_CONTACT = 0.05  # share of a part's neighbours that another part must have to touch it
 _LEAST_WEIGHT = 0.02
 
@@ -130,11 +130,15 @@ class _MeanLoss:
         self._loss = _compiled_loss(config.stream)
         self._canonical, self._headroom = discovery.canonical, 2 * config.headroom
         done, count = np.flatnonzero(discovery.done), sequence.num_cameras
-        frames = done[np.linspace(0, len(done) - 1, min(_FRAMES, len(done))).round().astype(int)]
+        most = min(_PICTURES // _CAMERAS, len(done))
+        frames, cameras_of_one = (
+            done[np.linspace(0, len(done) - 1, most).round().astype(int)],
+            _PICTURES // most,
+        )
         self._pictures: list[tuple[HandlePose, Frame]] = []
         for i, t in enumerate(frames.tolist()):
             frame = part_of(corrected(sequence.frame(t), discovery.exposures), (), _SHRINK)
-            cameras = {(i + k * count // _CAMERAS) % count for k in range(_CAMERAS)}
+            cameras = {(i + k * count // cameras_of_one) % count for k in range(cameras_of_one)}
             place = self._canonical, jnp.asarray(weights), discovery.pose(t)
             seen = with_part_masks(frame, *place, TILE // _SHRINK, blend=config.stream.blend)
             self._pictures += [(discovery.pose(t), one_camera(seen, c)) for c in sorted(cameras)]

@@ -69,7 +69,8 @@ class Parts:
             sequence: the recording of synchronised cameras.
             start: from `begin`.
         """
-        return Problem(sequence), initial_run(start, sequence.num_frames, self.config)
+        problem = Problem(sequence, at_once=start.motions is not None)
+        return problem, initial_run(start, sequence.num_frames, self.config)
 
     @property
     def step(self) -> Step:
@@ -78,7 +79,8 @@ class Parts:
 
     def steps_of_frames(self, problem: Problem) -> int:
         """Number of steps that find the poses of all frames, before the refinement."""
-        return (problem.sequence.num_frames - 1) * self.config.stream.iterations
+        frames = 0 if problem.at_once else problem.sequence.num_frames - 1
+        return frames * self.config.stream.iterations
 
     def total(self, problem: Problem) -> int:
         """Number of steps, with the refinement."""

@@ -34,12 +34,14 @@ class Problem:
         past: past frames at half size, on the host, with colours in bytes.
         now: the current frame by size, with the weights by which its pixels were selected.
         whole: the newest full frame, with the colours of the scene, by its index.
+        at_once: whether the poses of all frames are known at the start.
     """
 
     sequence: SequenceLike
     past: dict[int, Frame] = field(default_factory=dict)
     now: dict[int, tuple[Array, Frame]] = field(default_factory=dict)
     whole: dict[int, Frame] = field(default_factory=dict)
+    at_once: bool = False
 
 
 class Draws(NamedTuple):

@@ -85,7 +85,7 @@ def _warn_of_few(scene: TrackedScene) -> None:
     few = [f"object {label} has {count}" for label, count in fewest.items() if count < _FEW]
     if few:
         warnings.warn(
-            "too few Gaussians in the first frame to tell whether an object, or a part of a large one, is lost: "
+            "too few Gaussians in the first frame to tell whether an object, or part of one, is lost: "
             f"{', '.join(few)}, expected {_FEW} or more; lower start.object_pixels "
             "(--track.start.object-pixels)",
             stacklevel=3,

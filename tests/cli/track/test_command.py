@@ -222,7 +222,7 @@ def test_a_run_says_what_was_lost_and_whose_turn_is_not_known(
         "carton: lost in 1 frame, number 2.",
         "carton: its rotation is unknown from frame 2 on: it was lost then.",
         "can: lost in 1 frame, number 1.",
-        "ball: lost in 1 frame, from 1 to 1.",
+        "ball: lost in 1 frame, number 1.",
         "ball: its rotation is unknown from frame 3 on: other rotations agree as well.",
     ]
     objects = found["objects"]

@@ -1,0 +1,243 @@
+"""The motions that together explain what is gone from where it was. Pieces of it guess, all of it judges."""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from gsjax.methods.parts.states.labels import connections, costs_of, labels_of
+from gsjax.methods.parts.states.registration import (
+    Target,
+    agrees,
+    axes_of,
+    guesses,
+    moved,
+    registered,
+    turned,
+)
+from gsjax.methods.parts.states.surfaces import Surface, evidence, pixel_width, surface_of
+from gsjax.scene.frame import Frame
+
+_SPACING = 1.5  # pixels between the points of a surface
+_TOLERANCE = 2.0  # pixels by which depth may be off
+_REACH = 8.0  # pixels from which a motion is found
+_LEAST_THROUGH = 2, 1 / 3  # cameras, and their share, that see through what is gone
+_SMOOTH = 9  # points next to each other that are judged together
+_MOST_PIECES, _LEAST_PIECE = 40, 30  # pieces, and the points of one
+_BENDS = np.cos(np.radians(25))  # between normals of neighbours in one piece
+_FEW, _MANY = 120, 6000  # points by which a guess of a piece, and one of all, are judged
+_BEST, _SOME = 30, 1000  # guesses of a piece that are followed, by at most so many points
+_COLOR = 0.15  # difference of colours that counts
+_BLOCKED = 0.3  # share of the cameras that may see through where a point is to be
+_EXPLAINS = 0.02  # least share of what is gone that a motion must explain
+_FAR_COSTS = 0.6  # share of its gain that a motion as far as the scene is large loses
+_MOST_MOTIONS = 30
+_ROUNDS = 2  # of labels and motions in turn
+_SAME = 2.0  # pixels between points after two motions that are one
+_LEAST_PART = 100  # points
+
+
+class States(NamedTuple):
+    """What moves between two states.
+
+    Attributes:
+        surface: points of the first state.
+        labels: the motion of each point, 0 for none.
+        motions: from the first state to the second; the first of them is none.
+    """
+
+    surface: Surface
+    labels: Int[np.ndarray, "n"]
+    motions: Float[np.ndarray, "k 4 4"]
+
+
+def states_of(before: Frame, after: Frame, seed: int = 0) -> States:
+    """The parts that move rigidly from one state to another, and their motions: along an axis or about one
+    unless the cameras tell otherwise.
+
+    Args:
+        before, after: all cameras of a state, with depth, 0 where unknown.
+        seed: of the points that judge guesses.
+
+    Raises:
+        ValueError: nothing has moved, or by no motion that is found.
+    """
+    pixel, random = pixel_width(before), np.random.default_rng(seed)
+    first, second = (surface_of(frame, _SPACING * pixel) for frame in (before, after))
+    gone, come = _seen_through(first, after, pixel), _seen_through(second, before, pixel)
+    if gone.sum() < _LEAST_PIECE or come.sum() < _LEAST_PIECE:
+        raise ValueError(
+            f"frames: expected parts that moved between two states, found {gone.sum()} points gone and "
+            f"{come.sum()} come of {len(gone)}; is the depth there, and in the unit of the poses?"
+        )
+    ends = np.concatenate([first.points[gone], second.points[come]])
+    low, high = ends.min(0) - _REACH * pixel, ends.max(0) + _REACH * pixel
+    anywhere, new = Target(second, pixel, low, high), Target(second.of(come), pixel, low, high)
+    lost = first.of(gone)
+    some = lost.of(random.permutation(len(lost.points))[:_MANY])
+    candidates = _candidates(lost, anywhere, new, float(np.max(high - low)), pixel, random)
+    motions = _explaining(candidates, some, anywhere, new, after, float(np.max(high - low)), pixel)
+    if not motions:
+        raise ValueError(
+            "frames: expected parts that moved rigidly between two states, found no motion that explains "
+            f"{_EXPLAINS:.0%} of what is gone"
+        )
+    here = np.flatnonzero(((first.points > low) & (first.points < high)).all(-1))  # nothing moves elsewhere
+    few, motions = _labelled(first.of(here), motions, anywhere, after, pixel)
+    labels = np.zeros(len(first.points), int)
+    labels[here] = few
+    return States(first, labels, motions)
+
+
+def _seen_through(surface: Surface, other: Frame, pixel: float) -> Bool[np.ndarray, "n"]:
+    """The points of a state that are not there in the other."""
+    said = evidence(surface.points, None, other, _TOLERANCE * pixel)
+    away = (said.through >= _LEAST_THROUGH[0]) & (said.share > _LEAST_THROUGH[1])
+    near = cKDTree(surface.points).query(surface.points, k=min(_SMOOTH, len(away)))[1]
+    return away[near.reshape(len(away), -1)].mean(1) > 0.5
+
+
+def _pieces(surface: Surface, radius: float) -> list[Int[np.ndarray, "m"]]:
+    """Rows of the smooth pieces of a surface, the largest first."""
+    pairs = cKDTree(surface.points).query_pairs(radius, output_type="ndarray")
+    smooth = (surface.normals[pairs[:, 0]] * surface.normals[pairs[:, 1]]).sum(-1) > _BENDS
+    pairs, count = pairs[smooth], len(surface.points)
+    links = coo_array((np.ones(len(pairs), bool), (pairs[:, 0], pairs[:, 1])), shape=(count, count))
+    total, piece_of = connected_components(links, directed=False)
+    sizes = np.bincount(piece_of, minlength=total)
+    largest = np.argsort(-sizes, kind="stable")[:_MOST_PIECES]
+    return [np.flatnonzero(piece_of == i) for i in largest if sizes[i] >= _LEAST_PIECE]
+
+
+def _candidates(
+    lost: Surface,
+    anywhere: Target,
+    new: Target,
+    size: float,
+    pixel: float,
+    random: np.random.Generator,
+) -> list[Float[np.ndarray, "4 4"]]:
+    """The motions that bring a piece of what is gone onto what has come."""
+    common, found = axes_of(np.concatenate([lost.normals, new.surface.normals])), []
+    for rows in _pieces(lost, 2.5 * pixel):
+        piece = lost.of(rows)
+        own = axes_of(piece.normals)
+        same = (np.abs(own @ common.T).max(1) > np.cos(np.radians(5))).all()
+        tried = np.concatenate(
+            [guesses(piece.points, axes, size) for axes in ([common] if same else [common, own])]
+        )
+        mixed = random.permutation(len(rows))
+        few, part = piece.of(mixed[:_FEW]), piece.of(mixed[:_SOME])
+        far, there = new.nearest(moved(tried, few.points))
+        same_way = (turned(tried, few.normals) * new.surface.normals[there]).sum(-1) > 0.6
+        same_way &= np.abs(few.colors - new.surface.colors[there]).mean(-1) < _COLOR
+        costs = np.where(same_way, np.minimum(far / (_REACH * pixel), 1), 1).mean(-1)
+        for guess in tried[
+            _best_apart(costs, moved(tried, few.points[:: len(few.points) // 8 + 1]), _REACH * pixel)
+        ]:
+            found.append(registered(guess, part, anywhere, _REACH * pixel, _TOLERANCE * pixel))
+    return found
+
+
+def _best_apart(costs: Float[np.ndarray, "k"], places: Float[np.ndarray, "k n 3"], apart: float) -> list[int]:
+    """Guesses of the least costs that bring points to places that are apart.
+
+    Args:
+        costs: of each guess.
+        places: where each brings the points, metres.
+        apart: mean distance, metres.
+    """
+    chosen: list[int] = []
+    for k in np.argsort(costs, kind="stable").tolist():
+        if all(np.linalg.norm(places[k] - places[other], axis=-1).mean() > apart for other in chosen):
+            chosen.append(k)
+            if len(chosen) == _BEST:
+                break
+    return chosen
+
+
+def _explaining(
+    candidates: list[Float[np.ndarray, "4 4"]],
+    some: Surface,
+    anywhere: Target,
+    new: Target,
+    after: Frame,
+    size: float,
+    pixel: float,
+) -> list[Float[np.ndarray, "4 4"]]:
+    """The motions that explain most of what is gone, one after the other, each by points and by places that
+    those before have not used; of motions that explain as much, the shorter."""
+
+    def explained(motion: Float[np.ndarray, "4 4"]) -> Bool[np.ndarray, "n"]:
+        fits = agrees(motion, some, anywhere, _SPACING * pixel, _COLOR)
+        fits |= agrees(motion, some, new, _TOLERANCE * pixel, _COLOR)
+        if fits.mean() < _EXPLAINS:
+            return np.zeros_like(fits)
+        said = evidence(moved(motion, some.points), turned(motion, some.normals), after, _TOLERANCE * pixel)
+        return fits & (said.share <= _BLOCKED)
+
+    explains = np.array([explained(motion) for motion in candidates]).reshape(len(candidates), -1)
+    candidates = [motion for motion, mine in zip(candidates, explains, strict=True) if mine.any()]
+    explains = explains[explains.any(1)]
+    places = [new.nearest(moved(motion, some.points))[1] for motion in candidates]
+    ways = [
+        np.linalg.norm(moved(motion, some.points[mine]) - some.points[mine], axis=-1).mean() / size
+        for motion, mine in zip(candidates, explains, strict=True)
+    ]
+    worth = 1 - _FAR_COSTS * np.minimum(np.array(ways), 1)
+    known, used, motions = np.zeros(len(some.points), bool), np.zeros(len(new.surface.points), bool), []
+    while len(candidates) and len(motions) < _MOST_MOTIONS:
+        fresh = np.array([mine & ~known & ~used[at] for mine, at in zip(explains, places, strict=True)])
+        gains = fresh.sum(1) * worth
+        best = int(gains.argmax())
+        if gains[best] < _EXPLAINS * len(known):
+            break
+        mine = explains[best] & ~known
+        motion = registered(candidates[best], some.of(mine), anywhere, 3 * pixel, _SPACING * pixel, 8)
+        motions.append(motion)
+        mine = explained(motion) | explains[best]
+        known |= mine
+        there = cKDTree(moved(motion, some.points[mine]))
+        used |= there.query(new.surface.points, distance_upper_bound=2 * _SPACING * pixel)[0] < np.inf
+    return motions
+
+
+def _labelled(
+    surface: Surface, motions: list[Float[np.ndarray, "4 4"]], target: Target, after: Frame, pixel: float
+) -> tuple[Int[np.ndarray, "n"], Float[np.ndarray, "k 4 4"]]:
+    """The points of each motion, and the motions by all of their points, in turn."""
+    spacing = _SPACING * pixel
+    links, every = connections(surface, spacing), [np.eye(4), *motions]
+    for _ in range(_ROUNDS):
+        costs = np.stack([costs_of(motion, surface, target, after, spacing) for motion in every], -1)
+        labels = labels_of(costs, links)
+        labels, kept = _without_doubles(surface, labels, every, pixel)
+        every = [np.eye(4)] + [
+            registered(every[k], surface.of(labels == i), target, 2 * pixel, pixel)
+            for i, k in enumerate(kept, start=1)
+        ]
+    return labels, np.stack(every)
+
+
+def _without_doubles(
+    surface: Surface, labels: Int[np.ndarray, "n"], motions: list[Float[np.ndarray, "4 4"]], pixel: float
+) -> tuple[Int[np.ndarray, "n"], list[int]]:
+    """The labels with motions joined that are one, and without those of few points; and which remain."""
+    labels, kept = labels.copy(), []
+    for k in np.argsort(-np.bincount(labels, minlength=len(motions)), kind="stable"):
+        mine = surface.points[labels == k]
+        if k == 0 or len(mine) < _LEAST_PART:
+            continue
+        for other in (0, *kept):
+            apart = np.linalg.norm(moved(motions[k], mine) - moved(motions[other], mine), axis=-1)
+            if apart.mean() < _SAME * pixel:
+                labels[labels == k] = other
+                break
+        else:
+            kept.append(int(k))
+    renamed = np.zeros(len(motions), int)
+    renamed[kept] = np.arange(1, len(kept) + 1)
+    return renamed[labels], kept
