@@ -26,7 +26,7 @@ from gsjax.data.realsense import read_realsense
 from gsjax.data.record3d import EXPORT_THIS, is_record3d, read_record3d
 from gsjax.data.sequence import Sequence
 from gsjax.data.seven_scenes import read_seven_scenes
-from gsjax.data.simulated import articulated, bar, hard_parts, tabletop, tissue
+from gsjax.data.simulated import articulated, bar, cabinet, hard_parts, tabletop, tissue
 from gsjax.data.through_lenses import Fisheye
 from gsjax.data.tool_masks import Tool
 from gsjax.data.tum import read_tum
@@ -38,6 +38,7 @@ SIMULATED_SCENES = {
     "tabletop": tabletop,
     "articulated": articulated,
     "bar": bar,
+    "cabinet": cabinet,
     "hard_parts": hard_parts,
     "tissue": tissue,
 }

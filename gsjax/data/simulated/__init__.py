@@ -5,6 +5,7 @@ They are not made of Gaussians, so no reconstruction can fit them by constructio
 
 from gsjax.data.simulated.articulated import articulated
 from gsjax.data.simulated.bar import bar
+from gsjax.data.simulated.cabinet import cabinet
 from gsjax.data.simulated.hard_parts import hard_parts
 from gsjax.data.simulated.primitives import Primitive
 from gsjax.data.simulated.raycaster import Light, Scene
@@ -20,6 +21,7 @@ __all__ = [
     "Texture",
     "articulated",
     "bar",
+    "cabinet",
     "hard_parts",
     "simulated_sequence",
     "tabletop",

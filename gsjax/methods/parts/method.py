@@ -186,6 +186,7 @@ class Parts:
             jnp.asarray(discovery.anchor),
             i / self.config.refine.iterations,
             run.plans[_REFINING],
+            problem.at_once,  # surfaces in space tell poses better than pictures do
         )
         return batch, (_REFINING,)
 

@@ -12,7 +12,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import optax
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from gsjax.losses.extra import ExtraLosses, extra_terms, named_losses
 from gsjax.methods.parts.config import PartsConfig
@@ -59,6 +59,7 @@ class RefineBatch(NamedTuple):
         frame: the picture of one camera at frame t; its masks select the pixels that count.
         t: index of the frame.
         anchor: index of the canonical frame, at which all handles are at rest.
+        held: whether all poses stay as they are.
         progress: share of the refinement that is done, 0 to 1, over which learning rates fall.
         plan: the render plan.
     """
@@ -70,6 +71,7 @@ class RefineBatch(NamedTuple):
     anchor: Int[Array, ""]
     progress: Float[Array, ""] | float
     plan: Plan
+    held: Bool[Array, ""] | bool = False
 
 
 def refine_step(config: PartsConfig, extra_losses: ExtraLosses = ()) -> Step:
@@ -124,7 +126,7 @@ def refine_step(config: PartsConfig, extra_losses: ExtraLosses = ()) -> Step:
             gaussians.append(optax.apply_updates(before, moves))
             known.append(now)
         moves, pose_state = poses.update(slope[1], pose_state)
-        far = jnp.where(batch.t == batch.anchor, 0.0, length)
+        far = jnp.where((batch.t == batch.anchor) | batch.held, 0.0, length)
         pose = pose_after(pose, moves, batch.canonical, far, far)
         everywhere = jax.tree.map(
             lambda every, one: every.at[batch.t].set(one), (params.poses, state[1]), (pose, pose_state)

@@ -16,7 +16,10 @@ _SLIDES = np.arange(0.04, 0.75, 0.03)  # of the size of the scene
 _TURNS = np.radians(np.arange(8, 180, 8))
 _SAME_WAY = 0.6  # least cosine between normals that may belong together
 _CLOSER = 0.75  # by which the reach falls from round to round
-_PURE = 0.01  # weight of turning without sliding along the axis, relative to the points
+_PURE, _PULLED = (
+    0.01,
+    0.3,
+)  # weight of not sliding along the axis of a turn, and the most it counts, in reaches
 _TURNS_AT_ALL = 0.05  # radians
 
 
@@ -75,7 +78,7 @@ def axes_of(normals: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "3 3"]:
     some = normals[:: max(1, len(normals) // 2000)]
     alike = np.abs(some @ some.T)
     left, found = np.ones(len(some), bool), []
-    for _ in range(2):
+    for _ in range(2 if len(some) else 0):
         scores = ((alike > _ALIKE[0]) & left).sum(1) * left
         best = int(scores.argmax())
         if scores[best] < _FEWEST * len(some):
@@ -157,9 +160,9 @@ def registered(
         turn = Rotation.from_matrix(motion[:3, :3]).as_rotvec()
         if (angle := np.linalg.norm(turn)) > _TURNS_AT_ALL:
             along = np.concatenate([np.zeros(3), turn / angle])
-            strength = _PURE * len(at)
-            curvature += strength * np.outer(along, along)
-            slope -= strength * (motion[:3, 3] @ along[3:]) * along
+            slid = np.clip(motion[:3, 3] @ along[3:], -_PULLED * near, _PULLED * near)
+            curvature += _PURE * len(at) * np.outer(along, along)
+            slope -= _PURE * len(at) * slid * along
         damped = curvature + np.diag(1e-5 * np.diag(curvature) + 1e-9 * np.trace(curvature))
         step = np.linalg.solve(damped, slope)
         change = np.eye(4)

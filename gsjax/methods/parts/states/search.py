@@ -216,7 +216,7 @@ def _labelled(
         labels = labels_of(costs, links)
         labels, kept = _without_doubles(surface, labels, every, pixel)
         every = [np.eye(4)] + [
-            registered(every[k], surface.of(labels == i), target, 2 * pixel, pixel)
+            registered(every[k], surface.of(labels == i), target, 2 * pixel, pixel, 25)
             for i, k in enumerate(kept, start=1)
         ]
     return labels, np.stack(every)

@@ -1,0 +1,165 @@
+"""Parts from two states: motions that nobody saw are found, and parts that nobody named."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+import gsjax
+from gsjax.engine.scores import true_labels_at
+from gsjax.methods.parts import PartsConfig
+from gsjax.methods.parts.states import states_of
+from gsjax.methods.parts.states.labels import connections, labels_of
+from gsjax.methods.parts.states.registration import Target, axes_of, guesses, moved, registered, turned
+from gsjax.methods.parts.states.surfaces import Surface, evidence, pixel_width, surface_of
+from gsjax.metrics.tracking import relative_motion
+from gsjax.scene.initialize import gaussians_from_points
+
+SMALL = "width=96&height=72&cameras=12"
+
+
+@pytest.fixture(scope="module")
+def cabinet():
+    return gsjax.open_sequence(f"simulated:cabinet?{SMALL}")
+
+
+@pytest.fixture(scope="module")
+def found(cabinet):
+    return states_of(cabinet.frame(0), cabinet.frame(1))
+
+
+def true_motions(sequence, anchor=0):
+    """From one state to the other, for each part."""
+    return [relative_motion(sequence.truth.poses[:, k], anchor)[1 - anchor] for k in range(2)]
+
+
+def gap(one, other, points):
+    """Mean distance between points after two motions, metres."""
+    return np.linalg.norm(moved(one, points) - moved(other, points), axis=-1).mean()
+
+
+def test_a_door_and_a_drawer_are_found_to_a_tenth_of_a_pixel(cabinet, found):
+    pixel, points = pixel_width(cabinet.frame(0)), found.surface.points
+    assert len(found.motions) == 3
+    for true in true_motions(cabinet):
+        best = min(
+            gap(motion, true, points[found.labels == k]) for k, motion in enumerate(found.motions) if k
+        )
+        assert best < 0.1 * pixel
+
+
+def test_points_follow_the_motion_of_what_they_are_on(cabinet, found):
+    labels = true_labels_at(cabinet, 0, found.surface.points)
+    matches = [(found.labels == k) & (labels == label) for k in (1, 2) for label in (1, 2)]
+    right = max(matches[0].sum() + matches[3].sum(), matches[1].sum() + matches[2].sum())
+    assert right > 0.85 * (labels > 0).sum()
+    assert (found.labels[labels == 0] == 0).mean() > 0.98
+
+
+def test_backwards_the_motions_are_the_inverse(cabinet):
+    found, pixel = states_of(cabinet.frame(1), cabinet.frame(0)), pixel_width(cabinet.frame(0))
+    for true in true_motions(cabinet, anchor=1):
+        points = found.surface.points
+        assert min(gap(m, true, points[found.labels == k]) for k, m in enumerate(found.motions) if k) < pixel
+
+
+def test_where_nothing_has_moved_that_is_said(cabinet):
+    with pytest.raises(ValueError, match="expected parts that moved between two states, found 0 points gone"):
+        states_of(cabinet.frame(0), cabinet.frame(0))
+
+
+def test_the_run_of_two_states_has_joints_and_is_refined(cabinet):
+    """Without a fit: the points that the cameras measure, as Gaussians."""
+    surface = surface_of(cabinet.frame(0), 2 * pixel_width(cabinet.frame(0)))
+    gaussians = gaussians_from_points(surface.points, surface.colors)
+    config = PartsConfig()
+    config = replace(config, refine=replace(config.refine, iterations=4))
+    ticks = gsjax.parts(cabinet, config, anchor=0, gaussians=gaussians)
+    assert [now.step for now in ticks] == [1, 2, 3, 4]
+    result = ticks.result
+    assert result.done.all()
+    joints = [result.joints()[k].joint for k in (1, 2)]
+    assert sorted(joint.kind for joint in joints) == ["prismatic", "revolute"]
+    for true in cabinet.truth.joints:
+        mine = next(joint for joint in joints if joint.kind == true.kind)
+        assert abs(mine.axis @ true.axis) > np.cos(np.radians(0.5))
+        assert abs(np.ptp(mine.values) - np.ptp(true.values)) < 5e-3
+    going_on = gsjax.parts(cabinet, config, after=ticks.tick)
+    assert next(going_on, None) is None
+
+
+@pytest.fixture(scope="module")
+def corner():
+    """Points on three faces of a box, whose motion they determine."""
+    flat = np.stack(np.meshgrid(np.linspace(0, 0.3, 21), np.linspace(0, 0.2, 15)), -1).reshape(-1, 2)
+    points, normals = [], []
+    for axis in range(3):
+        points.append(np.insert(flat, axis, 0.0, axis=1))
+        normals.append(np.tile(-np.eye(3)[axis], (len(flat), 1)))
+    points, normals = np.concatenate(points), np.concatenate(normals)
+    return Surface(points, normals, np.full_like(points, 0.5))
+
+
+@settings(max_examples=20, deadline=None)
+@given(seed=st.integers(0, 2**31 - 1))
+def test_a_motion_near_a_guess_is_found(corner, seed):
+    random = np.random.default_rng(seed)
+    true, off = (np.eye(4) for _ in range(2))
+    true[:3, :3] = Rotation.from_rotvec(random.normal(size=3)).as_matrix()
+    true[:3, 3] = random.normal(size=3)
+    off[:3, :3] = Rotation.from_rotvec(0.03 * random.normal(size=3)).as_matrix()
+    off[:3, 3] = 0.01 * random.normal(size=3)
+    after = Surface(moved(true, corner.points), turned(true, corner.normals), corner.colors)
+    target = Target(after, 0.005, after.points.min(0) - 0.1, after.points.max(0) + 0.1)
+    result = registered(true @ off, corner, target, 0.05, 0.01, rounds=25)
+    assert gap(result, true, corner.points) < 1.5e-3
+
+
+def test_a_plate_that_may_slide_along_its_hinge_does_not(corner):
+    """Its plane tells neither its place within it nor, about an axis within it, the slide along that."""
+    face = Surface(*(values[: len(values) // 3] for values in corner))
+    true, guess = np.eye(4), np.eye(4)
+    true[:3, :3] = Rotation.from_rotvec([0, 0, 1.0]).as_matrix()
+    guess[:3, :3], guess[:3, 3] = true[:3, :3], (0, 0, 0.03)
+    after = Surface(moved(true, face.points), turned(true, face.normals), face.colors)
+    target = Target(after, 0.005, after.points.min(0) - 0.1, after.points.max(0) + 0.1)
+    assert abs(registered(guess, face, target, 0.05, 0.01, rounds=30)[2, 3]) < 2e-3
+
+
+def test_guesses_are_rigid_and_the_axes_those_of_the_normals(corner):
+    axes = axes_of(np.concatenate([corner.normals, -corner.normals]))
+    np.testing.assert_allclose(np.abs(axes @ np.eye(3)).max(1), 1, atol=1e-6)
+    motions = guesses(corner.points, axes, 1.0)
+    rotations = motions[:, :3, :3]
+    np.testing.assert_allclose(
+        rotations @ np.swapaxes(rotations, 1, 2), np.tile(np.eye(3), (len(motions), 1, 1)), atol=1e-9
+    )
+    np.testing.assert_allclose(np.linalg.det(rotations), 1)
+    for few in (np.zeros((0, 3)), np.tile([[0.0, 0.0, 1.0]], (9, 1))):  # no plane, or one
+        np.testing.assert_allclose(axes_of(few) @ axes_of(few).T, np.eye(3), atol=1e-9)
+
+
+def test_cameras_see_surfaces_see_through_points_before_them_and_nothing_behind(cabinet):
+    frame = cabinet.frame(0)
+    pixel = pixel_width(frame)
+    surface = surface_of(frame, 2 * pixel)
+    there = evidence(surface.points, surface.normals, frame, 2 * pixel)
+    assert (there.there > 0).mean() > 0.95
+    assert there.share.mean() < 0.02
+    before = evidence(surface.points + 6 * pixel * surface.normals, None, frame, 2 * pixel)
+    assert np.median(before.share) > 0.7
+    below = surface.points[np.abs(surface.points[:, 2]) < pixel] - (0, 0, 0.2)
+    assert not evidence(below, None, frame, 2 * pixel).seen.any()
+
+
+def test_what_nothing_is_known_of_takes_the_label_around_it(corner):
+    links = connections(corner, 0.015)
+    assert abs(links - links.T).max() < 1e-12
+    costs = np.full((len(corner.points), 2), 0.4)
+    costs[: len(costs) // 3 : 5, 0], costs[len(costs) // 3 :: 5, 1] = 0.0, 0.0
+    labels = labels_of(costs, links)
+    assert (labels[: len(costs) // 3] == 0).mean() > 0.9
+    assert (labels[len(costs) // 3 :] == 1).mean() > 0.9
