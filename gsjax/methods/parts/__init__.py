@@ -17,6 +17,7 @@ discover.py   the start, from all of these        finish.py      removal of unne
 unify.py      which parts join or divide          result.py      scene, trajectory and joints
 motion.py     what moves, from all cameras        exposure.py    colours of cameras against the scene
 search.py     parts that jump
+states/       parts from two states, of which no motion is seen
 trajectory.py parts over time                     screws.py      poses as rigid motions
 edits.py      edits of trajectories               film.py        layers rendered together
 entries.py    checked entries of scripts          operation.py   base classes of operations

@@ -1,4 +1,4 @@
-"""The motions that together explain what is gone from where it was. Pieces of it guess, all of it judges."""
+"""The motions that together explain what is gone from where it was: guessed by pieces, judged by all of it."""
 
 from typing import NamedTuple
 
@@ -36,8 +36,7 @@ _EXPLAINS = 0.02  # least share of what is gone that a motion must explain
 _FAR_COSTS = 0.6  # share of its gain that a motion as far as the scene is large loses
 _MOST_MOTIONS = 30
 _ROUNDS = 2  # of labels and motions in turn
-_SAME = 2.0  # pixels between points after two motions that are one
-_LEAST_PART = 100  # points
+_NEEDED, _LEAST_PART = 0.15, 100  # by how much worse, and how many, points would fit without a motion
 
 
 class States(NamedTuple):
@@ -213,31 +212,32 @@ def _labelled(
     links, every = connections(surface, spacing), [np.eye(4), *motions]
     for _ in range(_ROUNDS):
         costs = np.stack([costs_of(motion, surface, target, after, spacing) for motion in every], -1)
-        labels = labels_of(costs, links)
-        labels, kept = _without_doubles(surface, labels, every, pixel)
+        kept = _needed(costs)
+        labels = labels_of(costs[:, kept], links)
         every = [np.eye(4)] + [
             registered(every[k], surface.of(labels == i), target, 2 * pixel, pixel, 25)
-            for i, k in enumerate(kept, start=1)
+            for i, k in enumerate(kept)
+            if k
         ]
     return labels, np.stack(every)
 
 
-def _without_doubles(
-    surface: Surface, labels: Int[np.ndarray, "n"], motions: list[Float[np.ndarray, "4 4"]], pixel: float
-) -> tuple[Int[np.ndarray, "n"], list[int]]:
-    """The labels with motions joined that are one, and without those of few points; and which remain."""
-    labels, kept = labels.copy(), []
-    for k in np.argsort(-np.bincount(labels, minlength=len(motions)), kind="stable"):
-        mine = surface.points[labels == k]
-        if k == 0 or len(mine) < _LEAST_PART:
-            continue
-        for other in (0, *kept):
-            apart = np.linalg.norm(moved(motions[k], mine) - moved(motions[other], mine), axis=-1)
-            if apart.mean() < _SAME * pixel:
-                labels[labels == k] = other
-                break
-        else:
-            kept.append(int(k))
-    renamed = np.zeros(len(motions), int)
-    renamed[kept] = np.arange(1, len(kept) + 1)
-    return renamed[labels], kept
+def _needed(costs: Float[np.ndarray, "n k"]) -> list[int]:
+    """The motions without which points would fit clearly worse; 0, none, is one of them. One that also turns
+    over a plate that looks alike from both sides is not, nor is one of two that are the same.
+
+    Args:
+        costs: of each point after each motion.
+    """
+    kept = list(range(costs.shape[1]))
+    while len(kept) > 1:
+        best, following = np.sort(costs[:, kept], axis=1)[:, :2].T
+        follows, lead = costs[:, kept].argmin(1), following - best
+        counts = np.bincount(follows, minlength=len(kept))
+        leads = np.bincount(follows, lead, len(kept)) / np.maximum(counts, 1)
+        leads[counts < _LEAST_PART] = 0
+        leads[0] = np.inf
+        if leads.min() >= _NEEDED:
+            break
+        kept.pop(int(leads.argmin()))
+    return kept

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from gsjax.geometry.cameras import project
 from gsjax.geometry.neighbors import voxel_thin
@@ -32,7 +32,7 @@ class Surface(NamedTuple):
     normals: Float[np.ndarray, "n 3"]
     colors: Float[np.ndarray, "n 3"]
 
-    def of(self, rows: np.ndarray) -> "Surface":
+    def of(self, rows: Int[np.ndarray, "m"] | Bool[np.ndarray, "n"]) -> "Surface":
         """Some of the points."""
         return Surface(*(values[rows] for values in self))
 
