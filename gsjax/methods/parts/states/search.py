@@ -1,4 +1,4 @@
-"""The motions that together explain what is gone from where it was: guessed by pieces, judged by all of it."""
+"""The motions that together explain what is gone from where it was: guessed by pieces, judged by all."""
 
 from typing import NamedTuple
 
