@@ -8,13 +8,13 @@ from scipy.sparse.linalg import LinearOperator, cg
 from scipy.spatial import cKDTree
 
 from gsjax.methods.parts.states.registration import Target, moved, turned
-from gsjax.methods.parts.states.surfaces import Surface, evidence
+from gsjax.methods.parts.states.surfaces import Surface, evidence, unlike
 from gsjax.scene.frame import Frame
 
 _NEIGHBORS = 10
 _COLOR = 0.05  # difference of colours at which neighbours are hardly connected
 _BEND = 0.1  # strength of the connection of neighbours with perpendicular normals
-_SAME_WAY, _SAME_COLOR = 0.7, 0.15
+_SAME_WAY, _SAME_COLOR = 0.7, 0.12
 _UNKNOWN = 0.4  # cost of a point of which nothing is known; of one that agrees it is 0, of others up to 1
 _SHARPNESS = 0.05  # differences of costs that count
 _PULL = 0.5  # of the cameras, relative to a connection
@@ -54,7 +54,7 @@ def costs_of(
     said = evidence(at, normals, frame, 4 / 3 * spacing)
     far, rows = target.nearest(at)
     fits = (far < spacing) & ((normals * target.surface.normals[rows]).sum(-1) > _SAME_WAY)
-    off = np.abs(surface.colors - target.surface.colors[rows]).mean(-1) / _SAME_COLOR
+    off = unlike(surface.colors, target.surface.colors[rows]) / _SAME_COLOR
     cost = np.where(fits, 0.5 * _UNKNOWN * np.minimum(off, 1), _UNKNOWN)
     return np.where(said.seen, cost + (1 - _UNKNOWN) * np.minimum(3 * said.share, 1), _UNKNOWN)
 

@@ -6,7 +6,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.ndimage import distance_transform_edt
 from scipy.spatial.transform import Rotation
 
-from gsjax.methods.parts.states.surfaces import Surface
+from gsjax.methods.parts.states.surfaces import Surface, unlike
 
 _MOST_CELLS = 4e6  # of the grid that finds nearest points
 _BORDER = 4  # cells around it
@@ -182,8 +182,8 @@ def agrees(
         part: before it.
         target: the surface after it.
         near: distance that counts, metres.
-        color: difference of colours that counts, 0 to 1.
+        color: how unlike colours may be, 0 to 1.
     """
     far, rows = target.nearest(moved(motion, part.points))
     same_way = (turned(motion, part.normals) * target.surface.normals[rows]).sum(-1) > _SAME_WAY
-    return (far < near) & same_way & (np.abs(part.colors - target.surface.colors[rows]).mean(-1) < color)
+    return (far < near) & same_way & (unlike(part.colors, target.surface.colors[rows]) < color)

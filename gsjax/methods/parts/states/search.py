@@ -18,7 +18,7 @@ from gsjax.methods.parts.states.registration import (
     registered,
     turned,
 )
-from gsjax.methods.parts.states.surfaces import Surface, evidence, pixel_width, surface_of
+from gsjax.methods.parts.states.surfaces import Surface, evidence, pixel_width, surface_of, unlike
 from gsjax.scene.frame import Frame
 
 _SPACING = 1.5  # pixels between the points of a surface
@@ -30,7 +30,7 @@ _MOST_PIECES, _LEAST_PIECE = 40, 30  # pieces, and the points of one
 _BENDS = np.cos(np.radians(25))  # between normals of neighbours in one piece
 _FEW, _MANY = 120, 6000  # points by which a guess of a piece, and one of all, are judged
 _BEST, _SOME = 30, 1000  # guesses of a piece that are followed, by at most so many points
-_COLOR = 0.15  # difference of colours that counts
+_COLOR = 0.12  # how unlike colours may be
 _BLOCKED = 0.3  # share of the cameras that may see through where a point is to be
 _EXPLAINS = 0.02  # least share of what is gone that a motion must explain
 _FAR_COSTS = 0.6  # share of its gain that a motion as far as the scene is large loses
@@ -132,7 +132,7 @@ def _candidates(
         few, part = piece.of(mixed[:_FEW]), piece.of(mixed[:_SOME])
         far, there = new.nearest(moved(tried, few.points))
         same_way = (turned(tried, few.normals) * new.surface.normals[there]).sum(-1) > 0.6
-        same_way &= np.abs(few.colors - new.surface.colors[there]).mean(-1) < _COLOR
+        same_way &= unlike(few.colors, new.surface.colors[there]) < _COLOR
         costs = np.where(same_way, np.minimum(far / (_REACH * pixel), 1), 1).mean(-1)
         for guess in tried[
             _best_apart(costs, moved(tried, few.points[:: len(few.points) // 8 + 1]), _REACH * pixel)

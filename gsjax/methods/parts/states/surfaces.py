@@ -59,6 +59,13 @@ class Evidence(NamedTuple):
         return self.there + self.through > 0
 
 
+def unlike(one: Float[np.ndarray, "*n 3"], other: Float[np.ndarray, "*m 3"]) -> Float[np.ndarray, "*m"]:
+    """How unlike colours are, 0 to 1; `one` is broadcast. Brightness counts a third: what turns is lit otherwise."""
+    apart = one - other
+    brighter = apart.mean(-1)
+    return np.abs(apart - brighter[..., None]).mean(-1) + np.abs(brighter) / 3
+
+
 def pixel_width(frame: Frame) -> float:
     """Width of a pixel at the depth of what is seen, metres: the median over the cameras.
 
