@@ -14,7 +14,7 @@ from gsjax.scene.frame import Frame
 _NEIGHBORS = 10
 _COLOR = 0.05  # difference of colours at which neighbours are hardly connected
 _BEND = 0.1  # strength of the connection of neighbours with perpendicular normals
-_SAME_WAY, _SAME_COLOR = 0.7, 0.12
+_SAME_WAY, _SAME_COLOR = 0.7, 0.15
 _UNKNOWN = 0.4  # cost of a point of which nothing is known; of one that agrees it is 0, of others up to 1
 _SHARPNESS = 0.05  # differences of costs that count
 _PULL = 0.5  # of the cameras, relative to a connection

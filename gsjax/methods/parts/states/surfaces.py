@@ -60,10 +60,8 @@ class Evidence(NamedTuple):
 
 
 def unlike(one: Float[np.ndarray, "*n 3"], other: Float[np.ndarray, "*m 3"]) -> Float[np.ndarray, "*m"]:
-    """How unlike colours are, 0 to 1; brightness counts a third, as what turns is lit otherwise."""
-    apart = one - other
-    brighter = apart.mean(-1)
-    return np.abs(apart - brighter[..., None]).mean(-1) + np.abs(brighter) / 3
+    """How unlike colours are, 0 to 1."""
+    return np.abs(one - other).mean(-1)
 
 
 def pixel_width(frame: Frame) -> float:
