@@ -18,7 +18,7 @@ from gsjax.methods.parts.states.surfaces import Surface, evidence, pixel_width, 
 from gsjax.metrics.tracking import relative_motion
 from gsjax.scene.initialize import gaussians_from_points
 
-SMALL = "width=160&height=120&cameras=16"
+SMALL = "width=96&height=72&cameras=12"
 
 
 @pytest.fixture(scope="module")

@@ -6,7 +6,7 @@ import numpy as np
 
 from gsjax.cli import main
 
-SCENE = "simulated:cabinet?width=160&height=120&cameras=16"
+SCENE = "simulated:cabinet?width=96&height=72&cameras=12"
 QUICK = (
     *("--fit.steps", "60", "--fit.cap", "3000", "--fit.start.count", "3000", "--fit.coarse-until", "0"),
     *("--parts.refine.iterations", "3", "--eval-cameras", "5"),
