@@ -95,6 +95,11 @@ def test_the_run_of_two_states_has_joints_and_is_refined(cabinet):
     assert next(going_on, None) is None
 
 
+def test_an_anchor_that_is_neither_state_is_refused(cabinet):
+    with pytest.raises(ValueError, match="anchor: expected a frame from 0 to 1, found 2"):
+        gsjax.parts(cabinet, anchor=2)
+
+
 @pytest.fixture(scope="module")
 def corner():
     """Points on three faces of a box, whose motion they determine."""

@@ -7,6 +7,7 @@ from jaxtyping import Bool, Int
 from gsjax.data.sequence import Sequence
 from gsjax.methods.fit import FitConfig, StartConfig
 from gsjax.methods.parts import Anchor, PartsConfig, Start, begin, choose_anchor, moved_pixels
+from gsjax.methods.parts.anchor import check_anchor
 from gsjax.methods.parts.states import begin_with_states
 from gsjax.methods.protocols import Segmenter
 from gsjax.scene.gaussians import Gaussians
@@ -36,6 +37,7 @@ def detect_motion(
             first).
     """
     if has_two_states(tracked):
+        check_anchor(anchor, tracked.num_frames)
         chosen = anchor or 0
         return Anchor(chosen, 1 - chosen, np.zeros(2)), None
     cameras, discover = tracked.num_cameras, config.discover

@@ -51,8 +51,7 @@ def choose_anchor(load: Load, frames: int, cameras: int, anchor: int | None = No
     """
     if frames < 2:
         raise ValueError(f"frames: expected at least 2, between which something moves, found {frames}")
-    if anchor is not None and not 0 <= anchor < frames:
-        raise ValueError(f"anchor: expected a frame from 0 to {frames - 1}, found {anchor}")
+    check_anchor(anchor, frames)
     small = np.stack([[_thumbnail(load(t, c)) for c in range(cameras)] for t in range(frames)])
     flat = small.reshape(frames, -1, 3)
     apart = np.stack([np.linalg.norm(flat - one, axis=-1).mean(-1) for one in flat]) / np.sqrt(3)
@@ -65,6 +64,12 @@ def choose_anchor(load: Load, frames: int, cameras: int, anchor: int | None = No
             stacklevel=2,
         )
     return Anchor(chosen, int(apart[chosen].argmax()), apart[chosen])
+
+
+def check_anchor(anchor: int | None, frames: int) -> None:
+    """Raises ValueError for an anchor that is none of the frames."""
+    if anchor is not None and not 0 <= anchor < frames:
+        raise ValueError(f"anchor: expected a frame from 0 to {frames - 1}, found {anchor}")
 
 
 def moved_pixels(

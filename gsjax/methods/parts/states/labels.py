@@ -7,7 +7,7 @@ from scipy.sparse import csr_array, diags_array
 from scipy.sparse.linalg import LinearOperator, cg
 from scipy.spatial import cKDTree
 
-from gsjax.methods.parts.states.registration import Target, moved, turned
+from gsjax.methods.parts.states.registration import Target, matched, moved, turned
 from gsjax.methods.parts.states.surfaces import Surface, evidence, unlike
 from gsjax.scene.frame import Frame
 
@@ -30,7 +30,7 @@ def connections(surface: Surface, spacing: float) -> csr_array:
     """
     count = min(_NEIGHBORS + 1, len(surface.points))
     far, near = (a[:, 1:] for a in cKDTree(surface.points).query(surface.points, k=count))
-    apart = np.abs(surface.colors[:, None] - surface.colors[near]).mean(-1)
+    apart = unlike(surface.colors[:, None], surface.colors[near])
     bend = np.clip((surface.normals[:, None] * surface.normals[near]).sum(-1), 0, 1)
     strengths = np.exp(-apart / _COLOR - 0.5 * (far / (1.5 * spacing)) ** 2) * (_BEND + (1 - _BEND) * bend)
     rows = np.repeat(np.arange(len(far)), far.shape[1])
@@ -50,11 +50,10 @@ def costs_of(
         frame: all cameras of the other state.
         spacing: between the points, metres.
     """
-    at, normals = moved(motion, surface.points), turned(motion, surface.normals)
-    said = evidence(at, normals, frame, 4 / 3 * spacing)
-    far, rows = target.nearest(at)
-    fits = (far < spacing) & ((normals * target.surface.normals[rows]).sum(-1) > _SAME_WAY)
-    off = unlike(surface.colors, target.surface.colors[rows]) / _SAME_COLOR
+    said = evidence(moved(motion, surface.points), turned(motion, surface.normals), frame, 4 / 3 * spacing)
+    match = matched(motion, surface, target)
+    fits = (match.far < spacing) & (match.cosines > _SAME_WAY)
+    off = match.unlike / _SAME_COLOR
     cost = np.where(fits, 0.5 * _UNKNOWN * np.minimum(off, 1), _UNKNOWN)
     return np.where(said.seen, cost + (1 - _UNKNOWN) * np.minimum(3 * said.share, 1), _UNKNOWN)
 

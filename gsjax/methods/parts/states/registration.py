@@ -1,6 +1,8 @@
 """Rigid motions between two surfaces: guesses of all that joints allow, and the motion that fits best near
 one (point to plane, Chen and Medioni 1992)."""
 
+from typing import NamedTuple
+
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.ndimage import distance_transform_edt
@@ -14,12 +16,11 @@ _ALIKE = np.cos(np.radians(8)), np.cos(np.radians(25))  # normals of one directi
 _FEWEST = 0.02  # share of the normals that makes a direction
 _SLIDES = np.arange(0.04, 0.75, 0.03)  # of the size of the scene
 _TURNS = np.radians(np.arange(8, 180, 8))
-_SAME_WAY = 0.6  # least cosine between normals that may belong together
+SAME_WAY = 0.6
+"""Least cosine between normals that may belong together."""
 _CLOSER = 0.75  # by which the reach falls from round to round
-_PURE, _PULLED = (
-    0.01,
-    0.3,
-)  # weight of not sliding along the axis of a turn, and the most it counts, in reaches
+_PURE = 0.01  # weight of not sliding along the axis of a turn, relative to the points ...
+_PULLED = 0.3  # ... and the longest slide that it counts, in reaches
 _TURNS_AT_ALL = 0.05  # radians
 
 
@@ -148,7 +149,7 @@ def registered(
         at, facing = moved(motion, part.points), turned(motion, part.normals)
         far, rows = target.nearest(at)
         normals = target.surface.normals[rows]
-        counts = (far < near) & ((facing * normals).sum(-1) > _SAME_WAY)
+        counts = (far < near) & ((facing * normals).sum(-1) > SAME_WAY)
         if counts.sum() < 6:
             return motion
         at, there, normals = at[counts], target.surface.points[rows[counts]], normals[counts]
@@ -172,6 +173,33 @@ def registered(
     return motion
 
 
+class Match(NamedTuple):
+    """How points after a motion match the surface that is there.
+
+    Attributes:
+        far: distances to the nearest points of the surface, metres.
+        cosines: between the normals of the two.
+        unlike: how unlike their colours are, 0 to 1.
+    """
+
+    far: Float[np.ndarray, "*k n"]
+    cosines: Float[np.ndarray, "*k n"]
+    unlike: Float[np.ndarray, "*k n"]
+
+
+def matched(motion: Float[np.ndarray, "*k 4 4"], part: Surface, target: Target) -> Match:
+    """How the points of a part match a surface, after one motion or each of many.
+
+    Args:
+        motion: the motions.
+        part: before them.
+        target: the surface after them.
+    """
+    far, rows = target.nearest(moved(motion, part.points))
+    cosines = (turned(motion, part.normals) * target.surface.normals[rows]).sum(-1)
+    return Match(far, cosines, unlike(part.colors, target.surface.colors[rows]))
+
+
 def agrees(
     motion: Float[np.ndarray, "4 4"], part: Surface, target: Target, near: float, color: float
 ) -> Bool[np.ndarray, "n"]:
@@ -184,6 +212,5 @@ def agrees(
         near: distance that counts, metres.
         color: how unlike colours may be, 0 to 1.
     """
-    far, rows = target.nearest(moved(motion, part.points))
-    same_way = (turned(motion, part.normals) * target.surface.normals[rows]).sum(-1) > _SAME_WAY
-    return (far < near) & same_way & (unlike(part.colors, target.surface.colors[rows]) < color)
+    match = matched(motion, part, target)
+    return (match.far < near) & (match.cosines > SAME_WAY) & (match.unlike < color)

@@ -10,15 +10,17 @@ from scipy.spatial import cKDTree
 
 from gsjax.methods.parts.states.labels import connections, costs_of, labels_of
 from gsjax.methods.parts.states.registration import (
+    SAME_WAY,
     Target,
     agrees,
     axes_of,
     guesses,
+    matched,
     moved,
     registered,
     turned,
 )
-from gsjax.methods.parts.states.surfaces import Surface, evidence, pixel_width, surface_of, unlike
+from gsjax.methods.parts.states.surfaces import Surface, evidence, pixel_width, surface_of
 from gsjax.scene.frame import Frame
 
 _SPACING = 1.5  # pixels between the points of a surface
@@ -74,11 +76,12 @@ def states_of(before: Frame, after: Frame, seed: int = 0) -> States:
         )
     ends = np.concatenate([first.points[gone], second.points[come]])
     low, high = ends.min(0) - _REACH * pixel, ends.max(0) + _REACH * pixel
+    size = float(np.max(high - low))
     anywhere, new = Target(second, pixel, low, high), Target(second.of(come), pixel, low, high)
     lost = first.of(gone)
     some = lost.of(random.permutation(len(lost.points))[:_MANY])
-    candidates = _candidates(lost, anywhere, new, float(np.max(high - low)), pixel, random)
-    motions = _explaining(candidates, some, anywhere, new, after, float(np.max(high - low)), pixel)
+    candidates = _candidates(lost, anywhere, new, size, pixel, random)
+    motions = _explaining(candidates, some, anywhere, new, after, size, pixel)
     if not motions:
         raise ValueError(
             "frames: expected parts that moved rigidly between two states, found no motion that explains "
@@ -130,13 +133,11 @@ def _candidates(
         )
         mixed = random.permutation(len(rows))
         few, part = piece.of(mixed[:_FEW]), piece.of(mixed[:_SOME])
-        far, there = new.nearest(moved(tried, few.points))
-        same_way = (turned(tried, few.normals) * new.surface.normals[there]).sum(-1) > 0.6
-        same_way &= unlike(few.colors, new.surface.colors[there]) < _COLOR
-        costs = np.where(same_way, np.minimum(far / (_REACH * pixel), 1), 1).mean(-1)
-        for guess in tried[
-            _best_apart(costs, moved(tried, few.points[:: len(few.points) // 8 + 1]), _REACH * pixel)
-        ]:
+        match = matched(tried, few, new)
+        alike = (match.cosines > SAME_WAY) & (match.unlike < _COLOR)
+        costs = np.where(alike, np.minimum(match.far / (_REACH * pixel), 1), 1).mean(-1)
+        places = moved(tried, few.points[:: len(few.points) // 8 + 1])
+        for guess in tried[_best_apart(costs, places, _REACH * pixel)]:
             found.append(registered(guess, part, anywhere, _REACH * pixel, _TOLERANCE * pixel))
     return found
 

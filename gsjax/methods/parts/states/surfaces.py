@@ -17,6 +17,7 @@ _LEAST_FACING = 0.25  # cosine of the angle of sight below which depth says litt
 _STEEPEST = 6.0  # pixels between the points of neighbouring pixels, above which there is an edge
 _FACES = 0.2  # cosine of the angle of sight below which a point is not judged
 _APART = 0.5  # spacings by which the two sides of a thin plate are kept apart
+_ROOM = 4096  # points are judged in multiples of it, so that few shapes are compiled
 
 
 class Surface(NamedTuple):
@@ -118,14 +119,11 @@ def evidence(
         frame: all cameras, with depth, 0 where unknown.
         tolerance: difference in depth that counts as the same, metres.
     """
-    size = -(-len(points) // _ROOM) * _ROOM  # few shapes, each of which is compiled
+    size = -(-len(points) // _ROOM) * _ROOM
     room = ((0, size - len(points)), (0, 0))
     given = [None if a is None else np.pad(a, room).astype(np.float32) for a in (points, normals)]
     counts = _evidence(*given, frame.depths, frame.cameras.viewmat, frame.cameras.K, jnp.float32(tolerance))
     return Evidence(*(np.asarray(count)[: len(points)] for count in counts))
-
-
-_ROOM = 4096
 
 
 @host_jit
