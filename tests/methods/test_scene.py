@@ -89,7 +89,7 @@ def test_objects_of_a_few_gaussians_are_told_of(table):
     _, frames, mask = table()
     coarse = TrackConfig(start=StartConfig(iterations=0, object_pixels=60.0))
     with pytest.warns(
-        UserWarning, match=r"object \d has \d+.*expected 12 or more; set --track.start.object-pixels"
+        UserWarning, match=r"object \d has \d+.*expected 12 or more; lower start.object_pixels"
     ):
         start_scene(frames[0], mask, 0, coarse)
     with warnings.catch_warnings():
