@@ -51,7 +51,7 @@ def costs_of(
         spacing: between the points, metres.
     """
     said = evidence(moved(motion, surface.points), turned(motion, surface.normals), frame, 4 / 3 * spacing)
-    match = matched(motion, surface, target)
+    match = matched(motion, surface, target, spacing)
     fits = (match.far < spacing) & (match.cosines > _SAME_WAY)
     off = match.unlike / _SAME_COLOR
     cost = np.where(fits, 0.5 * _UNKNOWN * np.minimum(off, 1), _UNKNOWN)

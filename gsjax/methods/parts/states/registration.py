@@ -22,6 +22,9 @@ _CLOSER = 0.75  # by which the reach falls from round to round
 _PURE = 0.01  # weight of not sliding along the axis of a turn, relative to the points ...
 _PULLED = 0.3  # ... and the longest slide that it counts, in reaches
 _TURNS_AT_ALL = 0.05  # radians
+_DARK, _LIT = 0.02, np.log(2.5)  # brightness that tells nothing; by how much light may change
+_CONTRAST = 0.1  # difference in brightness that pulls as much as the reach
+_TELLING = 8  # points that tell how a side is lit
 
 
 class Target:
@@ -38,6 +41,8 @@ class Target:
     ):
         cell = max(cell, float(np.prod(high - low) / _MOST_CELLS) ** (1 / 3))
         self.surface, self._cell, self._low = surface, cell, low - _BORDER * cell
+        ends = surface.outward.any(-1)
+        self.edges = Target(surface.of(ends), cell, low, high) if ends.any() and not ends.all() else None
         shape = np.ceil((high - low) / cell).astype(int) + 2 * _BORDER
         rows = np.full(shape, -1, np.int32)
         places = ((surface.points - self._low) / cell).astype(int)
@@ -144,26 +149,26 @@ def registered(
         least: the same in the last ones.
         rounds: number of rounds.
     """
+    edges = part.of(part.outward.any(-1))
     for k in range(rounds):
         near = max(reach * _CLOSER**k, least)
-        at, facing = moved(motion, part.points), turned(motion, part.normals)
-        far, rows = target.nearest(at)
-        normals = target.surface.normals[rows]
-        counts = (far < near) & ((facing * normals).sum(-1) > SAME_WAY)
-        if counts.sum() < 6:
+        pulls = [_pulled_flat(motion, part, target, near)]
+        if len(pulls[0].at) < 6:
             return motion
-        at, there, normals = at[counts], target.surface.points[rows[counts]], normals[counts]
+        pulls.append(_pulled_by_color(motion, part, target, near))
+        if target.edges is not None:
+            pulls.append(_pulled_by_edges(motion, edges, target.edges, near))
+        at, along, gaps = (np.concatenate(values) for values in zip(*pulls, strict=True))
         middle = at.mean(0)
-        gaps = ((there - at) * normals).sum(-1)
         weights = 1 / (1 + (gaps / (0.3 * near)) ** 2) ** 2
-        slopes = np.concatenate([np.cross(at - middle, normals), normals], -1)
+        slopes = np.concatenate([np.cross(at - middle, along), along], -1)
         curvature, slope = (slopes * weights[:, None]).T @ slopes, (slopes * weights[:, None]).T @ gaps
         turn = Rotation.from_matrix(motion[:3, :3]).as_rotvec()
         if (angle := np.linalg.norm(turn)) > _TURNS_AT_ALL:
-            along = np.concatenate([np.zeros(3), turn / angle])
-            slid = np.clip(motion[:3, 3] @ along[3:], -_PULLED * near, _PULLED * near)
-            curvature += _PURE * len(at) * np.outer(along, along)
-            slope -= _PURE * len(at) * slid * along
+            axis = np.concatenate([np.zeros(3), turn / angle])
+            slid = np.clip(motion[:3, 3] @ axis[3:], -_PULLED * near, _PULLED * near)
+            curvature += _PURE * len(at) * np.outer(axis, axis)
+            slope -= _PURE * len(at) * slid * axis
         damped = curvature + np.diag(1e-5 * np.diag(curvature) + 1e-9 * np.trace(curvature))
         step = np.linalg.solve(damped, slope)
         change = np.eye(4)
@@ -171,6 +176,49 @@ def registered(
         change[:3, 3] = middle + step[3:] - change[:3, :3] @ middle
         motion = change @ motion
     return motion
+
+
+class _Pull(NamedTuple):
+    """Where points are pulled, in which direction, and how far: metres, or as much as metres."""
+
+    at: Float[np.ndarray, "m 3"]
+    along: Float[np.ndarray, "m 3"]
+    gaps: Float[np.ndarray, "m"]
+
+
+def _pulled_flat(motion, part: Surface, target: Target, near: float) -> _Pull:
+    """Points to the plane of the surface."""
+    at, rows, counts = _pairs(motion, part, target, near)
+    normals = target.surface.normals[rows]
+    return _Pull(at[counts], normals[counts], ((target.surface.points[rows] - at) * normals).sum(-1)[counts])
+
+
+def _pulled_by_edges(motion, edges: Surface, target: Target, near: float) -> _Pull:
+    """Edges, along the surface, to edges."""
+    at, rows, counts = _pairs(motion, edges, target, near)
+    outward = target.surface.outward[rows]
+    counts &= (turned(motion, edges.outward) * outward).sum(-1) > SAME_WAY
+    return _Pull(at[counts], outward[counts], ((target.surface.points[rows] - at) * outward).sum(-1)[counts])
+
+
+def _pulled_by_color(motion, part: Surface, target: Target, near: float) -> _Pull:
+    """Points, along the surface, to where it is as bright as they are (Park et al. 2017)."""
+    at, rows, counts = _pairs(motion, part, target, near)
+    surface, scale = target.surface, near / _CONTRAST
+    slope = surface.slope[rows]
+    bright = part.brightness * _relit(part, surface.brightness[rows], counts)
+    gaps = bright - surface.brightness[rows] - (slope * (at - surface.points[rows])).sum(-1)
+    return _Pull(at[counts], scale * slope[counts], scale * gaps[counts])
+
+
+def _pairs(
+    motion, part: Surface, target: Target, near: float
+) -> tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, "n"], Bool[np.ndarray, "n"]]:
+    """Points after a motion, the rows of the surface nearest to them, and whether the two may be one."""
+    at = moved(motion, part.points)
+    far, rows = target.nearest(at)
+    same = (turned(motion, part.normals) * target.surface.normals[rows]).sum(-1) > SAME_WAY
+    return at, rows, (far < near) & same
 
 
 class Match(NamedTuple):
@@ -187,23 +235,55 @@ class Match(NamedTuple):
     unlike: Float[np.ndarray, "*k n"]
 
 
-def matched(motion: Float[np.ndarray, "*k 4 4"], part: Surface, target: Target) -> Match:
-    """How the points of a part match a surface, after one motion or each of many.
+def matched(motion: Float[np.ndarray, "*k 4 4"], part: Surface, target: Target, near: float) -> Match:
+    """How the points of a part match a surface, after one motion or each of many. What turns is lit
+    otherwise: colours are compared after each side of the part is made as bright as what it matches.
 
     Args:
         motion: the motions.
         part: before them.
         target: the surface after them.
+        near: distance of the points that tell how a side is lit, metres.
     """
     far, rows = target.nearest(moved(motion, part.points))
     cosines = (turned(motion, part.normals) * target.surface.normals[rows]).sum(-1)
-    return Match(far, cosines, unlike(part.colors, target.surface.colors[rows]))
+    tells = (far < near) & (cosines > SAME_WAY)
+    lit = _relit(part, target.surface.brightness[rows], tells)
+    return Match(far, cosines, unlike(part.colors * lit[..., None], target.surface.colors[rows]))
 
 
-def agrees(
+def _relit(
+    part: Surface, brightness: Float[np.ndarray, "*k n"], tells: Bool[np.ndarray, "*k n"]
+) -> Float[np.ndarray, "*k n"]:
+    """How many times as bright each point of a part is to be, by what the points of its side match.
+
+    Args:
+        part: the points.
+        brightness: of what each matches.
+        tells: whether it does.
+    """
+    brighter = np.log((brightness + _DARK) / (part.brightness + _DARK))
+    side, times = _side(part.normals), np.ones(brighter.shape)
+    for k in np.unique(side):
+        mine = side == k
+        known = np.where(tells[..., mine], brighter[..., mine], np.nan)
+        enough = tells[..., mine].sum(-1, keepdims=True) >= _TELLING
+        middle = np.nanmedian(np.where(enough, known, 0), axis=-1, keepdims=True)
+        times[..., mine] = np.exp(np.clip(middle, -_LIT, _LIT))
+    return times
+
+
+def _side(normals: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, "n"]:
+    """The side of a part that each point is on, 0 to 5, by its normal."""
+    largest = np.abs(normals).argmax(-1)
+    return 2 * largest + (np.take_along_axis(normals, largest[:, None], -1)[:, 0] > 0)
+
+
+def likeness(
     motion: Float[np.ndarray, "4 4"], part: Surface, target: Target, near: float, color: float
-) -> Bool[np.ndarray, "n"]:
-    """The points of a part that a motion brings onto a surface of their normal and colour.
+) -> Float[np.ndarray, "n"]:
+    """How well the points of a part agree with the surface that a motion brings them onto, 0 to 1: in place,
+    normal and colour.
 
     Args:
         motion: the motion.
@@ -212,5 +292,6 @@ def agrees(
         near: distance that counts, metres.
         color: how unlike colours may be, 0 to 1.
     """
-    match = matched(motion, part, target)
-    return (match.far < near) & (match.cosines > SAME_WAY) & (match.unlike < color)
+    match = matched(motion, part, target, near)
+    fits = (match.far < near) & (match.cosines > SAME_WAY)
+    return fits * np.maximum(1 - match.unlike / color, 0)

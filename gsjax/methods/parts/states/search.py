@@ -1,5 +1,6 @@
 """The motions that together explain what is gone from where it was: guessed by pieces, judged by all."""
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -12,9 +13,9 @@ from gsjax.methods.parts.states.labels import connections, costs_of, labels_of
 from gsjax.methods.parts.states.registration import (
     SAME_WAY,
     Target,
-    agrees,
     axes_of,
     guesses,
+    likeness,
     matched,
     moved,
     registered,
@@ -37,6 +38,8 @@ _BLOCKED = 0.3  # share of the cameras that may see through where a point is to 
 _EXPLAINS = 0.02  # least share of what is gone that a motion must explain
 _FAR_COSTS = 0.6  # share of its gain that a motion as far as the scene is large loses
 _MOST_MOTIONS = 30
+_BESIDE = -8, -4, 4, 8  # pixels beside a motion from which a better one is looked for ...
+_TIMES_BESIDE = 3  # ... and from that again
 _ROUNDS = 2  # of labels and motions in turn
 _NEEDED, _LEAST_PART = 0.15, 100  # by how much worse, and how many, points would fit without a motion
 
@@ -133,7 +136,7 @@ def _candidates(
         )
         mixed = random.permutation(len(rows))
         few, part = piece.of(mixed[:_FEW]), piece.of(mixed[:_SOME])
-        match = matched(tried, few, new)
+        match = matched(tried, few, new, _REACH * pixel)
         alike = (match.cosines > SAME_WAY) & (match.unlike < _COLOR)
         costs = np.where(alike, np.minimum(match.far / (_REACH * pixel), 1), 1).mean(-1)
         places = moved(tried, few.points[:: len(few.points) // 8 + 1])
@@ -171,38 +174,60 @@ def _explaining(
     """The motions that explain most of what is gone, one after the other, each by points and by places that
     those before have not used; of motions that explain as much, the shorter."""
 
-    def explained(motion: Float[np.ndarray, "4 4"]) -> Bool[np.ndarray, "n"]:
-        fits = agrees(motion, some, anywhere, _SPACING * pixel, _COLOR)
-        fits |= agrees(motion, some, new, _TOLERANCE * pixel, _COLOR)
+    def explained(motion: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "n"]:
+        fits = likeness(motion, some, anywhere, _SPACING * pixel, _COLOR)
+        fits = np.maximum(fits, likeness(motion, some, new, _TOLERANCE * pixel, _COLOR))
         if fits.mean() < _EXPLAINS:
             return np.zeros_like(fits)
         said = evidence(moved(motion, some.points), turned(motion, some.normals), after, _TOLERANCE * pixel)
-        return fits & (said.share <= _BLOCKED)
+        return fits * (said.share <= _BLOCKED)
 
     explains = np.array([explained(motion) for motion in candidates]).reshape(len(candidates), -1)
     candidates = [motion for motion, mine in zip(candidates, explains, strict=True) if mine.any()]
     explains = explains[explains.any(1)]
     places = [new.nearest(moved(motion, some.points))[1] for motion in candidates]
     ways = [
-        np.linalg.norm(moved(motion, some.points[mine]) - some.points[mine], axis=-1).mean() / size
+        np.linalg.norm(moved(motion, some.points[mine > 0]) - some.points[mine > 0], axis=-1).mean() / size
         for motion, mine in zip(candidates, explains, strict=True)
     ]
     worth = 1 - _FAR_COSTS * np.minimum(np.array(ways), 1)
     known, used, motions = np.zeros(len(some.points), bool), np.zeros(len(new.surface.points), bool), []
     while len(candidates) and len(motions) < _MOST_MOTIONS:
-        fresh = np.array([mine & ~known & ~used[at] for mine, at in zip(explains, places, strict=True)])
+        fresh = np.array([mine * ~known * ~used[at] for mine, at in zip(explains, places, strict=True)])
         gains = fresh.sum(1) * worth
         best = int(gains.argmax())
         if gains[best] < _EXPLAINS * len(known):
             break
-        mine = explains[best] & ~known
-        motion = registered(candidates[best], some.of(mine), anywhere, 3 * pixel, _SPACING * pixel, 8)
+        mine = (explains[best] > 0) & ~known
+        motion = _beside(candidates[best], some.of(mine), anywhere, lambda m: explained(m)[~known].sum(), pixel)
         motions.append(motion)
-        mine = explained(motion) | explains[best]
+        mine = (explained(motion) > 0) | (explains[best] > 0)
         known |= mine
         there = cKDTree(moved(motion, some.points[mine]))
         used |= there.query(new.surface.points, distance_upper_bound=2 * _SPACING * pixel)[0] < np.inf
     return motions
+
+
+def _beside(
+    motion: Float[np.ndarray, "4 4"],
+    part: Surface,
+    target: Target,
+    score: Callable[[Float[np.ndarray, "4 4"]], float],
+    pixel: float,
+) -> Float[np.ndarray, "4 4"]:
+    """The motion of the best score among those that are found from one, and from places beside it: a plate
+    whose edges are hidden may lie off within its plane."""
+    steps = pixel * np.concatenate([np.zeros((1, 3)), *(way * np.eye(3) for way in _BESIDE)])
+    best, highest = motion, -1.0
+    for _ in range(_TIMES_BESIDE):
+        tried = np.tile(best, (len(steps), 1, 1))
+        tried[:, :3, 3] += steps
+        found = [registered(one, part, target, 3 * pixel, _SPACING * pixel, 8) for one in tried]
+        scores = [score(one) for one in found]
+        if max(scores) <= highest * 1.01:
+            break
+        best, highest = found[int(np.argmax(scores))], max(scores)
+    return best
 
 
 def _labelled(
