@@ -185,7 +185,7 @@ def _guard_of(before: Run, run: Run) -> Guard:
     parameters or constants, or where `between` dropped it."""
     old, new = (jax.tree.leaves((one.params, one.kept)) for one in (before, run))
     is_same = len(old) == len(new) and all(map(operator.is_, old, new))
-    return run.guard if run.guard is not None and is_same else begun(before.guard)
+    return run.guard if run.guard is not None and is_same else begun(run.params, before.guard)
 
 
 @lru_cache(maxsize=4)

@@ -3,7 +3,8 @@ smaller steps from there; and a run ends with the best that it had.
 
 Losses are compared by their mean over a window of steps, and beyond the standard error that they have in the
 best window. It has whole passes over the views, so that each view counts in each; where those would be a
-large part of the run, it has some of the views, in their random order. A stretch is the time during which
+large part of the run, it has some of the views, in their random order. Before the first window, the best are
+the parameters that the stretch began with. A stretch is the time during which
 losses can be compared: it begins anew when parameters or constants are replaced, such as by densification, or
 when a method says that its loss has become another. One shorter than a window, such as a frame of parts, is
 not guarded.
@@ -28,30 +29,40 @@ _TAIL = 20  # steps by which a candidate is confirmed, and of which most must no
 _LOST, _LOST_SIGMA = 0.25, 4.0  # by how much a loss is lost: relative, and in standard errors
 _WORSE, _WORSE_SIGMA = 0.02, 3.0  # by how much it must be worse at the end to go back
 _SMALLER = 0.5
+_FIRST = 5  # losses of which the largest stands for the parameters at the beginning
+_MOST_SKIPPED, _FAR_SMALLER, _LEAST_SHARE = 18, 0.1, 1e-3  # of a tail, to go back at once; and then
 
 
 class Level(eqx.Module):
-    """The losses of a window, and the parameters at its end.
+    """The losses of a window, and the parameters at its end; or the first losses of a stretch, and the
+    parameters that it began with.
 
     Attributes:
-        mean, deviation: mean and standard deviation of the losses.
+        mean: mean of the losses; at the beginning, the largest.
+        deviation: their standard deviation; None at the beginning.
         params: the parameters, copied to the host.
     """
 
     mean: float
-    deviation: float
+    deviation: float | None
     params: PyTree
 
-    def is_exceeded(self, loss: float, count: int, relative: float, sigma: float) -> bool:
-        """Whether a mean or median of losses is larger by a relative and a significant amount.
+    def is_exceeded(
+        self, losses: Float[np.ndarray, "n"], relative: float, sigma: float, statistic=np.mean
+    ) -> bool:
+        """Whether losses are larger by a relative and a significant amount.
 
         Args:
-            loss: the mean or median.
-            count: number of losses.
+            losses: of as many steps; NaN for the ones that were skipped.
             relative: least difference, relative to the level.
             sigma: least difference in standard errors.
+            statistic: what is compared.
         """
-        margin = max(relative * abs(self.mean), sigma * self.deviation * (2 / count) ** 0.5)
+        loss = _of_those_taken(statistic, losses)
+        if self.deviation is None:
+            margin = max(_LOST * abs(self.mean), _LOST_SIGMA * float(np.nanstd(losses))) if loss < np.inf else 0
+        else:
+            margin = max(relative * abs(self.mean), sigma * self.deviation * (2 / len(losses)) ** 0.5)
         return loss > self.mean + margin
 
 
@@ -60,18 +71,18 @@ class Guard(eqx.Module):
 
     Attributes:
         share: share of each step that is taken; 1 until a return.
+        best: the best window; before the first, the beginning.
         losses: those of the latest steps, at most a window; NaN for the ones that were skipped.
         steps: number of steps in the stretch, or since the last return.
-        best: the best window; None before the first.
         candidate: a better one, until the steps after it confirm its parameters, which no loss has seen.
         returns: number of returns to the best parameters, in all stretches.
         is_settled: whether the parameters at the end of the run are the best rather than the latest.
     """
 
     share: Float[Array, ""]
+    best: Level
     losses: Float[np.ndarray, "n"] = eqx.field(default_factory=lambda: np.zeros(0))
     steps: int = 0
-    best: Level | None = None
     candidate: Level | None = None
     returns: int = 0
     is_settled: bool = False
@@ -88,16 +99,20 @@ class Guard(eqx.Module):
         losses = np.append(self.losses, loss)[-window:]
         guard = replace(self, losses=losses, steps=self.steps + 1, is_settled=False)
         best, candidate = guard.best, guard.candidate
+        if best.deviation is None and guard.steps <= _FIRST and float(guard.share) == 1:
+            best = replace(best, mean=float(np.fmax(best.mean, loss)))
+            guard = replace(guard, best=best)
+        if guard.steps % _TAIL == 0 and np.isnan(losses[-_TAIL:]).sum() >= _MOST_SKIPPED:
+            return guard._returned(params, _FAR_SMALLER)
         if candidate is not None and guard.steps % window == _TAIL:
-            is_confirmed = not candidate.is_exceeded(_median(losses[-_TAIL:]), _TAIL, _LOST, _LOST_SIGMA)
+            is_confirmed = not candidate.is_exceeded(losses[-_TAIL:], _LOST, _LOST_SIGMA, np.median)
             guard = replace(guard, best=candidate if is_confirmed else best, candidate=None)
         if guard.steps % window:
             return guard, params
-        mean = _mean(losses)
-        if best is not None and best.is_exceeded(mean, window, _LOST, _LOST_SIGMA):
-            state = {"share": _SMALLER * self.share, "candidate": None, "returns": self.returns + 1}
-            return replace(guard, losses=np.zeros(0), steps=0, **state), _restored(best)
-        if mean < (np.inf if best is None else best.mean):
+        if guard.best.is_exceeded(losses, _LOST, _LOST_SIGMA):
+            return guard._returned(params, _SMALLER)
+        mean = _of_those_taken(np.mean, losses)
+        if mean < (np.inf if guard.best.deviation is None else guard.best.mean):
             level = Level(mean, float(np.nanstd(losses)), jax.tree.map(np.array, params))
             guard = replace(guard, candidate=level)
         return guard, params
@@ -109,23 +124,34 @@ class Guard(eqx.Module):
         Args:
             params: the latest parameters.
         """
-        best, count = self.best, len(self.losses)
-        if best is None or count < _TAIL:
+        best, tail = self.best, self.losses[-_TAIL:]
+        is_known = len(tail) >= _TAIL or np.isnan(tail).any()
+        if not is_known or not np.isfinite(best.mean):
             return self, params
-        latest = ((_mean(self.losses), count), (_median(self.losses[-_TAIL:]), _TAIL))
-        if any(best.is_exceeded(*some, _WORSE, _WORSE_SIGMA) for some in latest):
+        latest = ((self.losses, np.mean), (tail, np.median))
+        if any(best.is_exceeded(losses, _WORSE, _WORSE_SIGMA, statistic) for losses, statistic in latest):
             settled = replace(self, losses=np.zeros(0), steps=0, candidate=None, is_settled=True)
             return settled, _restored(best)
         return self, params
 
+    def _returned(self, params: PyTree, smaller: float) -> tuple["Guard", PyTree]:
+        """The guard and the parameters after a return, if there is something to return to."""
+        if not np.isfinite(self.best.mean):
+            return self, params
+        share = jnp.maximum(smaller * self.share, _LEAST_SHARE)
+        state = {"share": share, "candidate": None, "returns": self.returns + 1}
+        return replace(self, losses=np.zeros(0), steps=0, **state), _restored(self.best)
 
-def begun(before: Guard | None = None) -> Guard:
+
+def begun(params: PyTree, before: Guard | None = None) -> Guard:
     """The guard at the beginning of a stretch.
 
     Args:
+        params: the parameters.
         before: the guard of the stretch before, whose count of returns goes on.
     """
-    return Guard(jnp.ones((), jnp.float32), returns=0 if before is None else before.returns)
+    best = Level(-np.inf, None, jax.tree.map(np.array, params))
+    return Guard(jnp.ones((), jnp.float32), best, returns=0 if before is None else before.returns)
 
 
 def window_of(total: int, period: int) -> int:
@@ -160,17 +186,8 @@ def _restored(best: Level) -> PyTree:
     return jax.tree.map(jnp.array, best.params)
 
 
-def _mean(losses: Float[np.ndarray, "n"]) -> float:
-    """Mean of losses without those of skipped steps; infinite if these are half of all, or another is not
-    finite."""
-    return _of_those_taken(np.mean, losses)
-
-
-def _median(losses: Float[np.ndarray, "n"]) -> float:
-    """Median of losses, as `_mean`: one view that stands out does not count."""
-    return _of_those_taken(np.median, losses)
-
-
 def _of_those_taken(statistic, losses: Float[np.ndarray, "n"]) -> float:
+    """A statistic of losses without those of skipped steps; infinite if these are half of all, or another is
+    not finite."""
     taken = losses[~np.isnan(losses)]
     return float(statistic(taken)) if 2 * len(taken) > len(losses) else float("inf")
