@@ -356,7 +356,11 @@ def _photographs(root, frames, cloud, background, fisheye: Fisheye) -> Photograp
         key: any(getattr(frame, key) is not None for frame in frames) for key in ("mask", "depth", "split")
     }
     times = np.array([np.nan if frame.time is None else frame.time for frame in frames])
-    moving = np.isfinite(times).all() and np.ptp(times) > 0
+    known = np.isfinite(times)
+    if known.any() and not known.all():
+        without = shortened([frame.name for frame in frames if frame.time is None])
+        message = f"{root}: expected a time of each photograph or of none, found none of {without}"
+        warnings.warn(f"{message}; the times of the others are ignored", DataWarning, stacklevel=3)
     return Photographs(
         name=root.resolve().name,
         names=tuple(frame.name for frame in frames),
@@ -366,7 +370,7 @@ def _photographs(root, frames, cloud, background, fisheye: Fisheye) -> Photograp
         load_image=load_image,
         load_mask=load_mask if has["mask"] or seen.has_edges else None,
         load_depth=load_depth if has["depth"] else None,
-        times=times if moving else None,
+        times=times if known.all() and np.ptp(times) > 0 else None,
         splits=tuple(frame.split or "train" for frame in frames) if has["split"] else None,
         cloud=cloud,
         background=shown_before,

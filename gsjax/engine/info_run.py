@@ -22,6 +22,8 @@ def describe_run(path: Path) -> dict[str, str]:
     else:
         record = read_record(path)
         facts = {"run": f"gsjax {record.kind}, {_ending(record)}"} | _scores(record)
+        if record.metrics is not None and (notes := record.metrics.get("notes")):
+            facts["notes"] = "\n".join(map(str, notes))
         for note in record.notes:
             warnings.warn(note, UserWarning, stacklevel=1)
         if record.evaluation is not None:

@@ -77,6 +77,11 @@ class Notes:
         """Note something for the report without printing it."""
         self._added.append(text)
 
+    def say(self, text: str) -> None:
+        """Note something for the report, and print it."""
+        self.add(text)
+        self._console.print(Text.assemble(("note: ", "bold"), text), soft_wrap=not self._console.is_terminal)
+
     def warn(self, text: str) -> None:
         """Note a warning, and print it unless one of its kind was printed before."""
         kind = re.sub(r"\d+(\.\d+)?", "#", text)

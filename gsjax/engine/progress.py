@@ -21,8 +21,9 @@ from gsjax.engine.drive import COMPILING, Drive, Tick
 from gsjax.engine.ending import ended
 from gsjax.engine.folder import RunFolder
 from gsjax.engine.interrupts import raise_if_interrupted, shielded
-from gsjax.engine.messages import Notes, counted
+from gsjax.engine.messages import Notes, counted, reason
 from gsjax.engine.saving import Saver
+from gsjax.engine.streams import say_error
 from gsjax.io.atomic import atomic_write
 from gsjax.io.checkpoints import CheckpointError, load_checkpoint, save_checkpoint
 from gsjax.optim.method import Run
@@ -194,6 +195,11 @@ def watch(
                 save(last=False)
                 raise_if_interrupted()
         except (KeyboardInterrupt, Exception) as stopped:
+            if isinstance(stopped, KeyboardInterrupt):
+                say_error(
+                    f"by {reason(stopped)} after {ticks.run.step:,} of {schedule.total:,} steps",
+                    word="stopped",
+                )
             if any(leaf.is_deleted() for leaf in jax.tree.leaves(ticks.run) if isinstance(leaf, jax.Array)):
                 raise  # a failed step has consumed the run; --resume has an earlier one
             progress.stopped = stopped
@@ -223,7 +229,10 @@ def note_if_cut_short(progress: Progress, schedule: Schedule, steps: int, notes:
 def warn_of_mishaps(progress: Progress, notes: Notes) -> None:
     """Warn of steps that changed nothing, because a number was not finite, and of returns."""
     if progress.skipped:
-        notes.warn(f"{counted(progress.skipped, 'step')} produced non-finite numbers and changed nothing")
+        notes.warn(
+            f"{counted(progress.skipped, 'step')} produced non-finite numbers and changed nothing; if they "
+            "are many, try lower learning rates"
+        )
     warn_of_returns(progress, notes)
 
 

@@ -60,7 +60,9 @@ class Level(eqx.Module):
         """
         loss = _of_those_taken(statistic, losses)
         if self.deviation is None:
-            margin = max(_LOST * abs(self.mean), _LOST_SIGMA * float(np.nanstd(losses))) if loss < np.inf else 0
+            margin = (
+                max(_LOST * abs(self.mean), _LOST_SIGMA * float(np.nanstd(losses))) if loss < np.inf else 0
+            )
         else:
             margin = max(relative * abs(self.mean), sigma * self.deviation * (2 / len(losses)) ** 0.5)
         return loss > self.mean + margin

@@ -221,7 +221,10 @@ def _split(sequence: Sequence, every: int, notes: Notes) -> tuple[list[int], lis
         return [i for i in range(count) if i not in test], test
     train, test = (some.tolist() for some in found)
     if not train:
-        raise ValueError(f"{sequence.name}: expected frames of its split train, found none; see --frames")
+        raise ValueError(
+            f"{sequence.name}: expected photographs of its split train, found none; is transforms_train.json "
+            "there, with its pictures, and does --frames take any of them?"
+        )
     unused = count - len(train) - len(test)
     notes.add(
         f"The data's own split is used: {counted(len(train), 'frame')} of train learned, {len(test)} held out"

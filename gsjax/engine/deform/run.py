@@ -163,9 +163,17 @@ def run(options: Options, by_preset: Callable[[str], Options]) -> int:
 def _warn_of_oddities(progress: Progress, judged: Mapping[str, Any], notes: Notes) -> None:
     """Warns of skipped steps, and of a scene that hardly learned motion or classes."""
     warn_of_mishaps(progress, notes)
+    if progress.stopped is not None:
+        return
     tracks = judged["tracks"]
     if tracks is not None and tracks["median_mm"] > _HARDLY * tracks["still_median_mm"]:
-        notes.warn("tracks are hardly better than those of a static scene; try more --deform.iterations")
+        off, still = tracks["median_mm"], tracks["still_median_mm"]
+        how = "worse" if off > still else "hardly better"
+        went_wrong = progress.skipped or progress.returns
+        do = "lower learning rates (--deform.rates)" if went_wrong else "more --deform.iterations"
+        notes.warn(
+            f"tracks are {how} than those of a static scene (median {off:.3g} and {still:.3g} mm); try {do}"
+        )
     unlike = [f"{one['class']} {one['iou']:.2f}" for one in judged["classes"] if one["iou"] < _UNLIKE]
     if unlike:
         notes.warn(
@@ -181,6 +189,11 @@ def _recording(options: Options, notes: Notes) -> tuple[Sequence, DepthSource]:
     if is_photographs(options.dataset) and not is_recording(options.dataset):
         photographs = open_photographs(options.dataset, options.read)
         notes.add(_of_photographs(photographs, whole.viewmats[0, 0]))
+        if photographs.times is None and photographs.splits is not None:
+            notes.warn(
+                f"{whole.name}: its photographs have splits but no times: the order of their files, split "
+                'after split, is taken for time; give each frame of its transforms a "time"'
+            )
     for flag, camera in (("--cameras", options.cameras), ("--eval-cameras", options.eval_cameras)):
         if camera and camera[0] not in whole.camera_ids:
             known = list(whole.camera_ids)
@@ -199,7 +212,10 @@ def _recording(options: Options, notes: Notes) -> tuple[Sequence, DepthSource]:
 def _of_photographs(photographs: Photographs, facing: Float[np.ndarray, "4 4"]) -> str:
     """The note on their order, and on the unit of lengths by their points; `facing` is the first view
     matrix."""
-    words = f"{photographs.num} photographs are used as frames, in their order."
+    order = (
+        "that of their files, as they have no times" if photographs.times is None else "that of their times"
+    )
+    words = f"{photographs.num} photographs are used as frames; their order is {order}."
     if photographs.cloud is None or not len(photographs.cloud.points):
         return words
     away = float(np.median(photographs.cloud.points @ facing[2, :3] + facing[2, 3]))

@@ -296,11 +296,11 @@ def _note_what_was_lost(
         if len(lost):
             last = "the end" if to_the_end else str(lost[-1])
             between = f"between {lost[0]} and {last}" if len(lost) > 1 or to_the_end else f"number {lost[0]}"
-            notes.add(f"{names[label]}: lost in {counted(len(lost), 'frame')}, {between}.")
+            notes.say(f"{names[label]}: lost in {counted(len(lost), 'frame')}, {between}.")
         unknown = turn_unknown_from(tracking, values, label)
         if unknown is not None and not to_the_end:
             why = "it was lost then" if unknown in lost else "other rotations agree as well"
-            notes.add(f"{names[label]}: its rotation is unknown from frame {unknown} on: {why}.")
+            notes.say(f"{names[label]}: its rotation is unknown from frame {unknown} on: {why}.")
     for label in sorted({*groups.tolist()}):
         frames = unseen[groups == label].max()
         if frames:

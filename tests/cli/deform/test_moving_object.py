@@ -11,7 +11,7 @@ import yaml
 from rich.console import Console
 
 import gsjax as gs
-from gsjax.data import DataError, open_sequence, photographs_of
+from gsjax.data import DataError, DataWarning, open_sequence, photographs_of
 from gsjax.data.ordered import open_as_sequence
 from gsjax.engine.deform.data import deform_data
 from gsjax.engine.deform.depth import with_depth
@@ -86,8 +86,24 @@ def test_the_data_says_what_is_held_out(sequence):
     assert read(sequence, every=0)[0].test == data.test  # as for gsjax fit, the data's split comes first
     no_test = sequence.select([t for t, split in enumerate(sequence.splits) if split != "test"])
     assert {no_test.splits[t] for t in read(no_test)[0].test} == {"val"}
-    with pytest.raises(ValueError, match="expected frames of its split train, found none; see --frames"):
+    with pytest.raises(ValueError, match="expected photographs of its split train, found none"):
         read(sequence.select([1, 2]))
+
+
+def test_times_that_are_missing_are_told_of(gsjax, tmp_path):
+    """The order of the files, test after train, was taken for time without a word."""
+    write_dnerf(tmp_path / "things", SIZE, {"train": 4, "val": 1, "test": 2})
+    path = tmp_path / "things" / "transforms_train.json"
+    meta = json.loads(path.read_text())
+    del meta["frames"][1]["time"]
+    path.write_text(json.dumps(meta))
+    with pytest.warns(
+        DataWarning, match="expected a time of each photograph or of none, found none of .*001"
+    ):
+        assert gs.open_photographs(tmp_path / "things").times is None
+    code, said = gsjax("deform", tmp_path / "things", "--out", tmp_path / "run", *SMALL)
+    assert code == 0, said
+    assert "its photographs have splits but no times: the order of their files" in said
 
 
 def test_the_scene_starts_within_what_most_frames_show(sequence, data):

@@ -66,7 +66,10 @@ def test_a_log_says_when_a_later_step_compiles(tmp_path):
     ]
     notes = Notes(Console(quiet=True))
     warn_of_mishaps(progress, notes)
-    assert notes.all == ["Warning: 1 step produced non-finite numbers and changed nothing"]
+    assert notes.all == [
+        "Warning: 1 step produced non-finite numbers and changed nothing; if they are many, try lower "
+        "learning rates"
+    ]
 
 
 def test_a_loss_that_is_lost_is_mended_counted_and_told(tmp_path):

@@ -142,7 +142,12 @@ def test_the_terminal_shows_what_the_report_does(capsys, tmp_path):
     )
     print_summary(summary, tmp_path / "report.html")
     lines = [" ".join(line.split()) for line in capsys.readouterr().out.splitlines()]
-    expected = ["cup 1.23", "box –", "update rate 18.24 Hz", "partial run; continue with --resume"]
+    expected = [
+        "cup 1.23",
+        "box –",
+        "update rate 18.24 Hz",
+        "partial run; the same command with --resume continues it",
+    ]
     assert [line for line in lines if line in expected] == expected
     assert {"view it gsjax view RUN", f"report {tmp_path / 'report.html'}"} <= {*lines}
     assert "A note." not in lines

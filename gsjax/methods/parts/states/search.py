@@ -198,8 +198,12 @@ def _explaining(
         best = int(gains.argmax())
         if gains[best] < _EXPLAINS * len(known):
             break
-        mine = (explains[best] > 0) & ~known
-        motion = _beside(candidates[best], some.of(mine), anywhere, lambda m: explained(m)[~known].sum(), pixel)
+        mine, left = (explains[best] > 0) & ~known, ~known
+
+        def score(motion: Float[np.ndarray, "4 4"], left: Bool[np.ndarray, "n"] = left) -> float:
+            return float(explained(motion)[left].sum())
+
+        motion = _beside(candidates[best], some.of(mine), anywhere, score, pixel)
         motions.append(motion)
         mine = (explained(motion) > 0) | (explains[best] > 0)
         known |= mine
