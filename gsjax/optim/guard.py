@@ -73,21 +73,28 @@ class Guard(eqx.Module):
 
     Attributes:
         share: share of each step that is taken; 1 until a return.
-        best: the best window; before the first, the beginning.
+        beginning: of the stretch; its parameters are dropped once there is a best window.
         losses: those of the latest steps, at most a window; NaN for the ones that were skipped.
         steps: number of steps in the stretch, or since the last return.
+        best: the best window; None before the first.
         candidate: a better one, until the steps after it confirm its parameters, which no loss has seen.
         returns: number of returns to the best parameters, in all stretches.
         is_settled: whether the parameters at the end of the run are the best rather than the latest.
     """
 
     share: Float[Array, ""]
-    best: Level
+    beginning: Level
     losses: Float[np.ndarray, "n"] = eqx.field(default_factory=lambda: np.zeros(0))
     steps: int = 0
+    best: Level | None = None
     candidate: Level | None = None
     returns: int = 0
     is_settled: bool = False
+
+    @property
+    def level(self) -> Level:
+        """What the run goes back to: the best window or, before the first, the beginning."""
+        return self.beginning if self.best is None else self.best
 
     def watched(self, loss: float, params: PyTree, window: int) -> tuple["Guard", PyTree]:
         """The guard after a step, and the parameters to continue from: those given or, where the loss is
@@ -100,21 +107,23 @@ class Guard(eqx.Module):
         """
         losses = np.append(self.losses, loss)[-window:]
         guard = replace(self, losses=losses, steps=self.steps + 1, is_settled=False)
-        best, candidate = guard.best, guard.candidate
-        if best.deviation is None and guard.steps <= _FIRST and float(guard.share) == 1:
-            best = replace(best, mean=float(np.fmax(best.mean, loss)))
-            guard = replace(guard, best=best)
+        candidate, beginning = guard.candidate, guard.beginning
+        if guard.best is None and guard.steps <= _FIRST and float(guard.share) == 1:
+            beginning = replace(beginning, mean=float(np.fmax(beginning.mean, loss)))
+            guard = replace(guard, beginning=beginning)
         if guard.steps % _TAIL == 0 and np.isnan(losses[-_TAIL:]).sum() >= _MOST_SKIPPED:
             return guard._returned(params, _FAR_SMALLER)
         if candidate is not None and guard.steps % window == _TAIL:
             is_confirmed = not candidate.is_exceeded(losses[-_TAIL:], _LOST, _LOST_SIGMA, np.median)
-            guard = replace(guard, best=candidate if is_confirmed else best, candidate=None)
+            guard = replace(guard, candidate=None)
+            if is_confirmed:
+                guard = replace(guard, best=candidate, beginning=replace(beginning, params=None))
         if guard.steps % window:
             return guard, params
-        if guard.best.is_exceeded(losses, _LOST, _LOST_SIGMA):
+        if guard.level.is_exceeded(losses, _LOST, _LOST_SIGMA):
             return guard._returned(params, _SMALLER)
         mean = _of_those_taken(np.mean, losses)
-        if mean < (np.inf if guard.best.deviation is None else guard.best.mean):
+        if mean < (np.inf if guard.best is None else guard.best.mean):
             level = Level(mean, float(np.nanstd(losses)), jax.tree.map(np.array, params))
             guard = replace(guard, candidate=level)
         return guard, params
@@ -126,23 +135,23 @@ class Guard(eqx.Module):
         Args:
             params: the latest parameters.
         """
-        best, tail = self.best, self.losses[-_TAIL:]
+        level, tail = self.level, self.losses[-_TAIL:]
         is_known = len(tail) >= _TAIL or np.isnan(tail).any()
-        if not is_known or not np.isfinite(best.mean):
+        if not is_known or not np.isfinite(level.mean):
             return self, params
         latest = ((self.losses, np.mean), (tail, np.median))
-        if any(best.is_exceeded(losses, _WORSE, _WORSE_SIGMA, statistic) for losses, statistic in latest):
+        if any(level.is_exceeded(losses, _WORSE, _WORSE_SIGMA, statistic) for losses, statistic in latest):
             settled = replace(self, losses=np.zeros(0), steps=0, candidate=None, is_settled=True)
-            return settled, _restored(best)
+            return settled, _restored(level)
         return self, params
 
     def _returned(self, params: PyTree, smaller: float) -> tuple["Guard", PyTree]:
         """The guard and the parameters after a return, if there is something to return to."""
-        if not np.isfinite(self.best.mean):
+        if not np.isfinite(self.level.mean):
             return self, params
         share = jnp.maximum(smaller * self.share, _LEAST_SHARE)
         state = {"share": share, "candidate": None, "returns": self.returns + 1}
-        return replace(self, losses=np.zeros(0), steps=0, **state), _restored(self.best)
+        return replace(self, losses=np.zeros(0), steps=0, **state), _restored(self.level)
 
 
 def begun(params: PyTree, before: Guard | None = None) -> Guard:
@@ -152,8 +161,8 @@ def begun(params: PyTree, before: Guard | None = None) -> Guard:
         params: the parameters.
         before: the guard of the stretch before, whose count of returns goes on.
     """
-    best = Level(-np.inf, None, jax.tree.map(np.array, params))
-    return Guard(jnp.ones((), jnp.float32), best, returns=0 if before is None else before.returns)
+    beginning = Level(-np.inf, None, jax.tree.map(np.array, params))
+    return Guard(jnp.ones((), jnp.float32), beginning, returns=0 if before is None else before.returns)
 
 
 def window_of(total: int, period: int) -> int:
@@ -184,8 +193,8 @@ def part_of_step(new: PyTree, old: PyTree, share: Float[Array, ""]) -> PyTree:
     return jax.tree.map(of, new, old)
 
 
-def _restored(best: Level) -> PyTree:
-    return jax.tree.map(jnp.array, best.params)
+def _restored(level: Level) -> PyTree:
+    return jax.tree.map(jnp.array, level.params)
 
 
 def _of_those_taken(statistic, losses: Float[np.ndarray, "n"]) -> float:
