@@ -31,15 +31,15 @@ carried = jax.jit(carry)
 BRIEF = replace(CONFIG, iterations=3)
 
 
-def of_three(points, center):
-    """(points, centres) of three groups that are alike."""
-    return jax.tree.map(lambda a: np.stack([a] * 3), (points, center))
+def of_several(points, center, count=3):
+    """(points, centres) of groups that are alike."""
+    return jax.tree.map(lambda a: np.stack([a] * count), (points, center))
 
 
 def search_one(points, center, images, config=BRIEF, everywhere=1) -> SearchResult:
     """A search of one group from standing still, beside two that nobody sees."""
     how = (config, first_watch(jnp.ones(3)), np.array([True, False, False]), np.int32(everywhere))
-    return search(np.zeros((1, 3, 6), np.float32), *of_three(points, center), images, *how)
+    return search(np.zeros((1, 3, 6), np.float32), *of_several(points, center), images, *how)
 
 
 def look(*given):
@@ -172,7 +172,7 @@ def test_one_group_is_relocated_in_the_time_in_which_two_are_turned(jumped):
 
     def tried(everywhere, suspects):
         how = (BRIEF, watch, visible, np.int32(everywhere), np.array(suspects))
-        start = (np.zeros((1, 3, 6), np.float32), *of_three(*given[:2]), given[2])
+        start = (np.zeros((1, 3, 6), np.float32), *of_several(*given[:2]), given[2])
         result = search(*start, *how, nowhere)
         return result.searched.tolist(), result.relocation_tried.tolist()
 
@@ -187,24 +187,24 @@ def test_one_group_is_relocated_in_the_time_in_which_two_are_turned(jumped):
 
 
 def test_groups_that_agree_worst_or_have_waited_longest_are_searched_for_first(jumped):
-    """Three groups jumped alike. Shifts find two of them; what they left is turned first, unless another was
+    """Four groups jumped alike. Shifts find three of them; what they left is turned first, unless another was
     glimpsed elsewhere or has waited for long."""
     *given, shift = jumped
-    visible, first = np.array([True, True, True]), first_watch(jnp.ones(3))
-    unusual = first._replace(usual=np.float32([0.3, 0.1, 0.3]))
+    visible, first = np.array([True] * 4), first_watch(jnp.ones(4))
+    unusual = first._replace(usual=np.float32([0.3, 0.1, 0.3, 0.3]))
     watches = [
-        (unusual, visible, [2]),
-        (first._replace(waited=np.float32([300.0, 5.0, 0.0])), visible, [0]),
-        (unusual, np.array([True, False, False]), [0]),
-        (unusual._replace(glimpsed=np.array([False, True, False])), visible, [1]),
+        (unusual, visible, [3]),
+        (first._replace(waited=np.float32([300.0, 5.0, 0.0, 0.0])), visible, [0]),
+        (unusual, np.array([True, False, False, False]), [0]),
+        (unusual._replace(glimpsed=np.array([False, True, False, False])), visible, [1]),
     ]
     for watch, there, expected in watches:
         one = (BRIEF, watch, there, np.int32(1))
-        result = search(np.zeros((1, 3, 6), np.float32), *of_three(*given[:2]), given[2], *one)
+        result = search(np.zeros((1, 4, 6), np.float32), *of_several(*given[:2], 4), given[2], *one)
         np.testing.assert_array_equal(np.flatnonzero(result.searched), expected)
         np.testing.assert_array_equal(np.flatnonzero(np.isfinite(result.leads)), expected)
         right = np.linalg.norm(np.asarray(result.estimate.twists)[:, :3] - shift, axis=1) < 1e-3
-        np.testing.assert_array_equal(right, there & [True, True, False])
+        np.testing.assert_array_equal(right, there & [True, True, True, False])
 
 
 @pytest.mark.parametrize("printed", [True, False])

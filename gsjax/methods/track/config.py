@@ -89,7 +89,7 @@ class AlignConfig:
     """Distance between those shifts, metres."""
     everywhere: int | None = 2
     """Groups per frame that are turned to all sides or, if they may be lost, searched for elsewhere (which
-    counts as two), those that agree worst first; None: all. One more is shifted, none with 0."""
+    counts as two), those that agree worst first; None: all. Three times as many are shifted."""
     turns: tuple[float, ...] = (0.2, 0.6)
     """Angles by which the best start is rotated, both ways about each principal axis, radians."""
     max_step: float = 0.1

@@ -29,6 +29,7 @@ from gsjax.methods.track.points import Points, ToneImages
 from gsjax.methods.track.recover import Relocation
 from gsjax.methods.track.watch import JUMPED_FACTOR, MOVED_FACTOR, Estimate, SearchResult, Watch
 
+_SHIFTS = 3  # groups that are shifted for each that is turned, which takes twice as long
 _DOUBT_WEIGHT = 0.5  # urgency of being in doubt, relative to a residual at its usual value
 _WAIT_WEIGHT = 0.05  # urgency of each frame of waiting, relative to a residual at its usual value
 _FIRST_WEIGHT = 1e3  # urgency of what must not wait, likewise
@@ -166,7 +167,7 @@ def follow(
     everywhere: Int[Array, ""],
 ) -> Followed:
     """Each group aligned from the best of its starts, and from shifts of them if it agrees worse than usual:
-    one group more than `everywhere`, the worst first. Arguments as for `search`."""
+    three times as many as `everywhere`, the worst first. Arguments as for `search`."""
     over_starts = jax.vmap(disagreements, in_axes=(0, None, None, None, None))
     best = best_of(over_starts(starts, points, centers, images, config), starts)
     aligned = align_groups(best.twists, points, centers, images, config)
@@ -179,7 +180,7 @@ def follow(
     ratio = first.residuals / watch.usual
     jumped = visible & ~watch.lost & (ratio > JUMPED_FACTOR)
     order = jnp.argsort(-jnp.where(jumped, ratio, 0.0))
-    count = jnp.where(everywhere > 0, jnp.minimum(jumped.sum(), everywhere + 1), 0)
+    count = jnp.minimum(jumped.sum(), _SHIFTS * everywhere)
     shifted = jnp.zeros_like(jumped).at[order].set(jnp.arange(len(order)) < count)
 
     def shift(i, estimate: Estimate) -> Estimate:
