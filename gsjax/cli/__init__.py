@@ -24,7 +24,7 @@ GROUPS = {
         "live": ("gsjax.cli.live", "track objects while frames arrive, at a given rate"),
         "fit": ("gsjax.cli.fit", "fit a static scene to posed photographs"),
         "parts": ("gsjax.cli.parts", "find the parts of a moving scene, and their joints"),
-        "deform": ("gsjax.cli.deform", "reconstruct a deforming scene, such as from an endoscope"),
+        "deform": ("gsjax.cli.deform", "reconstruct a scene that deforms, as one camera sees it"),
     },
     "Distil and query": {
         "distill": ("gsjax.cli.distill", "distil a semantic field for a run or a file"),
