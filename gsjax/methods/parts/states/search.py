@@ -21,7 +21,7 @@ from gsjax.methods.parts.states.registration import (
     registered,
     turned,
 )
-from gsjax.methods.parts.states.surfaces import Surface, evidence, pixel_width, surface_of
+from gsjax.methods.parts.states.surfaces import Evidence, Surface, evidence, pixel_width, surface_of
 from gsjax.scene.frame import Frame
 
 _SPACING = 1.5  # pixels between the points of a surface
@@ -36,6 +36,8 @@ _BEST, _SOME = 30, 1000  # guesses of a piece that are followed, by at most so m
 _COLOR = 0.15  # how unlike colours may be
 _BLOCKED = 0.3  # share of the cameras that may see through where a point is to be
 _EXPLAINS = 0.02  # least share of what is gone that a motion must explain
+_FRESH = 0.25  # least share of what a motion explains that those before it do not, or it repeats them
+_HIDDEN = 0.3  # what explaining a point is worth that another motion brings where no camera sees
 _FAR_COSTS = 0.6  # share of its gain that a motion as far as the scene is large loses
 _MOST_MOTIONS = 30
 _BESIDE = -8, -4, 4, 8  # pixels beside a motion from which a better one is looked for ...
@@ -172,15 +174,18 @@ def _explaining(
     pixel: float,
 ) -> list[Float[np.ndarray, "4 4"]]:
     """The motions that explain most of what is gone, one after the other, each by points and by places that
-    those before have not used; of motions that explain as much, the shorter."""
+    those before have not used; of motions that explain as much, the shorter. What goes where no camera sees
+    is half explained."""
+
+    def said(motion: Float[np.ndarray, "4 4"]) -> Evidence:
+        return evidence(moved(motion, some.points), turned(motion, some.normals), after, _TOLERANCE * pixel)
 
     def explained(motion: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "n"]:
         fits = likeness(motion, some, anywhere, _SPACING * pixel, _COLOR)
         fits = np.maximum(fits, likeness(motion, some, new, _TOLERANCE * pixel, _COLOR))
         if fits.mean() < _EXPLAINS:
             return np.zeros_like(fits)
-        said = evidence(moved(motion, some.points), turned(motion, some.normals), after, _TOLERANCE * pixel)
-        return fits * (said.share <= _BLOCKED)
+        return fits * (said(motion).share <= _BLOCKED)
 
     explains = np.array([explained(motion) for motion in candidates]).reshape(len(candidates), -1)
     candidates = [motion for motion, mine in zip(candidates, explains, strict=True) if mine.any()]
@@ -191,22 +196,24 @@ def _explaining(
         for motion, mine in zip(candidates, explains, strict=True)
     ]
     worth = 1 - _FAR_COSTS * np.minimum(np.array(ways), 1)
-    known, used, motions = np.zeros(len(some.points), bool), np.zeros(len(new.surface.points), bool), []
+    known, hidden = np.zeros((2, len(some.points)), bool)
+    used, motions = np.zeros(len(new.surface.points), bool), []
     while len(candidates) and len(motions) < _MOST_MOTIONS:
-        fresh = np.array([mine * ~known * ~used[at] for mine, at in zip(explains, places, strict=True)])
-        gains = fresh.sum(1) * worth
+        left = ~known * np.where(hidden, _HIDDEN, 1)
+        fresh = np.array([mine * left * ~used[at] for mine, at in zip(explains, places, strict=True)])
+        gains = fresh.sum(1) * worth * (fresh.sum(1) > _FRESH * explains.sum(1))
         best = int(gains.argmax())
         if gains[best] < _EXPLAINS * len(known):
             break
-        mine, left = (explains[best] > 0) & ~known, ~known
+        mine = (explains[best] > 0) & ~known
 
-        def score(motion: Float[np.ndarray, "4 4"], left: Bool[np.ndarray, "n"] = left) -> float:
-            return float(explained(motion)[left].sum())
+        def score(motion: Float[np.ndarray, "4 4"], left: Float[np.ndarray, "n"] = left) -> float:
+            return float((explained(motion) * left).sum())
 
         motion = _beside(candidates[best], some.of(mine), anywhere, score, pixel)
         motions.append(motion)
         mine = (explained(motion) > 0) | (explains[best] > 0)
-        known |= mine
+        known, hidden = known | mine, hidden | ~said(motion).seen
         there = cKDTree(moved(motion, some.points[mine]))
         used |= there.query(new.surface.points, distance_upper_bound=2 * _SPACING * pixel)[0] < np.inf
     return motions
