@@ -21,7 +21,7 @@ from gsjax.methods.parts.states.registration import (
     registered,
     turned,
 )
-from gsjax.methods.parts.states.surfaces import Evidence, Surface, evidence, pixel_width, surface_of
+from gsjax.methods.parts.states.surfaces import Evidence, Surface, evidence, pixel_width, steadied, surface_of
 from gsjax.scene.frame import Frame
 
 _SPACING = 1.5  # pixels between the points of a surface
@@ -71,6 +71,7 @@ def states_of(before: Frame, after: Frame, seed: int = 0) -> States:
     Raises:
         ValueError: nothing has moved, or by no motion that is found.
     """
+    before, after = steadied(before), steadied(after)
     pixel, random = pixel_width(before), np.random.default_rng(seed)
     first, second = (surface_of(frame, _SPACING * pixel) for frame in (before, after))
     gone, come = _seen_through(first, after, pixel), _seen_through(second, before, pixel)

@@ -3,6 +3,8 @@ they see through."""
 
 from typing import NamedTuple
 
+import cv2
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -14,6 +16,10 @@ from gsjax.geometry.neighbors import voxel_thin
 from gsjax.optim.compiler import host_jit
 from gsjax.scene.frame import Frame
 
+_BEND_OF_NOISE = 1.65  # median size of the second difference of three numbers, in standard deviations
+_LEAST_NOISE, _MOST_NOISE = 5e-4, 4.0  # of depth, relative; differences that are noise, in its deviations
+_WIDTH = 3.0  # pixels of the average
+_FAR_AWAY = 50.0  # logarithm of a depth that is like no other
 _LEAST_FACING = 0.25  # cosine of the angle of sight below which depth says little of a normal
 _STEEPEST = 6.0  # pixels between the points of neighbouring pixels, above which there is an edge
 _FACES = 0.2  # cosine of the angle of sight below which a point is not judged
@@ -87,6 +93,24 @@ def pixel_width(frame: Frame) -> float:
     return float(np.median(widths))
 
 
+def steadied(frame: Frame) -> Frame:
+    """A frame whose depth has less noise: where it is measurable, depth is averaged with the depth around it
+    that differs by no more (a bilateral filter).
+
+    Args:
+        frame: all cameras, with depth, 0 where unknown.
+    """
+    depths = np.asarray(frame.depths, np.float32)
+    logs = np.log(np.where(depths > 0, depths, np.nan))
+    bends = np.abs(logs[:, :, 2:] - 2 * logs[:, :, 1:-1] + logs[:, :, :-2])
+    noise = float(np.nanmedian(bends)) / _BEND_OF_NOISE if np.isfinite(bends).any() else 0.0
+    if noise < _LEAST_NOISE:
+        return frame
+    apart = np.nan_to_num(logs, nan=_FAR_AWAY)
+    smooth = np.stack([cv2.bilateralFilter(one, -1, _MOST_NOISE * noise, _WIDTH) for one in apart])
+    return eqx.tree_at(lambda f: f.depths, frame, jnp.asarray(np.where(depths > 0, np.exp(smooth), 0)))
+
+
 def surface_of(frame: Frame, spacing: float) -> Surface:
     """The surfaces that all cameras see, thinned to about one point in `spacing`.
 
@@ -115,16 +139,21 @@ def surface_of(frame: Frame, spacing: float) -> Surface:
     points, normals, colors = (np.concatenate(values) for values in zip(*seen, strict=True))
     rows = voxel_thin(points + _APART * spacing * normals, spacing)
     points, normals = points[rows], normals[rows]
-    return Surface(points, normals, colors[rows], *_around(points, normals, colors[rows], spacing))
+    return Surface(points, normals, colors[rows], *around(points, normals, colors[rows], spacing))
 
 
-def _around(
+def around(
     points: Float[np.ndarray, "n 3"],
     normals: Float[np.ndarray, "n 3"],
     colors: Float[np.ndarray, "n 3"],
     spacing: float,
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n"], Float[np.ndarray, "n 3"]]:
-    """What the points around each tell: which way the surface ends, its brightness, and the slope of that."""
+    """What the points around each tell: `Surface.outward`, `brightness` and `slope`.
+
+    Args:
+        points, normals, colors: of the surface.
+        spacing: between the points, metres.
+    """
     near = cKDTree(points).query(
         points, k=min(_AROUND, len(points)), distance_upper_bound=_WITHIN * spacing, workers=-1
     )[1]
