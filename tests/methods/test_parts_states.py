@@ -77,7 +77,7 @@ def test_backwards_the_motions_are_the_inverse(cabinet):
 
 
 @pytest.mark.parametrize(
-    "parts", ["doors=3&drawers=0&width=240&height=180", "doors=0&drawers=2&width=200&height=150"]
+    "parts", ["doors=3&drawers=0&width=160&height=120", "doors=0&drawers=2&width=200&height=150"]
 )
 def test_parts_that_look_alike_are_not_mistaken_for_each_other(parts):
     """Doors whose edges are hidden between their neighbours; drawers that would fit in each other's place."""

@@ -40,6 +40,7 @@ _FRESH = 0.25  # least share of what a motion explains that those before it do n
 _HIDDEN = 0.3  # what explaining a point is worth that another motion brings where no camera sees
 _FAR_COSTS = 0.6  # share of its gain that a motion as far as the scene is large loses
 _MOST_MOTIONS = 30
+_RIVALS, _RIVAL = 3, 0.5  # motions among which the best is chosen, and their least gain, relative to it
 _BESIDE = -8, -4, 4, 8  # pixels beside a motion from which a better one is looked for ...
 _TIMES_BESIDE = 3  # ... and from that again
 _ROUNDS = 2  # of labels and motions in turn
@@ -188,32 +189,36 @@ def _explaining(
             return np.zeros_like(fits)
         return fits * (said(motion).share <= _BLOCKED)
 
+    def worth(motion: Float[np.ndarray, "4 4"], mine: Bool[np.ndarray, "n"]) -> float:
+        way = np.linalg.norm(moved(motion, some.points[mine]) - some.points[mine], axis=-1).mean()
+        return 1 - _FAR_COSTS * min(way / size, 1)
+
     explains = np.array([explained(motion) for motion in candidates]).reshape(len(candidates), -1)
     candidates = [motion for motion, mine in zip(candidates, explains, strict=True) if mine.any()]
     explains = explains[explains.any(1)]
     places = [new.nearest(moved(motion, some.points))[1] for motion in candidates]
-    ways = [
-        np.linalg.norm(moved(motion, some.points[mine > 0]) - some.points[mine > 0], axis=-1).mean() / size
-        for motion, mine in zip(candidates, explains, strict=True)
-    ]
-    worth = 1 - _FAR_COSTS * np.minimum(np.array(ways), 1)
+    ends = np.array([moved(motion, some.points[:: len(some.points) // 8 + 1]) for motion in candidates])
+    worths = np.array([worth(motion, mine > 0) for motion, mine in zip(candidates, explains, strict=True)])
     known, hidden = np.zeros((2, len(some.points)), bool)
     used, motions = np.zeros(len(new.surface.points), bool), []
     while len(candidates) and len(motions) < _MOST_MOTIONS:
         left = ~known * np.where(hidden, _HIDDEN, 1)
         fresh = np.array([mine * left * ~used[at] for mine, at in zip(explains, places, strict=True)])
-        gains = fresh.sum(1) * worth * (fresh.sum(1) > _FRESH * explains.sum(1))
-        best = int(gains.argmax())
-        if gains[best] < _EXPLAINS * len(known):
+        gains = fresh.sum(1) * worths * (fresh.sum(1) > _FRESH * explains.sum(1))
+        if gains.max() < _EXPLAINS * len(known):
             break
-        mine = (explains[best] > 0) & ~known
 
         def score(motion: Float[np.ndarray, "4 4"], left: Float[np.ndarray, "n"] = left) -> float:
-            return float((explained(motion) * left).sum())
+            mine = explained(motion)
+            return float((mine * left).sum()) * worth(motion, mine > 0) if mine.any() else 0.0
 
-        motion = _beside(candidates[best], some.of(mine), anywhere, score, pixel)
+        best = [k for k in _best_apart(-gains, ends, 4 * pixel)[:_RIVALS] if gains[k] > _RIVAL * gains.max()]
+        tried = [
+            _beside(candidates[k], some.of((explains[k] > 0) & ~known), anywhere, score, pixel) for k in best
+        ]
+        motion = max(tried, key=score)
         motions.append(motion)
-        mine = (explained(motion) > 0) | (explains[best] > 0)
+        mine = explained(motion) > 0
         known, hidden = known | mine, hidden | ~said(motion).seen
         there = cKDTree(moved(motion, some.points[mine]))
         used |= there.query(new.surface.points, distance_upper_bound=2 * _SPACING * pixel)[0] < np.inf
@@ -227,13 +232,14 @@ def _beside(
     score: Callable[[Float[np.ndarray, "4 4"]], float],
     pixel: float,
 ) -> Float[np.ndarray, "4 4"]:
-    """The motion of the best score among those that are found from one, and from places beside it: a plate
-    whose edges are hidden may lie off within its plane."""
-    steps = pixel * np.concatenate([np.zeros((1, 3)), *(way * np.eye(3) for way in _BESIDE)])
+    """The motion of the best score among those that are found from one, and from places beside it along the
+    axes of the part: a plate whose edges are hidden may lie off within its plane."""
+    axes = axes_of(part.normals)
+    steps = pixel * np.concatenate([np.zeros((1, 3)), *(way * axes for way in _BESIDE)])
     best, highest = motion, -1.0
     for _ in range(_TIMES_BESIDE):
         tried = np.tile(best, (len(steps), 1, 1))
-        tried[:, :3, 3] += steps
+        tried[:, :3, 3] += turned(best, steps)
         found = [registered(one, part, target, 3 * pixel, _SPACING * pixel, 8) for one in tried]
         scores = [score(one) for one in found]
         if max(scores) <= highest * 1.01:
