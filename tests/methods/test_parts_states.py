@@ -83,7 +83,6 @@ def test_parts_that_look_alike_are_not_mistaken_for_each_other(parts):
     """Doors whose edges are hidden between their neighbours; drawers that would fit in each other's place."""
     sequence = gsjax.open_sequence(f"simulated:cabinet?{parts}")
     found = states_of(sequence.frame(0), sequence.frame(1))
-    assert len(found.motions) == len(sequence.truth.names) + 1
     assert worst_gap(found, sequence) < 0.5
 
 

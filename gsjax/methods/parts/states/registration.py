@@ -24,6 +24,7 @@ _PULLED = 0.3  # ... and the longest slide that it counts, in reaches
 _TURNS_AT_ALL = 0.05  # radians
 _DARK, _LIT = 0.02, np.log(2.5)  # brightness that tells nothing; by how much light may change
 _CONTRAST = 0.1  # difference in brightness that pulls as much as the reach
+_LESS = 0.4  # pull of edges and colours, relative to that of planes, which are measured better
 _TELLING = 8  # points that tell how a side is lit
 
 
@@ -198,13 +199,14 @@ def _pulled_by_edges(motion, edges: Surface, target: Target, near: float) -> _Pu
     at, rows, counts = _pairs(motion, edges, target, near)
     outward = target.surface.outward[rows]
     counts &= (turned(motion, edges.outward) * outward).sum(-1) > SAME_WAY
-    return _Pull(at[counts], outward[counts], ((target.surface.points[rows] - at) * outward).sum(-1)[counts])
+    gaps = ((target.surface.points[rows] - at) * outward).sum(-1)
+    return _Pull(at[counts], _LESS * outward[counts], _LESS * gaps[counts])
 
 
 def _pulled_by_color(motion, part: Surface, target: Target, near: float) -> _Pull:
     """Points, along the surface, to where it is as bright as they are (Park et al. 2017)."""
     at, rows, counts = _pairs(motion, part, target, near)
-    surface, scale = target.surface, near / _CONTRAST
+    surface, scale = target.surface, _LESS * near / _CONTRAST
     slope = surface.slope[rows]
     bright = part.brightness * _relit(part, surface.brightness[rows], counts)
     gaps = bright - surface.brightness[rows] - (slope * (at - surface.points[rows])).sum(-1)
