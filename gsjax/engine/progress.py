@@ -195,13 +195,13 @@ def watch(
                 save(last=False)
                 raise_if_interrupted()
         except (KeyboardInterrupt, Exception) as stopped:
+            if any(leaf.is_deleted() for leaf in jax.tree.leaves(ticks.run) if isinstance(leaf, jax.Array)):
+                raise  # a failed step has consumed the run; --resume has an earlier one
             if isinstance(stopped, KeyboardInterrupt):
                 say_error(
                     f"by {reason(stopped)} after {ticks.run.step:,} of {schedule.total:,} steps",
                     word="stopped",
                 )
-            if any(leaf.is_deleted() for leaf in jax.tree.leaves(ticks.run) if isinstance(leaf, jax.Array)):
-                raise  # a failed step has consumed the run; --resume has an earlier one
             progress.stopped = stopped
         save(last=True)
     if not is_enough:

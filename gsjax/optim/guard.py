@@ -4,10 +4,10 @@ smaller steps from there; and a run ends with the best that it had.
 Losses are compared by their mean over a window of steps, and beyond the standard error that they have in the
 best window. It has whole passes over the views, so that each view counts in each; where those would be a
 large part of the run, it has some of the views, in their random order. Before the first window, the best are
-the parameters that the stretch began with. A stretch is the time during which
-losses can be compared: it begins anew when parameters or constants are replaced, such as by densification, or
-when a method says that its loss has become another. One shorter than a window, such as a frame of parts, is
-not guarded.
+the parameters that the stretch began with. A stretch is the time during which losses can be compared: it
+begins anew when parameters or constants are replaced, such as by densification, or when a method says that
+its loss has become another. One shorter than a window, such as a frame of parts, can go back to its beginning
+alone.
 
 That a step is finite is the step's own promise (`gsjax.optim.step`), as is that none is far longer than usual
 (`steady_adam`).
@@ -57,6 +57,8 @@ class Level(eqx.Module):
             relative: least difference, relative to the level.
             sigma: least difference in standard errors.
             statistic: what is compared.
+
+        The beginning, whose deviation is not known, is exceeded by a loss that is lost.
         """
         loss = _of_those_taken(statistic, losses)
         if self.deviation is None:
@@ -112,7 +114,8 @@ class Guard(eqx.Module):
             beginning = replace(beginning, mean=float(np.fmax(beginning.mean, loss)))
             guard = replace(guard, beginning=beginning)
         if guard.steps % _TAIL == 0 and np.isnan(losses[-_TAIL:]).sum() >= _MOST_SKIPPED:
-            return guard._returned(params, _FAR_SMALLER)
+            is_small = float(guard.share) <= _LEAST_SHARE  # smaller steps will not help
+            return (guard, params) if is_small else guard._returned(params, _FAR_SMALLER)
         if candidate is not None and guard.steps % window == _TAIL:
             is_confirmed = not candidate.is_exceeded(losses[-_TAIL:], _LOST, _LOST_SIGMA, np.median)
             guard = replace(guard, candidate=None)
@@ -139,7 +142,9 @@ class Guard(eqx.Module):
         is_known = len(tail) >= _TAIL or np.isnan(tail).any()
         if not is_known or not np.isfinite(level.mean):
             return self, params
-        latest = ((self.losses, np.mean), (tail, np.median))
+        if self.best is None and _is_finite(params):  # a skipped step has changed nothing
+            tail = tail[~np.isnan(tail)]
+        latest = ((tail if self.best is None else self.losses, np.mean), (tail, np.median))
         if any(level.is_exceeded(losses, _WORSE, _WORSE_SIGMA, statistic) for losses, statistic in latest):
             settled = replace(self, losses=np.zeros(0), steps=0, candidate=None, is_settled=True)
             return settled, _restored(level)
@@ -191,6 +196,12 @@ def part_of_step(new: PyTree, old: PyTree, share: Float[Array, ""]) -> PyTree:
         return jnp.where(share < 1, start + share.astype(start.dtype) * (end - start), end)
 
     return jax.tree.map(of, new, old)
+
+
+def _is_finite(params: PyTree) -> bool:
+    return all(
+        bool(jnp.isfinite(leaf).all()) for leaf in jax.tree.leaves(params) if eqx.is_inexact_array(leaf)
+    )
 
 
 def _restored(level: Level) -> PyTree:

@@ -13,8 +13,24 @@ from gsjax.engine.scores import true_labels_at
 from gsjax.methods.parts import PartsConfig
 from gsjax.methods.parts.states import states_of
 from gsjax.methods.parts.states.labels import connections, labels_of
-from gsjax.methods.parts.states.registration import Target, axes_of, guesses, moved, registered, turned
-from gsjax.methods.parts.states.surfaces import Surface, around, evidence, pixel_width, steadied, surface_of
+from gsjax.methods.parts.states.registration import (
+    Target,
+    axes_of,
+    guesses,
+    matched,
+    moved,
+    registered,
+    turned,
+)
+from gsjax.methods.parts.states.surfaces import (
+    Surface,
+    around,
+    evidence,
+    pixel_width,
+    steadied,
+    surface_of,
+    unlike,
+)
 from gsjax.metrics.tracking import relative_motion
 from gsjax.scene.initialize import gaussians_from_points
 
@@ -109,6 +125,43 @@ def test_depth_may_be_noisy(cabinet):
 def test_where_nothing_has_moved_that_is_said(cabinet):
     with pytest.raises(ValueError, match="expected parts that moved between two states, found 0 points gone"):
         states_of(cabinet.frame(0), cabinet.frame(0))
+
+
+def test_two_states_without_depth_are_refused(cabinet):
+    frames = [cabinet.frame(t) for t in (0, 1)]
+    frames[1] = replace(frames[1], depths=np.zeros_like(frames[1].depths))
+    with pytest.raises(ValueError, match="expected depth in both states"):
+        states_of(*frames)
+
+
+def test_what_is_lit_otherwise_after_its_motion_is_as_like_as_before(corner):
+    """One side is in the light now, another in the shadow."""
+    random = np.random.default_rng(0)
+    colors = random.uniform(0.2, 0.4, corner.points.shape)
+    part = corner._replace(colors=colors, brightness=colors.mean(-1))
+    lit = np.array([2.0, 1.0, 0.5])[np.abs(corner.normals).argmax(-1)]
+    after = part._replace(colors=lit[:, None] * colors, brightness=lit * part.brightness)
+    target = Target(after, 0.005, after.points.min(0) - 0.1, after.points.max(0) + 0.1)
+    assert np.median(matched(np.eye(4), part, target, 0.01).unlike) < 0.01
+    assert np.median(unlike(part.colors, after.colors)) > 0.1
+
+
+def test_edges_tell_where_a_plain_plate_lies_within_its_plane(corner):
+    """Its plane and its colour say nothing."""
+    count = len(corner.points) // 3
+    face = Surface(*(values[:count] for values in corner))
+    face = face._replace(outward=around(face.points, face.normals, face.colors, 0.015)[0])
+    target = Target(face, 0.005, face.points.min(0) - 0.1, face.points.max(0) + 0.1)
+    guess = np.eye(4)
+    guess[1:3, 3] = 0.012, -0.009  # within the plane
+    assert np.linalg.norm(registered(guess, face, target, 0.05, 0.01, 20)[:3, 3]) < 2e-3
+    blind = Target(
+        face._replace(outward=np.zeros_like(face.outward)),
+        0.005,
+        face.points.min(0) - 0.1,
+        face.points.max(0) + 0.1,
+    )
+    assert np.linalg.norm(registered(guess, face, blind, 0.05, 0.01, 20)[:3, 3]) > 8e-3
 
 
 def test_the_run_of_two_states_has_joints_and_is_refined(cabinet):

@@ -159,6 +159,17 @@ def test_what_diverges_from_its_first_steps_goes_back_to_the_beginning(after):
         assert loss_of(ticks) < 1.001e-3
 
 
+def test_steps_that_are_skipped_at_the_end_of_a_short_run_lose_nothing():
+    """79 good ones, and 11 that changed nothing, before there was a window."""
+    first, good = jnp.ones(SIZE), jnp.zeros(SIZE)
+    guard = begun(first)
+    for loss in [*np.linspace(4, 0.01, 79), *[np.nan] * 11]:
+        guard, _ = guard.watched(float(loss), good, LEAST_WINDOW)
+    assert guard.settled(good)[1] is good
+    back = guard.settled(jnp.full(SIZE, jnp.nan))[1]  # unless they have left the finite, unsaid
+    np.testing.assert_array_equal(back, first)
+
+
 def test_what_was_never_finite_is_left_alone():
     ticks, _ = descended(sick_after=-1, steps=230)
     assert ticks.run.guard.returns == 0

@@ -191,8 +191,8 @@ def _recording(options: Options, notes: Notes) -> tuple[Sequence, DepthSource]:
         notes.add(_of_photographs(photographs, whole.viewmats[0, 0]))
         if photographs.times is None and photographs.splits is not None:
             notes.warn(
-                f"{whole.name}: its photographs have splits but no times: the order of their files, split "
-                'after split, is taken for time; give each frame of its transforms a "time"'
+                f"{whole.name}: its photographs have splits but no times, or one time: the order of their "
+                'files, split after split, is taken for time; give each frame of its transforms a "time"'
             )
     for flag, camera in (("--cameras", options.cameras), ("--eval-cameras", options.eval_cameras)):
         if camera and camera[0] not in whole.camera_ids:

@@ -153,10 +153,10 @@ def registered(
     edges = part.of(part.outward.any(-1))
     for k in range(rounds):
         near = max(reach * _CLOSER**k, least)
-        pulls = [_pulled_flat(motion, part, target, near)]
-        if len(pulls[0].at) < 6:
+        pairs = _pairs(motion, part, target, near)
+        if pairs.counts.sum() < 6:
             return motion
-        pulls.append(_pulled_by_color(motion, part, target, near))
+        pulls = [_pulled_flat(pairs, target.surface), _pulled_by_color(pairs, part, target.surface, near)]
         if target.edges is not None:
             pulls.append(_pulled_by_edges(motion, edges, target.edges, near))
         at, along, gaps = (np.concatenate(values) for values in zip(*pulls, strict=True))
@@ -187,40 +187,44 @@ class _Pull(NamedTuple):
     gaps: Float[np.ndarray, "m"]
 
 
-def _pulled_flat(motion, part: Surface, target: Target, near: float) -> _Pull:
+class _Pairs(NamedTuple):
+    """Points after a motion, the rows of the surface nearest to them, and whether the two may be one."""
+
+    at: Float[np.ndarray, "n 3"]
+    rows: Int[np.ndarray, "n"]
+    counts: Bool[np.ndarray, "n"]
+
+
+def _pairs(motion: Float[np.ndarray, "4 4"], part: Surface, target: Target, near: float) -> _Pairs:
+    at = moved(motion, part.points)
+    far, rows = target.nearest(at)
+    same = (turned(motion, part.normals) * target.surface.normals[rows]).sum(-1) > SAME_WAY
+    return _Pairs(at, rows, (far < near) & same)
+
+
+def _pulled_flat(pairs: _Pairs, surface: Surface) -> _Pull:
     """Points to the plane of the surface."""
-    at, rows, counts = _pairs(motion, part, target, near)
-    normals = target.surface.normals[rows]
-    return _Pull(at[counts], normals[counts], ((target.surface.points[rows] - at) * normals).sum(-1)[counts])
+    at, rows, counts = pairs
+    normals = surface.normals[rows]
+    return _Pull(at[counts], normals[counts], ((surface.points[rows] - at) * normals).sum(-1)[counts])
 
 
-def _pulled_by_edges(motion, edges: Surface, target: Target, near: float) -> _Pull:
+def _pulled_by_color(pairs: _Pairs, part: Surface, surface: Surface, near: float) -> _Pull:
+    """Points, along the surface, to where it is as bright as they are (Park et al. 2017)."""
+    at, rows, counts = pairs
+    scale, slope = _LESS * near / _CONTRAST, surface.slope[rows]
+    bright = part.brightness * _relit(part, surface.brightness[rows], counts)
+    gaps = bright - surface.brightness[rows] - (slope * (at - surface.points[rows])).sum(-1)
+    return _Pull(at[counts], scale * slope[counts], scale * gaps[counts])
+
+
+def _pulled_by_edges(motion: Float[np.ndarray, "4 4"], edges: Surface, target: Target, near: float) -> _Pull:
     """Edges, along the surface, to edges."""
     at, rows, counts = _pairs(motion, edges, target, near)
     outward = target.surface.outward[rows]
     counts &= (turned(motion, edges.outward) * outward).sum(-1) > SAME_WAY
     gaps = ((target.surface.points[rows] - at) * outward).sum(-1)
     return _Pull(at[counts], _LESS * outward[counts], _LESS * gaps[counts])
-
-
-def _pulled_by_color(motion, part: Surface, target: Target, near: float) -> _Pull:
-    """Points, along the surface, to where it is as bright as they are (Park et al. 2017)."""
-    at, rows, counts = _pairs(motion, part, target, near)
-    surface, scale = target.surface, _LESS * near / _CONTRAST
-    slope = surface.slope[rows]
-    bright = part.brightness * _relit(part, surface.brightness[rows], counts)
-    gaps = bright - surface.brightness[rows] - (slope * (at - surface.points[rows])).sum(-1)
-    return _Pull(at[counts], scale * slope[counts], scale * gaps[counts])
-
-
-def _pairs(
-    motion, part: Surface, target: Target, near: float
-) -> tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, "n"], Bool[np.ndarray, "n"]]:
-    """Points after a motion, the rows of the surface nearest to them, and whether the two may be one."""
-    at = moved(motion, part.points)
-    far, rows = target.nearest(at)
-    same = (turned(motion, part.normals) * target.surface.normals[rows]).sum(-1) > SAME_WAY
-    return at, rows, (far < near) & same
 
 
 class Match(NamedTuple):

@@ -72,6 +72,8 @@ def states_of(before: Frame, after: Frame, seed: int = 0) -> States:
     Raises:
         ValueError: nothing has moved, or by no motion that is found.
     """
+    if not all((np.asarray(frame.depths) > 0).any() for frame in (before, after)):
+        raise ValueError("frames: expected depth in both states, found none that is known")
     before, after = steadied(before), steadied(after)
     pixel, random = pixel_width(before), np.random.default_rng(seed)
     first, second = (surface_of(frame, _SPACING * pixel) for frame in (before, after))
@@ -193,7 +195,9 @@ def _explaining(
         way = np.linalg.norm(moved(motion, some.points[mine]) - some.points[mine], axis=-1).mean()
         return 1 - _FAR_COSTS * min(way / size, 1)
 
-    explains = np.array([explained(motion) for motion in candidates]).reshape(len(candidates), -1)
+    if not candidates:
+        return []
+    explains = np.array([explained(motion) for motion in candidates])
     candidates = [motion for motion, mine in zip(candidates, explains, strict=True) if mine.any()]
     explains = explains[explains.any(1)]
     places = [new.nearest(moved(motion, some.points))[1] for motion in candidates]
@@ -216,7 +220,10 @@ def _explaining(
         tried = [
             _beside(candidates[k], some.of((explains[k] > 0) & ~known), anywhere, score, pixel) for k in best
         ]
-        motion = max(tried, key=score)
+        winner, (highest, motion) = max(zip(best, tried, strict=True), key=lambda one: one[1][0])
+        explains[winner] = 0
+        if not highest:
+            continue
         motions.append(motion)
         mine = explained(motion) > 0
         known, hidden = known | mine, hidden | ~said(motion).seen
@@ -231,12 +238,12 @@ def _beside(
     target: Target,
     score: Callable[[Float[np.ndarray, "4 4"]], float],
     pixel: float,
-) -> Float[np.ndarray, "4 4"]:
-    """The motion of the best score among those that are found from one, and from places beside it along the
-    axes of the part: a plate whose edges are hidden may lie off within its plane."""
+) -> tuple[float, Float[np.ndarray, "4 4"]]:
+    """The best score, and its motion: of one, and of those that are found from there, and from places beside
+    it along the axes of the part: a plate whose edges are hidden may lie off within its plane."""
     axes = axes_of(part.normals)
     steps = pixel * np.concatenate([np.zeros((1, 3)), *(way * axes for way in _BESIDE)])
-    best, highest = motion, -1.0
+    best, highest = motion, score(motion)
     for _ in range(_TIMES_BESIDE):
         tried = np.tile(best, (len(steps), 1, 1))
         tried[:, :3, 3] += turned(best, steps)
@@ -245,7 +252,7 @@ def _beside(
         if max(scores) <= highest * 1.01:
             break
         best, highest = found[int(np.argmax(scores))], max(scores)
-    return best
+    return highest, best
 
 
 def _labelled(

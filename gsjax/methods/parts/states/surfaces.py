@@ -19,7 +19,7 @@ from gsjax.scene.frame import Frame
 _BEND_OF_NOISE = 1.65  # median size of the second difference of three numbers, in standard deviations
 _LEAST_NOISE, _MOST_NOISE = 5e-4, 4.0  # of depth, relative; differences that are noise, in its deviations
 _WIDTH = 3.0  # pixels of the average
-_FAR_AWAY = 50.0  # logarithm of a depth that is like no other
+_FAR_AWAY = 20.0  # how far unknown depth is beyond all other, in differences that are noise
 _LEAST_FACING = 0.25  # cosine of the angle of sight below which depth says little of a normal
 _STEEPEST = 6.0  # pixels between the points of neighbouring pixels, above which there is an edge
 _FACES = 0.2  # cosine of the angle of sight below which a point is not judged
@@ -106,8 +106,9 @@ def steadied(frame: Frame) -> Frame:
     noise = float(np.nanmedian(bends)) / _BEND_OF_NOISE if np.isfinite(bends).any() else 0.0
     if noise < _LEAST_NOISE:
         return frame
-    apart = np.nan_to_num(logs, nan=_FAR_AWAY)
-    smooth = np.stack([cv2.bilateralFilter(one, -1, _MOST_NOISE * noise, _WIDTH) for one in apart])
+    width = _MOST_NOISE * noise
+    apart = np.where(np.isfinite(logs), logs, np.nanmax(logs) + _FAR_AWAY * width)
+    smooth = np.stack([cv2.bilateralFilter(one, -1, width, _WIDTH) for one in apart.astype(np.float32)])
     return eqx.tree_at(lambda f: f.depths, frame, jnp.asarray(np.where(depths > 0, np.exp(smooth), 0)))
 
 
@@ -154,9 +155,10 @@ def around(
         points, normals, colors: of the surface.
         spacing: between the points, metres.
     """
-    near = cKDTree(points).query(
-        points, k=min(_AROUND, len(points)), distance_upper_bound=_WITHIN * spacing, workers=-1
-    )[1]
+    if not len(points):
+        return points, np.zeros(0), points
+    count = max(min(_AROUND, len(points)), 2)
+    near = cKDTree(points).query(points, k=count, distance_upper_bound=_WITHIN * spacing)[1]
     known = near < len(points)
     near = np.where(known, near, 0)
     known &= np.einsum("nkd,nd->nk", normals[near], normals) > _FLAT
@@ -176,7 +178,7 @@ def around(
     spread += _STIFF * counts[:, None, None] * spacing**2 * np.eye(3)
     moment = np.einsum("nkd,nk->nd", offsets, values) - (counts * level)[:, None] * mean
     slope = np.linalg.solve(spread, moment[..., None])[..., 0]
-    return outward, level - (slope * mean).sum(-1), slope
+    return outward, np.clip(level - (slope * mean).sum(-1), 0, 1), slope
 
 
 def evidence(
