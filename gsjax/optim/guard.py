@@ -21,6 +21,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PyTree
 
+from gsjax.optim.step import all_finite
+
 LEAST_WINDOW = 100
 """Fewest steps whose losses are compared."""
 _WINDOWS, _MOST_STEPS = 50, 200  # windows of a run, at most, unless they have so many steps
@@ -142,7 +144,7 @@ class Guard(eqx.Module):
         is_known = len(tail) >= _TAIL or np.isnan(tail).any()
         if not is_known or not np.isfinite(level.mean):
             return self, params
-        if self.best is None and _is_finite(params):  # a skipped step has changed nothing
+        if self.best is None and bool(all_finite(params)):  # a skipped step has changed nothing
             tail = tail[~np.isnan(tail)]
         latest = ((tail if self.best is None else self.losses, np.mean), (tail, np.median))
         if any(level.is_exceeded(losses, _WORSE, _WORSE_SIGMA, statistic) for losses, statistic in latest):
@@ -196,12 +198,6 @@ def part_of_step(new: PyTree, old: PyTree, share: Float[Array, ""]) -> PyTree:
         return jnp.where(share < 1, start + share.astype(start.dtype) * (end - start), end)
 
     return jax.tree.map(of, new, old)
-
-
-def _is_finite(params: PyTree) -> bool:
-    return all(
-        bool(jnp.isfinite(leaf).all()) for leaf in jax.tree.leaves(params) if eqx.is_inexact_array(leaf)
-    )
 
 
 def _restored(level: Level) -> PyTree:

@@ -1,6 +1,7 @@
 """Rigid motions between two surfaces: guesses of all that joints allow, and the motion that fits best near
 one (point to plane, Chen and Medioni 1992)."""
 
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -42,8 +43,7 @@ class Target:
     ):
         cell = max(cell, float(np.prod(high - low) / _MOST_CELLS) ** (1 / 3))
         self.surface, self._cell, self._low = surface, cell, low - _BORDER * cell
-        ends = surface.outward.any(-1)
-        self.edges = Target(surface.of(ends), cell, low, high) if ends.any() and not ends.all() else None
+        self._box = low, high
         shape = np.ceil((high - low) / cell).astype(int) + 2 * _BORDER
         rows = np.full(shape, -1, np.int32)
         places = ((surface.points - self._low) / cell).astype(int)
@@ -51,6 +51,12 @@ class Target:
         rows[tuple(places[inside].T)] = np.flatnonzero(inside)
         at = distance_transform_edt(rows < 0, return_distances=False, return_indices=True)
         self._rows = rows[tuple(at)]
+
+    @cached_property
+    def edges(self) -> "Target | None":
+        """The edges of the surface; None if it has none."""
+        ends = self.surface.outward.any(-1)
+        return Target(self.surface.of(ends), self._cell, *self._box) if ends.any() else None
 
     def nearest(
         self, points: Float[np.ndarray, "*n 3"]

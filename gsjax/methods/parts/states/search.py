@@ -179,7 +179,7 @@ def _explaining(
 ) -> list[Float[np.ndarray, "4 4"]]:
     """The motions that explain most of what is gone, one after the other, each by points and by places that
     those before have not used; of motions that explain as much, the shorter. What goes where no camera sees
-    is half explained."""
+    is explained in part."""
 
     def said(motion: Float[np.ndarray, "4 4"]) -> Evidence:
         return evidence(moved(motion, some.points), turned(motion, some.normals), after, _TOLERANCE * pixel)
