@@ -94,6 +94,7 @@ def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
         "false_doubts": 100 * doubts / max(known, 1),
         "objects": {name: {k: v for k, v in o.items() if k != "order"} for name, o in objects.items()},
         "update_ms": 1e3 * np.median(tracking.update_s[3:]),
+        "update_p95_ms": 1e3 * np.percentile(tracking.update_s[3:], 95),
     }
 
 

@@ -272,7 +272,13 @@ _PHOTOGRAPHS = (
     _PhotographLayout(
         "nerfstudio",
         "transforms.json",
-        lambda root: next(root.glob("transforms*.json"), None) is not None,
+        lambda root: (root / "transforms.json").is_file(),
+        transforms.read_transforms,
+    ),
+    _PhotographLayout(
+        "Blender",
+        "transforms_train.json",
+        lambda root: next(root.glob("transforms_*.json"), None) is not None,
         transforms.read_transforms,
     ),
     _PhotographLayout(

@@ -89,8 +89,14 @@ def colmap(root):
     (root / "images.txt").write_text("1 1 0 0 0 0 0 0 1 a.png\n\n")
 
 
+def blender(root):
+    transforms(root)
+    (root / "transforms.json").rename(root / "transforms_train.json")
+
+
 @pytest.mark.parametrize(
-    ("write", "layout"), [(transforms, "nerfstudio"), (llff, "LLFF"), (colmap, "COLMAP")]
+    ("write", "layout"),
+    [(transforms, "nerfstudio"), (blender, "Blender"), (llff, "LLFF"), (colmap, "COLMAP")],
 )
 def test_photographs_are_no_recording(tmp_path, write, layout):
     write(tmp_path)
@@ -188,7 +194,7 @@ def test_folders_of_scenes(tmp_path):
 
 def test_folders_without_photographs(tmp_path):
     (tmp_path / "notes.md").touch()
-    known = r"expected the files of a known layout: nerfstudio \(transforms.json\), COLMAP \(.*LLFF"
+    known = r"expected the files of a known layout: nerfstudio \(transforms.json\), Blender .*COLMAP \(.*LLFF"
     with pytest.raises(DataError, match=known):
         open_photographs(tmp_path)
     scenes = r"7-Scenes \(frame-\*.pose.txt or .*photographs \(transforms.json, .*\) are for gsjax fit"

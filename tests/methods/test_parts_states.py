@@ -275,6 +275,30 @@ def test_what_nothing_is_known_of_takes_the_label_around_it(corner):
     assert abs(links - links.T).max() < 1e-12
     costs = np.full((len(corner.points), 2), 0.4)
     costs[: len(costs) // 3 : 5, 0], costs[len(costs) // 3 :: 5, 1] = 0.0, 0.0
-    labels = labels_of(costs, links)
+    motions = [np.eye(4), slide(9.0, 0)]
+    labels = labels_of(costs, links, corner, motions, 0.015)
     assert (labels[: len(costs) // 3] == 0).mean() > 0.9
     assert (labels[len(costs) // 3 :] == 1).mean() > 0.9
+
+
+@pytest.mark.parametrize("slides", [False, True])
+def test_a_hidden_wall_does_not_follow_what_slides_along_it(slides):
+    """Where a drawer hides it, a wall fits its other points as if it had slid; it was labelled so."""
+    along, up = np.meshgrid(np.arange(0, 1, 0.01), np.arange(0, 0.2, 0.01), indexing="ij")
+    points = np.stack([along.ravel(), up.ravel(), np.zeros(along.size)], -1)
+    plain = np.tile([0.0, 0.0, 1.0], (len(points), 1))
+    wall = Surface(points, plain, np.full_like(points, 0.5), *around(points, plain, plain, 0.01))
+    x, costs = points[:, 0], np.zeros((len(points), 2))
+    costs[x < 0.4, 0] = 0.4  # hidden
+    costs[x < 0.1, 1] = 0.4  # would be hidden
+    costs[x >= 0.7, 1] = 0.0 if slides else 1.0  # would stick out
+    costs[:, 0] += slides * (x < 0.4) * 0.6  # seen through instead
+    motions = [np.eye(4), slide(0.3, 0)]
+    labels = labels_of(costs, connections(wall, 0.01), wall, motions, 0.015)
+    assert (labels[(x > 0.05) & (x < 0.35)] == slides).all()
+
+
+def slide(by, axis):
+    motion = np.eye(4)
+    motion[axis, 3] = by
+    return motion

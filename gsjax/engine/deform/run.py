@@ -98,6 +98,11 @@ def run(options: Options, by_preset: Callable[[str], Options]) -> int:
             options = replace(options, preset=preset)
             if preset == "around":
                 console.print("settings of --preset around, as a camera goes around an object")
+            elif source == "hull" and stored is None:
+                notes.add(
+                    "The camera goes around the scene, but its pictures are not transparent, so the settings "
+                    "are those of --preset surst. If they show one object, make them transparent around it."
+                )
         settings = replace(options, dataset=located(options.dataset), **choice.located())
         if options.resume:
             folder.check_config(settings, but=RESUME_MAY_CHANGE)

@@ -21,7 +21,7 @@ FIT = FitConfig(
 def has_two_states(tracked: Sequence) -> bool:
     """Whether a recording shows two states, each by cameras of its own, and no motion between them."""
     stands = np.allclose(tracked.viewmats[0], tracked.viewmats[-1], atol=1e-6)
-    return tracked.num_frames == 2 and tracked.has_depth and not stands
+    return tracked.num_frames == 2 and not stands
 
 
 def detect_motion(
@@ -35,8 +35,17 @@ def detect_motion(
         config: settings of the discovery.
         anchor: index of the frame (default: the one that differs most from the others; of two states, the
             first).
+
+    Raises:
+        ValueError: there is no such frame, nothing moves, or two states have no depth.
     """
     if has_two_states(tracked):
+        if not tracked.has_depth:
+            raise ValueError(
+                f"{tracked.name}: found two frames by cameras that stand elsewhere in each, and no depth; "
+                "what moved between two states is searched for in space. Add depth of both, measured or by a "
+                "network (docs/data.md), or record more frames by cameras that stand still"
+            )
         check_anchor(anchor, tracked.num_frames)
         chosen = anchor or 0
         return Anchor(chosen, 1 - chosen, np.zeros(2)), None

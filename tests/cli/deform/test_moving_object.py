@@ -165,6 +165,18 @@ def test_a_run_is_learned_and_scored_on_white(gsjax, folder, tmp_path):
     assert scene.num_frames == 19
 
 
+def test_opaque_pictures_are_told_of(gsjax, tmp_path):
+    """The settings of surst were taken for D-NeRF's layout without a word."""
+    write_dnerf(tmp_path / "things", SIZE, {"train": 4, "val": 1, "test": 2})
+    for picture in (tmp_path / "things").rglob("*.png"):
+        cv2.imwrite(str(picture), cv2.imread(str(picture)))
+    code, said = gsjax("deform", tmp_path / "things", "--out", tmp_path / "run", *SMALL)
+    assert code == 0, said
+    found = json.loads((tmp_path / "run" / "metrics.json").read_text())
+    assert found["preset"] == "surst"
+    assert "its pictures are not transparent" in " ".join(found["notes"])
+
+
 @pytest.mark.slow
 def test_a_run_of_an_earlier_version_goes_on_as_it_was_begun(gsjax, folder, interrupted, tmp_path):
     told = ("deform", folder, "--out", tmp_path / "run", *SMALL)

@@ -1,6 +1,8 @@
 """Which motion each point of a surface follows: what the cameras of the other state say of it, spread over
 the surface where they say nothing (random walks, Grady 2006)."""
 
+from itertools import permutations
+
 import numpy as np
 from jaxtyping import Float, Int
 from scipy.sparse import csr_array, diags_array
@@ -16,9 +18,13 @@ _COLOR = 0.05  # difference of colours at which neighbours are hardly connected
 _BEND = 0.1  # strength of the connection of neighbours with perpendicular normals
 _SAME_WAY, _SAME_COLOR = 0.7, 0.15
 _UNKNOWN = 0.4  # cost of a point of which nothing is known; of one that agrees it is 0, of others up to 1
-_SHARPNESS = 0.05  # differences of costs that count
+_MOVES = 0.1  # what it costs a point to follow a motion, unless nothing is known of it
+_THERE = 0.3  # cost of a point where cameras see something, but no surface that agrees
+_SHARPNESS = 0.1  # differences of costs that count
 _PULL = 0.5  # of the cameras, relative to a connection
 _ITERATIONS = 300
+_APART = 0.5  # spacings by which the two sides of a thin plate are kept apart
+_TURNS = 3  # of labels and of who takes a place
 
 
 def connections(surface: Surface, spacing: float) -> csr_array:
@@ -54,24 +60,75 @@ def costs_of(
     match = matched(motion, surface, target, spacing)
     fits = (match.far < spacing) & (match.cosines > _SAME_WAY)
     off = match.unlike / _SAME_COLOR
-    cost = np.where(fits, 0.5 * _UNKNOWN * np.minimum(off, 1), _UNKNOWN)
+    unsure = np.where(said.there > 0, _THERE, _UNKNOWN)
+    cost = np.where(fits, 0.5 * _UNKNOWN * np.minimum(off, 1), unsure)
     return np.where(said.seen, cost + (1 - _UNKNOWN) * np.minimum(3 * said.share, 1), _UNKNOWN)
 
 
-def labels_of(costs: Float[np.ndarray, "n k"], links: csr_array) -> Int[np.ndarray, "n"]:
+def labels_of(
+    costs: Float[np.ndarray, "n k"],
+    links: csr_array,
+    surface: Surface,
+    motions: list[Float[np.ndarray, "4 4"]],
+    spacing: float,
+) -> Int[np.ndarray, "n"]:
     """The motion of each point, as an index.
+
+    A point gains nothing by a place that another takes, by another motion: a wall along which a drawer slides
+    fits, where the drawer hides it, as if it had slid too, but only onto what else of the wall is seen to
+    stay. Who takes a place is told by the labels, so both are found in turn.
 
     Args:
         costs: from `costs_of`, for each motion.
         links: from `connections`.
+        surface: before the motions.
+        motions: all of them; the first is none.
+        spacing: between the points, metres.
     """
+    claims = _claims(costs, surface, motions, spacing)
+    costs = costs + np.clip(_UNKNOWN - costs, 0, [0, *[_MOVES] * (len(motions) - 1)])
+    worth = np.maximum(_UNKNOWN - costs, 0)
+    shares = _spread(costs, links)
+    for _ in range(_TURNS):
+        taken = np.zeros(costs.shape)
+        for k, j, rows, others in claims:
+            taken[rows, k] = np.maximum(taken[rows, k], shares[others, j])
+        shares = _spread(costs + worth * np.clip(2 * taken, 0, 1), links)  # who more likely has it, has it
+    return shares.argmax(-1)
+
+
+def _claims(
+    costs: Float[np.ndarray, "n k"],
+    surface: Surface,
+    motions: list[Float[np.ndarray, "4 4"]],
+    spacing: float,
+) -> list[tuple[int, int, Int[np.ndarray, "m"], Int[np.ndarray, "m"]]]:
+    """Which points two motions bring to the same place: the motions, the points of the first, and those of
+    the second. Arguments as for `labels_of`."""
+    ways = [turned(motion, surface.normals) for motion in motions]
+    places = [
+        moved(motion, surface.points) + _APART * spacing * way
+        for motion, way in zip(motions, ways, strict=True)
+    ]
+    fits, trees, claims = costs < _UNKNOWN, [cKDTree(place) for place in places], []
+    for k, j in permutations(range(len(motions)), 2):
+        rows = np.flatnonzero(fits[:, k])
+        far, others = trees[j].query(places[k][rows], distance_upper_bound=spacing)
+        rows, others = rows[far < np.inf], others[far < np.inf]
+        both = ((ways[k][rows] * ways[j][others]).sum(-1) > _SAME_WAY) & fits[others, j]
+        claims.append((k, j, rows[both], others[both]))
+    return claims
+
+
+def _spread(costs: Float[np.ndarray, "n k"], links: csr_array) -> Float[np.ndarray, "n k"]:
+    """How likely each point follows each motion: where the costs do not tell, as its neighbours do."""
     likely = np.exp(-(costs - costs.min(1, keepdims=True)) / _SHARPNESS)
     likely /= likely.sum(1, keepdims=True)
     pull = _PULL * (likely.max(1) - 1 / costs.shape[1]) + 1e-4
     diagonal = links.sum(1) + pull
     system = diags_array(diagonal) - links
     scaled = LinearOperator(system.shape, lambda x: x / diagonal)
-    spread = [
+    solved = [
         cg(system, pull * share, x0=share, rtol=1e-4, maxiter=_ITERATIONS, M=scaled)[0] for share in likely.T
     ]
-    return np.stack(spread, -1).argmax(-1)
+    return np.stack(solved, -1)

@@ -264,7 +264,7 @@ def _labelled(
     for _ in range(_ROUNDS):
         costs = np.stack([costs_of(motion, surface, target, after, spacing) for motion in every], -1)
         kept = _needed(costs)
-        labels = labels_of(costs[:, kept], links)
+        labels = labels_of(costs[:, kept], links, surface, [every[k] for k in kept], spacing)
         every = [np.eye(4)] + [
             registered(every[k], surface.of(labels == i), target, 2 * pixel, pixel, 25)
             for i, k in enumerate(kept)
