@@ -33,6 +33,8 @@ OBJECTS: dict[str, Callable[..., Sequence]] = {
 }
 NOISE = {"exact": 0.0, "0.5 % noise": 0.005}
 AVERAGED = ("axis_deg", "line_mm", "travel_deg", "travel_mm", "point_mm", "chamfer_mm", "iou")
+PANELS = ("axis_deg", "angle between the axes [deg]", 1e-3), ("chamfer_mm", "Chamfer distance [mm]", 0.1)
+PRINTED = {"ArtGS": 0.05, "DTA": 0.13, "PARIS": 11.14}  # mean angles of their synthetic objects, degrees
 FOUND_IOU = 0.5  # overlap from which a part counts as found
 
 
@@ -114,3 +116,33 @@ def mean_of(parts: dict[str, dict[str, Any]], key: str) -> float | None:
     """Mean over the parts that have a value; None if none has."""
     values = [part[key] for part in parts.values() if part.get(key) is not None]
     return float(np.mean(values)) if values else None
+
+
+def figure(rows: list[dict[str, Any]], path: Path) -> None:
+    """Axes and surfaces: a dot for each part, a column for each object and kind of depth."""
+    from matplotlib.figure import Figure
+
+    objects, kinds = (list(dict.fromkeys(row[key] for row in rows)) for key in ("object", "depth"))
+    drawing = Figure(figsize=(2.1 * len(objects), 4.2), dpi=100, layout="constrained")
+    panels = drawing.subplots(1, 2)
+    for axes, (key, label, floor) in zip(panels, PANELS, strict=True):
+        for row in rows:
+            kind = kinds.index(row["depth"])
+            column = objects.index(row["object"]) + 0.3 * (kind - (len(kinds) - 1) / 2)
+            values = [part[key] for part in row["parts"].values() if part.get(key) is not None]
+            places = column + 0.05 * (row["seed"] - 1) * np.ones(len(values))
+            axes.plot(places, np.maximum(values, floor), "o", color=f"C{kind}", markersize=4, alpha=0.7)
+            if row["found"] < row["true_parts"]:
+                axes.plot(column, floor, "x", color=f"C{kind}", markersize=8, clip_on=False)
+        axes.set(yscale="log", ylabel=label)
+        axes.set_xticks(range(len(objects)), [name.replace(", ", ",\n") for name in objects], fontsize=7)
+        axes.grid(axis="y", linewidth=0.3)
+    for system, degrees in PRINTED.items():
+        panels[0].axhline(degrees, color="#888888", linewidth=0.8, linestyle=":")
+        panels[0].text(
+            len(objects) - 0.5, degrees, system, fontsize=7, color="#666666", va="bottom", ha="right"
+        )
+    for kind, name in enumerate(kinds):
+        panels[1].plot([], [], "o", color=f"C{kind}", label=f"depth: {name}")
+    panels[1].legend(fontsize=8, frameon=False)
+    drawing.savefig(path, format=path.suffix.removeprefix(".") or "png")
