@@ -41,8 +41,9 @@ class Options(Common):
     """Options of `gsjax export`."""
 
     path: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN|FILE|FOLDER")]
-    """Folder of a run of `gsjax fit`, `track`, `parts` or `deform`; a file of Gaussians: .ply,
-    .compressed.ply, .splat, .spz, .sog or .ksplat; or a folder of numbered ones, the frames of a scene."""
+    """Folder of a run of `gsjax fit`, `track`, `parts` or `deform`, or of a film of `gsjax edit`; a file of
+    Gaussians: .ply, .compressed.ply, .splat, .spz, .sog or .ksplat; or a folder of numbered ones, the frames
+    of a scene."""
     out: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="OUT")]
     """The file to write. Where its name has a run of #, as in 'frame_####.ply', a file is written for each
     frame of a run that moves, with the number of the frame in place of it."""

@@ -32,9 +32,9 @@ class Options(Common):
 
     path: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN|FIELD|FILE")]
     """Folder of a run of `gsjax fit`, `gsjax track`, `gsjax parts` or `gsjax deform`; of a field (`gsjax
-    distill`); a file of Gaussians: .ply, .compressed.ply, .splat, .spz, .sog or .ksplat; or a folder of
-    numbered ones, the frames of a scene. A field, a fit with one and a deforming scene with names can be
-    queried."""
+    distill`); of a film (`gsjax edit`); a file of Gaussians: .ply, .compressed.ply, .splat, .spz, .sog or
+    .ksplat; or a folder of numbered ones, the frames of a scene. A field, a fit with one and a deforming
+    scene with names can be queried."""
     host: str = "127.0.0.1"
     """Address to listen on. With the default, only this machine can connect."""
     port: int | None = None

@@ -20,6 +20,7 @@ from gsjax.engine.distill.saved import AS_IT_WAS, FieldRun, Whereabouts, field_o
 from gsjax.engine.files import read_drawable, read_frames, reopen
 from gsjax.engine.folder import expect_run
 from gsjax.engine.messages import Notes, describe
+from gsjax.engine.parts.films import SCRIPT, edited, read_film
 from gsjax.engine.parts.saved import blend_of, open_parts_run, read_parts
 from gsjax.engine.parts.viewer import Filmed, camera_names, editing_of
 from gsjax.engine.photographs import photographs_of_run
@@ -48,8 +49,8 @@ def open_viewable(
     """The scene at a path, and the folder for screenshots.
 
     Args:
-        path: a run, a field, a file of Gaussians in any format that `read_gaussians` reads, or a folder of
-            numbered ones, the frames of a scene that moves.
+        path: a run, a field, a film of `gsjax edit`, a file of Gaussians in any format that `read_gaussians`
+            reads, or a folder of numbered ones, the frames of a scene that moves.
         notes: collects warnings.
         now: the present paths of what a field or a fit refers to.
         photographs: whether those of a fit or of a deforming run are opened, if they are still there.
@@ -81,6 +82,9 @@ def open_viewable(
         return _of_files(path, files, notes), path
     if (path / NAME).is_file():
         return _of_field(path, notes, now), path
+    if (path / SCRIPT).is_file():
+        _expect_only((), now, f"{path} is a film of `gsjax edit`")
+        return _of_film(path, notes), path
     expect_run(path)
     if (path / DEFORMATION).is_file():
         _expect_only(("weights",), now, f"{path} is a run that deforms")
@@ -270,6 +274,19 @@ def _of_parts(path: Path, notes: Notes) -> Viewable:
     filmed = Filmed(path.absolute().name, names, blend, times - times[0], shots)
     scene = filmed.viewable((layer,), None if saved is None else editing_of(saved, filmed))
     return replace(scene, origin=origin)
+
+
+def _of_film(path: Path, notes: Notes) -> Viewable:
+    """The edited scene of a film, over the time of the film; its photographs are those of the recording."""
+    script, run = read_film(path)
+    saved = open_parts_run(run)
+    film, doubts = edited(script, saved)
+    for doubt in doubts:
+        notes.warn(doubt)
+    times = np.asarray(saved.layer.trajectory.times)
+    shots = _shots_of_recording(saved.recording) if saved.complete else None
+    filmed = Filmed(path.absolute().name, saved.names, saved.blend, times - times[0], shots)
+    return replace(filmed.viewable(film), origin=saved.recording.judged.origin)
 
 
 def _shots_of(photographs: Photographs) -> Shots:

@@ -18,18 +18,20 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from gsjax.engine.files import write_scene
+from gsjax.engine.folder import expect_run, is_run, read_values
 from gsjax.engine.machine import describe as describe_machine
 from gsjax.engine.messages import Notes, counted, reason
 from gsjax.engine.parts.saved import PartsRun, read_parts_about
 from gsjax.geometry.cameras import Camera, resized
 from gsjax.io.atomic import atomic_write, write_json
+from gsjax.io.parsed import parse_json
 from gsjax.io.video import VideoWriter
 from gsjax.methods.parts.entries import relative
 from gsjax.methods.parts.film import Film, Layer, film_gaussians
 from gsjax.methods.parts.limits import Beyond, beyond_captured, describe_beyond
 from gsjax.methods.parts.operation import Edit
 from gsjax.methods.parts.operations import label
-from gsjax.methods.parts.timeline import LENGTHS, ROUND, LoadScene, Script, apply, to_yaml
+from gsjax.methods.parts.timeline import LENGTHS, ROUND, LoadScene, Script, apply, parse_script, to_yaml
 from gsjax.methods.parts.trajectory import Trajectory
 from gsjax.optim.compiler import host_options
 from gsjax.scene.gaussians import Gaussians, take
@@ -116,6 +118,25 @@ def telling_camera(film: Film, saved: PartsRun, script: Script) -> int:
 
     changed = (np.abs(seen(film) - seen(plain)).max(axis=-1) > _CHANGED).mean(axis=(0, 2, 3))
     return int(sequence.camera_ids[int(changed.argmax())]) if changed.any() else saved.camera(None)
+
+
+def read_film(folder: Path) -> tuple[Script, Path]:
+    """The edits of a film, and the run that they are of: the one that the folder lies in, as films do by
+    default, else the one that it was made from.
+
+    Raises:
+        ValueError: the edits cannot be read.
+        OSError: a file is missing, or the run is gone.
+    """
+    try:
+        script = parse_script((folder / SCRIPT).read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise ValueError(f"{folder / SCRIPT}: {error}") from error
+    run = folder.absolute().parent.parent
+    if not is_run(run):
+        run = Path(read_values(folder / _METRICS, parse_json).get("run", run))
+        expect_run(run, "`gsjax parts`")
+    return script, run
 
 
 def new_folder(parent: Path, name: str) -> Path:

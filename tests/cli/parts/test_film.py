@@ -1,0 +1,79 @@
+"""A film of `gsjax edit` leaves as a sequence of files or as a page, and is viewed like a run."""
+
+import shutil
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from gsjax.engine.messages import Notes
+from gsjax.engine.viewables import open_viewable
+from gsjax.io.ply import read_ply
+from tests.cli.parts.test_edit import SCRIPT, write_run
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """A run, and a film of it that lies elsewhere, with its frames."""
+    root = tmp_path_factory.mktemp("film")
+    return write_run(root / "run"), root / "film"
+
+
+@pytest.fixture
+def film(gsjax, made):
+    run, folder = made
+    if not folder.exists():
+        (run / "slow.yaml").write_text(SCRIPT)
+        ops = ("--op", "fade:parts=drawer,opacity=0.5", "--op", "echo:parts=drawer,copies=2")
+        code, said = gsjax("edit", run, run / "slow.yaml", *ops, "--ply", "--out", folder)
+        assert code == 0, said
+    return folder
+
+
+def in_order(gaussians):
+    """Rows by their places: a film to view has what changes first."""
+    rows = np.lexsort(np.asarray(gaussians.means).T.round(5))
+    return [np.asarray(a)[rows] for a in (gaussians.means, gaussians.opacities, gaussians.sh0)]
+
+
+def test_a_film_leaves_as_files_of_its_frames(gsjax, film, tmp_path):
+    code, said = gsjax("export", film, tmp_path / "frame_####.ply")
+    assert code == 0, said
+    assert "shut_door goes up to 100 mm" in said
+    files = sorted(path.name for path in tmp_path.glob("*.ply"))
+    assert files == [f"frame_{t:04d}.ply" for t in range(13)]
+    for t in (0, 12):
+        mine = in_order(read_ply(tmp_path / f"frame_{t:04d}.ply")[0])
+        shown = in_order(read_ply(film / "ply" / f"{t:06d}.ply")[0])
+        for one, other in zip(mine, shown, strict=True):
+            np.testing.assert_allclose(one, other, atol=1e-5)
+    code, said = gsjax("export", film, tmp_path / "frame_####.sog", "--frames", "0:13:6")
+    assert code == 0, said
+    assert len(list(tmp_path.glob("*.sog"))) == 3
+
+
+def test_a_film_leaves_as_a_page_that_plays(gsjax, film, tmp_path):
+    code, said = gsjax("export", film, tmp_path / "film.html")
+    assert code == 0, said
+    assert "of 13 frames" in said
+
+
+def test_a_film_is_viewed_over_its_own_time(film):
+    scene, folder = open_viewable(film, Notes(Console(quiet=True)))
+    assert (scene.num_frames, folder) == (13, film)
+    np.testing.assert_allclose(np.diff(scene.times), 1 / 15, rtol=1e-5)
+    assert scene.shots is not None
+
+
+def test_a_film_whose_run_is_gone_names_it(gsjax, film, tmp_path):
+    alone = tmp_path / "alone"
+    shutil.copytree(film, alone)
+    text = (alone / "metrics.json").read_text()
+    (alone / "metrics.json").write_text(text.replace("film0/run", "film0/gone"))
+    code, said = gsjax("export", alone, tmp_path / "film.html")
+    assert code != 0
+    assert "gone: expected the folder of a run of `gsjax parts`, found nothing there" in said
+    (alone / "edit.yaml").write_text("edits: 3")
+    code, said = gsjax("export", alone, tmp_path / "film.html")
+    assert code != 0
+    assert "edit.yaml: edits: expected" in said
