@@ -33,7 +33,7 @@ def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
         scale=options["scale"],
         overwrite=True,
         read=NEAR,
-        fit=replace(FIT, steps=2_000, cap=round(60_000 * options["scale"]), start=start, seed=seed),
+        fit=replace(FIT, steps=4_000, cap=round(60_000 * options["scale"]), start=start, seed=seed),
     )
     found = discovered(told) | steadiness(told.out) | ball_scores(told.out)
     metrics = json.loads((told.out / "metrics.json").read_text())

@@ -89,6 +89,27 @@ def test_what_came_before_something_did_not_move_it():
     assert not left[after].any()
 
 
+@pytest.mark.parametrize("farther", [0.0, 0.1])
+def test_a_shadow_that_moves_is_no_motion(farther):
+    """On a granite table, the shadow of a lid was followed as a part."""
+    grain = np.random.default_rng(0).integers(60, 200, (40, 60, 1))
+    table = (grain * np.array([1.0, 0.9, 0.8])).astype(np.uint8)
+    pictures, depths = np.stack([table, table]), np.full((2, 40, 60), 2.0, np.float32)
+    pictures[1, 10:30, 15:40] = 0.5 * table[10:30, 15:40]
+    depths[1, 10:30, 15:40] += farther  # else it is the same table
+    pictures[0, 32:38, 2:10], pictures[1, 32:38, 2:10] = (10, 10, 200), (200, 10, 10)
+
+    def changed(depth=None):
+        anchor = Anchor(0, 1, np.array([0.0, 1.0]))
+        return moved_pixels(lambda t, c: pictures[t], anchor, 1, frames=1, depth=depth)[0, 0]
+
+    by_colors, by_both = changed(), changed(lambda t, c: depths[t])
+    assert by_colors[12:28, 18:37].mean() > 0.9
+    assert by_both[12:28, 18:37].mean() > 0.9 if farther else by_both[12:28, 18:37].mean() < 0.02
+    assert by_colors[33:37, 3:9].all()
+    assert by_both[33:37, 3:9].all()
+
+
 @pytest.fixture(scope="module")
 def start(boxes, moved):
     config = PartsConfig(grid=FeatureGridConfig(4, 4, 32, 12, 2, 16))

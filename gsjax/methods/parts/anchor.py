@@ -18,6 +18,10 @@ _BLUR = 1.0  # pixels; suppresses camera noise and the aliasing of hard edges
 _NOISE_FACTOR = 4.0  # differences above this many times the noise level are motion
 _MOST_FRAMES = 16  # compared with the anchor at full size
 _NEARER = 0.02  # share of its depth by which what comes before something is nearer
+_AS_FAR = 0.01  # share of its depth by which the same surface may be nearer or farther
+_SAME_PATTERN, _SAME_HUE = 0.15, 0.03  # differences of patterns, relative, and of shares of a colour
+_WINDOW, _AROUND = 7, 5  # pixels over which brightness, and differences, are averaged
+_DARK = 0.02  # brightness below which neither pattern nor hue is known
 _LEAST_MOVED = 1e-3  # share of the pixels that must change for anything to have moved
 
 
@@ -93,7 +97,7 @@ def moved_pixels(
             missed.
         threshold: least difference of colours, which range from 0 to 1.
         depth: loads depths, if cameras measure them: where something nearer is seen, nothing has moved away,
-            something has come before it.
+            something has come before it; and where the same surface is lighter or darker, a shadow has moved.
 
     Raises:
         ValueError: nothing moves.
@@ -109,9 +113,13 @@ def moved_pixels(
     ]
     limit, moved = max(threshold, _NOISE_FACTOR * float(np.median(steps))), []
     for c, here in enumerate(heres):
-        changed = np.array([difference_image(_blurred(load(t, c)), here) > limit for t in sorted(others)])
+        nows = [_blurred(load(t, c)) for t in sorted(others)]
+        changed = np.array([difference_image(now, here) > limit for now in nows])
         if depth is not None and (before := depth(anchor.frame, c)) is not None:
-            changed &= np.array([~_is_covered(before, depth(t, c)) for t in sorted(others)])
+            deep = [depth(t, c) for t in sorted(others)]
+            changed &= np.array([~_is_covered(before, after) for after in deep])
+            both = zip(nows, deep, strict=True)
+            changed &= np.array([~_is_lit_otherwise(here, now, before, after) for now, after in both])
         moved.append(changed)
     share = np.mean(np.any(moved, axis=1))
     if share < _LEAST_MOVED:
@@ -127,6 +135,34 @@ def _is_covered(
 ) -> Bool[np.ndarray, "H W"]:
     """Where something nearer than before is seen; nowhere without depth."""
     return np.zeros(before.shape, bool) if now is None else (now > 0) & (now < (1 - _NEARER) * before)
+
+
+def _is_lit_otherwise(
+    here: Float[np.ndarray, "H W 3"],
+    now: Float[np.ndarray, "H W 3"],
+    before: Float[np.ndarray, "H W"],
+    after: Float[np.ndarray, "H W"] | None,
+) -> Bool[np.ndarray, "H W"]:
+    """Where the same surface is seen in other light: as far away, of the same hue, and with the same pattern
+    relative to the brightness around it; nowhere without depth."""
+    if after is None:
+        return np.zeros(before.shape, bool)
+    same = (before > 0) & (after > 0) & (np.abs(after - before) < _AS_FAR * before)
+    pattern, hue = (f(here) - f(now) for f in (_pattern, _hue))
+    unlike = cv2.blur(np.abs(pattern).mean(-1), (_AROUND, _AROUND))
+    return same & (unlike < _SAME_PATTERN) & (np.abs(hue).max(-1) < _SAME_HUE)
+
+
+def _pattern(picture: Float[np.ndarray, "H W 3"]) -> Float[np.ndarray, "H W 3"]:
+    """A picture relative to the mean around each pixel."""
+    mean = cv2.blur(picture, (_WINDOW, _WINDOW))
+    return cv2.blur(picture, (3, 3)) / np.maximum(mean, _DARK)
+
+
+def _hue(picture: Float[np.ndarray, "H W 3"]) -> Float[np.ndarray, "H W 3"]:
+    """The shares of red, green and blue."""
+    mean = cv2.blur(picture, (_AROUND, _AROUND))
+    return mean / np.maximum(mean.sum(-1, keepdims=True), 3 * _DARK)
 
 
 def difference_image(

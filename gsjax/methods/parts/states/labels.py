@@ -59,7 +59,7 @@ def costs_of(
     said = evidence(moved(motion, surface.points), turned(motion, surface.normals), frame, 4 / 3 * spacing)
     match = matched(motion, surface, target, spacing)
     fits = (match.far < spacing) & (match.cosines > _SAME_WAY)
-    off = match.unlike / _SAME_COLOR
+    off = np.maximum(match.unlike / _SAME_COLOR, (match.off / spacing) ** 2)
     unsure = np.where(said.there > 0, _THERE, _UNKNOWN)
     cost = np.where(fits, 0.5 * _UNKNOWN * np.minimum(off, 1), unsure)
     return np.where(said.seen, cost + (1 - _UNKNOWN) * np.minimum(3 * said.share, 1), _UNKNOWN)

@@ -238,11 +238,13 @@ class Match(NamedTuple):
 
     Attributes:
         far: distances to the nearest points of the surface, metres.
+        off: distances to the planes of these, metres.
         cosines: between the normals of the two.
         unlike: how unlike their colours are, 0 to 1.
     """
 
     far: Float[np.ndarray, "*k n"]
+    off: Float[np.ndarray, "*k n"]
     cosines: Float[np.ndarray, "*k n"]
     unlike: Float[np.ndarray, "*k n"]
 
@@ -257,11 +259,13 @@ def matched(motion: Float[np.ndarray, "*k 4 4"], part: Surface, target: Target, 
         target: the surface after them.
         near: distance of the points that tell how a side is lit, metres.
     """
-    far, rows = target.nearest(moved(motion, part.points))
-    cosines = (turned(motion, part.normals) * target.surface.normals[rows]).sum(-1)
+    at, surface = moved(motion, part.points), target.surface
+    far, rows = target.nearest(at)
+    off = np.abs(((surface.points[rows] - at) * surface.normals[rows]).sum(-1))
+    cosines = (turned(motion, part.normals) * surface.normals[rows]).sum(-1)
     tells = (far < near) & (cosines > SAME_WAY)
-    lit = _relit(part, target.surface.brightness[rows], tells)
-    return Match(far, cosines, unlike(part.colors * lit[..., None], target.surface.colors[rows]))
+    lit = _relit(part, surface.brightness[rows], tells)
+    return Match(far, off, cosines, unlike(part.colors * lit[..., None], surface.colors[rows]))
 
 
 def _relit(
@@ -306,4 +310,4 @@ def likeness(
     """
     match = matched(motion, part, target, near)
     fits = (match.far < near) & (match.cosines > SAME_WAY)
-    return fits * np.maximum(1 - match.unlike / color, 0)
+    return fits * np.maximum(1 - match.unlike / color, 0) * np.maximum(1 - (match.off / near) ** 2, 0)

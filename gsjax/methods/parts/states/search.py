@@ -38,6 +38,7 @@ _BLOCKED = 0.3  # share of the cameras that may see through where a point is to 
 _EXPLAINS = 0.02  # least share of what is gone that a motion must explain
 _FRESH = 0.25  # least share of what a motion explains that those before it do not, or it repeats them
 _HIDDEN = 0.3  # what explaining a point is worth that another motion brings where no camera sees
+_ALONGSIDE = 10.0  # pixels within which of what a motion explains it explains so
 _FAR_COSTS = 0.6  # share of its gain that a motion as far as the scene is large loses
 _MOST_MOTIONS = 30
 _RIVALS, _RIVAL = 3, 0.5  # motions among which the best is chosen, and their least gain, relative to it
@@ -226,7 +227,8 @@ def _explaining(
             continue
         motions.append(motion)
         mine = explained(motion) > 0
-        known, hidden = known | mine, hidden | ~said(motion).seen
+        beside = cKDTree(some.points[mine]).query(some.points)[0] < _ALONGSIDE * pixel
+        known, hidden = known | mine, hidden | (beside & ~said(motion).seen)
         there = cKDTree(moved(motion, some.points[mine]))
         used |= there.query(new.surface.points, distance_upper_bound=2 * _SPACING * pixel)[0] < np.inf
     return motions
