@@ -19,7 +19,8 @@ from gsjax.engine.parts.views import part_views
 HELD_OUT = (0, 10, 15, 30)  # the test cameras of Dynamic3DGaussians
 NEAR = ReadOptions(near=0.5)  # cameras of the dome see each other
 RED, BRIGHT = 1.9, 60 / 255  # how much redder than green and blue the ball is, and its least red
-LARGE = 7.0  # radius of a ball that is clearly seen, pixels of a picture 320 wide
+WIDTH = 320  # pixels of the pictures in which the ball's places are given
+LARGE = 7.0  # radius of a ball that is clearly seen, in these pixels
 NEARBY = 2.0  # radii within which a ball counts as where it is
 
 
@@ -50,22 +51,22 @@ def ball_scores(folder: Path) -> dict[str, Any]:
     """Where the ball is drawn in the test cameras, against where it is: the largest red disc of each picture.
 
     Only pictures count in which it is clearly seen, as a disc of at least the area that `LARGE` says. It is
-    found if a red disc is drawn within two radii of its place.
+    found if a red disc is drawn within two radii of its place; the median is over all pictures, infinite
+    (None) if it is not found in half of them.
     """
-    gaps, seen = [], 0
+    gaps = []
     for image, render in pictures(folder):
         there, radius = disc(image)
-        if there is None or radius < LARGE * image.shape[1] / 320:
+        if there is None or radius < LARGE:
             continue
-        seen += 1
         drawn, _ = disc(render)
         gap = np.inf if drawn is None else float(np.linalg.norm(drawn - there))
-        if gap < NEARBY * radius:
-            gaps.append(gap)
+        gaps.append(gap if gap < NEARBY * radius else np.inf)
+    median = float(np.median(gaps)) if gaps else np.inf
     return {
-        "ball_pixels": float(np.median(gaps)) if gaps else None,
-        "ball_found": 100 * len(gaps) / max(seen, 1),
-        "ball_pictures": seen,
+        "ball_pixels": median if np.isfinite(median) else None,
+        "ball_found": 100 * float(np.isfinite(gaps).mean()) if gaps else None,
+        "ball_pictures": len(gaps),
     }
 
 
@@ -77,8 +78,10 @@ def pictures(folder: Path) -> Iterator[tuple[np.ndarray, np.ndarray]]:
 
 
 def disc(picture: Float[np.ndarray, "H W 3"]) -> tuple[Float[np.ndarray, "2"] | None, float]:
-    """Middle and radius, in pixels, of the largest red disc; None and 0 if there is none."""
-    picture = np.asarray(picture, np.float32)
+    """Middle and radius of the largest red disc, in pixels of a picture `WIDTH` wide; None and 0 if there is
+    none."""
+    size = WIDTH, round(WIDTH * picture.shape[0] / picture.shape[1])
+    picture = cv2.resize(np.asarray(picture, np.float32), size, interpolation=cv2.INTER_AREA)
     red = (picture[..., 0] > RED * picture[..., 1:].max(-1)) & (picture[..., 0] > BRIGHT)
     opened = cv2.morphologyEx(red.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3)))
     count, _, sizes, middles = cv2.connectedComponentsWithStats(opened)

@@ -83,7 +83,11 @@ def partnet(root: Path, seed: int, size: int = 320, views: int = 32) -> Sequence
 
 
 def read_links(root: Path) -> dict[str, Link]:
-    """The links of mobility.urdf, by name, whose joints all hang on what does not move."""
+    """The links of mobility.urdf, by name.
+
+    Raises:
+        ValueError: a part hangs on another that moves, or its joint neither turns nor slides within limits.
+    """
     urdf = ET.parse(root / "mobility.urdf").getroot()
     links = {
         link.get("name"): Link(
@@ -96,13 +100,21 @@ def read_links(root: Path) -> dict[str, Link]:
     }
     for joint in urdf.findall("joint"):
         name, kind = joint.find("child").get("link"), joint.get("type")
-        if kind in ("revolute", "prismatic"):
+        if kind not in ("fixed", "revolute", "prismatic"):
+            raise ValueError(f"{root}: expected fixed, revolute and prismatic joints, found {kind} of {name}")
+        if kind != "fixed":
             limit = joint.find("limit")
             links[name] = links[name]._replace(
                 kind=kind,
                 axis=numbers(joint.find("axis"), "xyz"),
                 point=numbers(joint.find("origin"), "xyz"),
                 limits=(float(limit.get("lower")), float(limit.get("upper"))),
+            )
+    for joint in urdf.findall("joint"):
+        name, parent = joint.find("child").get("link"), joint.find("parent").get("link")
+        if links[parent].kind:
+            raise ValueError(
+                f"{root}: expected parts that hang on what stands still, found {name} on {parent}"
             )
     return {name: link for name, link in links.items() if link.meshes}
 
@@ -131,7 +143,7 @@ def model_of(links: dict[str, Link], random: np.random.Generator, size: int) -> 
             files[f"{key}.obj"] = (
                 trimesh.Trimesh(points, mesh.faces, process=False).export(file_type="obj").encode()
             )
-            material = len(files) % 3 + 3 * (link.kind is not None)
+            material = len(files) % MATERIALS  # parts and frames share them
             assets.append(f'<mesh name="{key}" file="{key}.obj" inertia="shell"/>')
             geoms.append(
                 f'<geom type="mesh" mesh="{key}" material="m{material}" contype="0" conaffinity="0"/>'
@@ -192,7 +204,7 @@ def eye(random: np.random.Generator) -> np.ndarray:
 def draw(
     model: mujoco.MjModel, movers: list[str], values: list[float], viewmats: np.ndarray, size: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Pictures [C, H, W, 3] before black, depths and labels of one state."""
+    """Pictures [C, H, W, 3] on black, depths and labels of one state."""
     data, renderer = mujoco.MjData(model), mujoco.Renderer(model, size, size)
     for name, value in zip(movers, values, strict=True):
         data.joint(name).qpos[0] = value

@@ -33,9 +33,12 @@ OBJECTS: dict[str, Callable[..., Sequence]] = {
 }
 NOISE = {"exact": 0.0, "0.5 % noise": 0.005}
 AVERAGED = ("axis_deg", "line_mm", "travel_deg", "travel_mm", "point_mm", "chamfer_mm", "iou")
-PANELS = ("axis_deg", "angle between the axes [deg]", 1e-3), ("chamfer_mm", "Chamfer distance [mm]", 0.1)
+PANELS = (
+    ("axis_deg", "angle between the axes [deg]", 1e-3),
+    ("point_mm", "points after the motion off [mm]", 1e-2),
+)
 PRINTED = {"ArtGS": 0.05, "DTA": 0.13, "PARIS": 11.14}  # mean angles of their synthetic objects, degrees
-FOUND_IOU = 0.5  # overlap from which a part counts as found
+FOUND_IOU = 0.5  # overlap from which a part counts as found, if its points come less than a pixel off
 
 
 def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
@@ -56,7 +59,9 @@ def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
         number = match.found.get(label, 0)
         if number and match.ious[label] >= FOUND_IOU:
             mine, its = points[found.labels == number], exact[exactly == label]
-            parts[name] = part_scores(found.motions[number], mine, its, joint) | {"iou": match.ious[label]}
+            scores = part_scores(found.motions[number], mine, its, joint) | {"iou": match.ious[label]}
+            if scores["point_mm"] < 1000 * pixel_width(states[0]):
+                parts[name] = scores
     return {
         "found": len(parts),
         "true_parts": len(truth.names),
@@ -119,7 +124,7 @@ def mean_of(parts: dict[str, dict[str, Any]], key: str) -> float | None:
 
 
 def figure(rows: list[dict[str, Any]], path: Path) -> None:
-    """Axes and surfaces: a dot for each part, a column for each object and kind of depth."""
+    """Axes and motions: a dot for each part, a column for each object and kind of depth."""
     from matplotlib.figure import Figure
 
     objects, kinds = (list(dict.fromkeys(row[key] for row in rows)) for key in ("object", "depth"))
@@ -129,11 +134,12 @@ def figure(rows: list[dict[str, Any]], path: Path) -> None:
         for row in rows:
             kind = kinds.index(row["depth"])
             column = objects.index(row["object"]) + 0.3 * (kind - (len(kinds) - 1) / 2)
+            column += 0.07 * (row["seed"] - 1)
             values = [part[key] for part in row["parts"].values() if part.get(key) is not None]
-            places = column + 0.05 * (row["seed"] - 1) * np.ones(len(values))
+            places = column * np.ones(len(values))
             axes.plot(places, np.maximum(values, floor), "o", color=f"C{kind}", markersize=4, alpha=0.7)
-            if row["found"] < row["true_parts"]:
-                axes.plot(column, floor, "x", color=f"C{kind}", markersize=8, clip_on=False)
+            missed = floor * 1.35 ** -np.arange(1, 1 + row["true_parts"] - row["found"])
+            axes.plot(column * np.ones(len(missed)), missed, "x", color=f"C{kind}", markersize=5)
         axes.set(yscale="log", ylabel=label)
         axes.set_xticks(range(len(objects)), [name.replace(", ", ",\n") for name in objects], fontsize=7)
         axes.grid(axis="y", linewidth=0.3)

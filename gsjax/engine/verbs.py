@@ -180,8 +180,8 @@ def parts(
         ticks, whose `result` is a `PartsResult`: the scene with its parts, `weights`, `poses(t)`, `joints()`.
 
     Raises:
-        ValueError: there are fewer than two cameras or frames, Gaussians are given without an anchor, or
-            nothing is found that moves.
+        ValueError: there are fewer than two cameras or frames, Gaussians are given without an anchor, two
+            states have no depth, or nothing is found that moves.
         DataError: a picture cannot be read.
     """
     from gsjax.engine.parts.start import FIT, detect_motion, discover, has_two_states

@@ -18,7 +18,7 @@ from gsjax.engine.distill.file import NAME
 from gsjax.engine.distill.query import QueryableField
 from gsjax.engine.distill.saved import AS_IT_WAS, FieldRun, Whereabouts, field_of, open_field_run
 from gsjax.engine.files import read_drawable, read_frames, reopen
-from gsjax.engine.folder import expect_run
+from gsjax.engine.folder import expect_run, is_run
 from gsjax.engine.messages import Notes, describe
 from gsjax.engine.parts.films import SCRIPT, edited, read_film
 from gsjax.engine.parts.saved import blend_of, open_parts_run, read_parts
@@ -82,7 +82,7 @@ def open_viewable(
         return _of_files(path, files, notes), path
     if (path / NAME).is_file():
         return _of_field(path, notes, now), path
-    if (path / SCRIPT).is_file():
+    if (path / SCRIPT).is_file() and not is_run(path):
         _expect_only((), now, f"{path} is a film of `gsjax edit`")
         return _of_film(path, notes), path
     expect_run(path)

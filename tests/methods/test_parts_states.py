@@ -9,8 +9,9 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 import gsjax
+from gsjax.engine.parts.start import detect_motion, has_two_states
 from gsjax.engine.scores import true_labels_at
-from gsjax.methods.parts import PartsConfig
+from gsjax.methods.parts import DiscoverConfig, PartsConfig
 from gsjax.methods.parts.states import states_of
 from gsjax.methods.parts.states.labels import connections, labels_of
 from gsjax.methods.parts.states.registration import (
@@ -302,3 +303,14 @@ def slide(by, axis):
     motion = np.eye(4)
     motion[axis, 3] = by
     return motion
+
+
+def test_two_states_without_depth_are_refused_unless_all_may_move(cabinet):
+    alone = replace(cabinet, load_depth=None)
+    assert not has_two_states(alone)
+    with pytest.raises(ValueError, match="expected depth of two frames by cameras that stand elsewhere"):
+        detect_motion(alone, PartsConfig(), None)
+    free = PartsConfig(discover=DiscoverConfig(difference=False))
+    assert detect_motion(alone, free, None)[1] is not None
+    stands = replace(cabinet, viewmats=np.stack([cabinet.viewmats[0]] * 2))
+    assert not has_two_states(stands)

@@ -121,8 +121,8 @@ def telling_camera(film: Film, saved: PartsRun, script: Script) -> int:
 
 
 def read_film(folder: Path) -> tuple[Script, Path]:
-    """The edits of a film, and the run that they are of: the one that the folder lies in, as films do by
-    default, else the one that it was made from.
+    """The edits of a film, and the run that it was made from; if that is gone, the one that the folder lies
+    in, as films do by default.
 
     Raises:
         ValueError: the edits cannot be read.
@@ -132,10 +132,10 @@ def read_film(folder: Path) -> tuple[Script, Path]:
         script = parse_script((folder / SCRIPT).read_text(encoding="utf-8"))
     except ValueError as error:
         raise ValueError(f"{folder / SCRIPT}: {error}") from error
-    run = folder.absolute().parent.parent
-    if not is_run(run):
-        run = Path(read_values(folder / _METRICS, parse_json).get("run", run))
-        expect_run(run, "`gsjax parts`")
+    around = folder.absolute().parent.parent
+    made_from = Path(read_values(folder / _METRICS, parse_json).get("run", around))
+    run = around if is_run(around) and not is_run(made_from) else made_from
+    expect_run(run, "`gsjax parts`")
     return script, run
 
 

@@ -16,12 +16,23 @@ FIT = FitConfig(
     steps=3_000, cap=15_000, sh_degree=0, depth_weight=0.5, exposure=True, start=StartConfig(count=10_000)
 )
 """Default settings of the fit of the canonical scene."""
+_STANDS = (
+    1e-3  # by how much a pose may differ, in metres or as a rotation, for a camera to stand where it was
+)
 
 
 def has_two_states(tracked: Sequence) -> bool:
-    """Whether a recording shows two states, each by cameras of its own, and no motion between them."""
-    stands = np.allclose(tracked.viewmats[0], tracked.viewmats[-1], atol=1e-6)
-    return tracked.num_frames == 2 and not stands
+    """Whether a recording shows two states, with depth, each by cameras of its own, and no motion between
+    them."""
+    return tracked.has_depth and _looks_from_elsewhere(tracked)
+
+
+def _looks_from_elsewhere(tracked: Sequence) -> bool:
+    """Whether there are two frames, and most of the cameras stand elsewhere in the second."""
+    if tracked.num_frames != 2:
+        return False
+    apart = np.abs(tracked.viewmats[0] - tracked.viewmats[1]).max((-1, -2))
+    return float(np.mean(apart > _STANDS)) > 0.5
 
 
 def detect_motion(
@@ -40,16 +51,17 @@ def detect_motion(
         ValueError: there is no such frame, nothing moves, or two states have no depth.
     """
     if has_two_states(tracked):
-        if not tracked.has_depth:
-            raise ValueError(
-                f"{tracked.name}: found two frames by cameras that stand elsewhere in each, and no depth; "
-                "what moved between two states is searched for in space. Add depth of both, measured or by a "
-                "network (docs/data.md), or record more frames by cameras that stand still"
-            )
         check_anchor(anchor, tracked.num_frames)
         chosen = anchor or 0
         return Anchor(chosen, 1 - chosen, np.zeros(2)), None
     cameras, discover = tracked.num_cameras, config.discover
+    if discover.difference and _looks_from_elsewhere(tracked):
+        raise ValueError(
+            f"{tracked.name}: expected depth of two frames by cameras that stand elsewhere in each, found "
+            "none; what moved between two states is searched for in space. Add depth of both, measured or by "
+            "a network (docs/data.md), record more frames by cameras that stand still, or turn "
+            "discover.difference off, so that all segments may move"
+        )
     chosen = choose_anchor(tracked.image, tracked.num_frames, cameras, anchor)
     depth = tracked.depth if tracked.has_depth else None
     return chosen, moved_pixels(

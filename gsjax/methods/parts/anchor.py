@@ -19,7 +19,9 @@ _NOISE_FACTOR = 4.0  # differences above this many times the noise level are mot
 _MOST_FRAMES = 16  # compared with the anchor at full size
 _NEARER = 0.02  # share of its depth by which what comes before something is nearer
 _AS_FAR = 0.01  # share of its depth by which the same surface may be nearer or farther
-_SAME_PATTERN, _SAME_HUE = 0.15, 0.03  # differences of patterns, relative, and of shares of a colour
+_PATTERNED = 0.01  # contrast of a pattern, relative to the brightness around
+_SAME_PATTERN, _OF_CONTRAST = 0.03, 0.7  # differences of one pattern: always, and of its contrast
+_SAME_HUE = 0.03  # differences of the shares of a colour
 _WINDOW, _AROUND = 7, 5  # pixels over which brightness, and differences, are averaged
 _DARK = 0.02  # brightness below which neither pattern nor hue is known
 _LEAST_MOVED = 1e-3  # share of the pixels that must change for anything to have moved
@@ -96,8 +98,8 @@ def moved_pixels(
             paper, only the frame that differs most is compared, so objects that return to their places are
             missed.
         threshold: least difference of colours, which range from 0 to 1.
-        depth: loads depths, if cameras measure them: where something nearer is seen, nothing has moved away,
-            something has come before it; and where the same surface is lighter or darker, a shadow has moved.
+        depth: loads depths, if cameras measure them: where something nearer is seen, it covers what is there,
+            which has not moved; where the same surface is lighter or darker, only the light has changed.
 
     Raises:
         ValueError: nothing moves.
@@ -113,14 +115,17 @@ def moved_pixels(
     ]
     limit, moved = max(threshold, _NOISE_FACTOR * float(np.median(steps))), []
     for c, here in enumerate(heres):
-        nows = [_blurred(load(t, c)) for t in sorted(others)]
-        changed = np.array([difference_image(now, here) > limit for now in nows])
-        if depth is not None and (before := depth(anchor.frame, c)) is not None:
-            deep = [depth(t, c) for t in sorted(others)]
-            changed &= np.array([~_is_covered(before, after) for after in deep])
-            both = zip(nows, deep, strict=True)
-            changed &= np.array([~_is_lit_otherwise(here, now, before, after) for now, after in both])
-        moved.append(changed)
+        before = None if depth is None else depth(anchor.frame, c)
+        surface = None if before is None else _Surface.of(here, before)
+        changed = []
+        for t in sorted(others):
+            now = _blurred(load(t, c))
+            different = difference_image(now, here) > limit
+            if surface is not None and (after := depth(t, c)) is not None:
+                different &= ~_is_covered(surface.depth, after)
+                different &= ~_is_lit_otherwise(surface, _Surface.of(now, after))
+            changed.append(different)
+        moved.append(np.array(changed))
     share = np.mean(np.any(moved, axis=1))
     if share < _LEAST_MOVED:
         raise ValueError(
@@ -130,39 +135,46 @@ def moved_pixels(
     return np.array(moved)
 
 
-def _is_covered(
-    before: Float[np.ndarray, "H W"], now: Float[np.ndarray, "H W"] | None
-) -> Bool[np.ndarray, "H W"]:
-    """Where something nearer than before is seen; nowhere without depth."""
-    return np.zeros(before.shape, bool) if now is None else (now > 0) & (now < (1 - _NEARER) * before)
+class _Surface(NamedTuple):
+    """What a camera sees, apart from how it is lit.
+
+    Attributes:
+        depth: metres, 0 where unknown.
+        pattern: colours relative to the brightness around each pixel.
+        hue: the shares of red, green and blue.
+        contrast: how strong the pattern around each pixel is.
+    """
+
+    depth: Float[np.ndarray, "H W"]
+    pattern: Float[np.ndarray, "H W 3"]
+    hue: Float[np.ndarray, "H W 3"]
+    contrast: Float[np.ndarray, "H W"]
+
+    @classmethod
+    def of(cls, picture: Float[np.ndarray, "H W 3"], depth: Float[np.ndarray, "H W"]) -> "_Surface":
+        """What a picture and its depth show."""
+        level = cv2.blur(picture, (_WINDOW, _WINDOW)).mean(-1, keepdims=True)
+        pattern = cv2.blur(picture, (3, 3)) / np.maximum(level, _DARK)
+        mean = cv2.blur(picture, (_AROUND, _AROUND))
+        hue = mean / np.maximum(mean.sum(-1, keepdims=True), 3 * _DARK)
+        gray = pattern.mean(-1)
+        contrast = cv2.blur(np.abs(gray - cv2.blur(gray, (_WINDOW, _WINDOW))), (_WINDOW, _WINDOW))
+        return cls(depth, pattern, hue, contrast)
 
 
-def _is_lit_otherwise(
-    here: Float[np.ndarray, "H W 3"],
-    now: Float[np.ndarray, "H W 3"],
-    before: Float[np.ndarray, "H W"],
-    after: Float[np.ndarray, "H W"] | None,
-) -> Bool[np.ndarray, "H W"]:
-    """Where the same surface is seen in other light: as far away, of the same hue, and with the same pattern
-    relative to the brightness around it; nowhere without depth."""
-    if after is None:
-        return np.zeros(before.shape, bool)
-    same = (before > 0) & (after > 0) & (np.abs(after - before) < _AS_FAR * before)
-    pattern, hue = (f(here) - f(now) for f in (_pattern, _hue))
-    unlike = cv2.blur(np.abs(pattern).mean(-1), (_AROUND, _AROUND))
-    return same & (unlike < _SAME_PATTERN) & (np.abs(hue).max(-1) < _SAME_HUE)
+def _is_covered(before: Float[np.ndarray, "H W"], now: Float[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"]:
+    """Where something nearer than before is seen."""
+    return (now > 0) & (now < (1 - _NEARER) * before)
 
 
-def _pattern(picture: Float[np.ndarray, "H W 3"]) -> Float[np.ndarray, "H W 3"]:
-    """A picture relative to the mean around each pixel."""
-    mean = cv2.blur(picture, (_WINDOW, _WINDOW))
-    return cv2.blur(picture, (3, 3)) / np.maximum(mean, _DARK)
-
-
-def _hue(picture: Float[np.ndarray, "H W 3"]) -> Float[np.ndarray, "H W 3"]:
-    """The shares of red, green and blue."""
-    mean = cv2.blur(picture, (_AROUND, _AROUND))
-    return mean / np.maximum(mean.sum(-1, keepdims=True), 3 * _DARK)
+def _is_lit_otherwise(here: _Surface, now: _Surface) -> Bool[np.ndarray, "H W"]:
+    """Where the same surface is seen in other light: as far away, of the same hue, and with the same pattern,
+    if there is one: two plain surfaces cannot be told apart."""
+    same = (here.depth > 0) & (now.depth > 0) & (np.abs(now.depth - here.depth) < _AS_FAR * here.depth)
+    unlike = cv2.blur(np.abs(here.pattern - now.pattern).mean(-1), (_AROUND, _AROUND))
+    contrast = np.minimum(here.contrast, now.contrast)
+    alike = (contrast > _PATTERNED) & (unlike < _SAME_PATTERN + _OF_CONTRAST * contrast)
+    return same & alike & (np.abs(here.hue - now.hue).max(-1) < _SAME_HUE)
 
 
 def difference_image(

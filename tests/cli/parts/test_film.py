@@ -1,5 +1,6 @@
 """A film of `gsjax edit` leaves as a sequence of files or as a page, and is viewed like a run."""
 
+import json
 import shutil
 
 import numpy as np
@@ -68,8 +69,9 @@ def test_a_film_is_viewed_over_its_own_time(film):
 def test_a_film_whose_run_is_gone_names_it(gsjax, film, tmp_path):
     alone = tmp_path / "alone"
     shutil.copytree(film, alone)
-    text = (alone / "metrics.json").read_text()
-    (alone / "metrics.json").write_text(text.replace("film0/run", "film0/gone"))
+    found = json.loads((alone / "metrics.json").read_text())
+    found["run"] = str(tmp_path / "gone")
+    (alone / "metrics.json").write_text(json.dumps(found))
     code, said = gsjax("export", alone, tmp_path / "film.html")
     assert code != 0
     assert "gone: expected the folder of a run of `gsjax parts`, found nothing there" in said
@@ -77,3 +79,15 @@ def test_a_film_whose_run_is_gone_names_it(gsjax, film, tmp_path):
     code, said = gsjax("export", alone, tmp_path / "film.html")
     assert code != 0
     assert "edit.yaml: edits: expected" in said
+
+
+def test_a_film_goes_along_with_its_run(gsjax, made, film, tmp_path):
+    moved = tmp_path / "elsewhere"
+    shutil.copytree(made[0], moved)
+    shutil.copytree(film, moved / "edit" / "slow")
+    (moved / "edit.yaml").write_text(SCRIPT)  # a script in the run does not make a film of it
+    found = json.loads((film / "metrics.json").read_text()) | {"run": str(tmp_path / "gone")}
+    (moved / "edit" / "slow" / "metrics.json").write_text(json.dumps(found))
+    notes = Notes(Console(quiet=True))
+    assert open_viewable(moved / "edit" / "slow", notes)[0].num_frames == 13
+    assert open_viewable(moved, notes)[0].num_frames == 4

@@ -24,7 +24,7 @@ _SHARPNESS = 0.1  # differences of costs that count
 _PULL = 0.5  # of the cameras, relative to a connection
 _ITERATIONS = 300
 _APART = 0.5  # spacings by which the two sides of a thin plate are kept apart
-_TURNS = 3  # of labels and of who takes a place
+_TURNS = 3  # of labels, and of which points take the places
 
 
 def connections(surface: Surface, spacing: float) -> csr_array:
@@ -76,7 +76,7 @@ def labels_of(
 
     A point gains nothing by a place that another takes, by another motion: a wall along which a drawer slides
     fits, where the drawer hides it, as if it had slid too, but only onto what else of the wall is seen to
-    stay. Who takes a place is told by the labels, so both are found in turn.
+    stay. Which point takes a place is told by the labels, so both are found in turn.
 
     Args:
         costs: from `costs_of`, for each motion.
@@ -93,7 +93,7 @@ def labels_of(
         taken = np.zeros(costs.shape)
         for k, j, rows, others in claims:
             taken[rows, k] = np.maximum(taken[rows, k], shares[others, j])
-        shares = _spread(costs + worth * np.clip(2 * taken, 0, 1), links)  # who more likely has it, has it
+        shares = _spread(costs + worth * np.clip(2 * taken, 0, 1), links)
     return shares.argmax(-1)
 
 
