@@ -10,11 +10,11 @@ from rich.console import Console
 from rich.progress import track
 
 from gsjax.data.text import decoded
-from gsjax.engine.folder import holds_something
+from gsjax.engine.folder import SCRIPT, holds_something
 from gsjax.engine.locks import lock, releasing_locks
 from gsjax.engine.messages import Notes, counted, stage
 from gsjax.engine.options import Common, Overwriting
-from gsjax.engine.parts.films import SCRIPT, VIDEO, Shot, edited, new_folder, telling_camera, write_film
+from gsjax.engine.parts.films import VIDEO, Shot, edited, new_folder, telling_camera, write_film
 from gsjax.engine.parts.saved import open_parts_run
 from gsjax.methods.parts.operation import Edit
 from gsjax.methods.parts.operations import OPERATIONS, Composite

@@ -37,6 +37,7 @@ _RESUMED = ("resume/*", "canonical/resume/*", "canonical/scene.ply")
 OF_QUERY = ("query.json", "selection.npz", "masks", "frames", "video.mp4", "overview.png")
 OF_QUERY += ("object.ply", "without.ply", "recolored.ply", "moved.ply", f"*{ENDING}")
 """The files that `gsjax query` writes."""
+SCRIPT = "edit.yaml"  # the edits of a film of `gsjax edit`, whose folder it marks
 _ANEW = "restore it, or replace the run with --overwrite"
 SIGNATURE = "# gsjax run"  # the first line of config.yml: other programs write files of that name too
 

@@ -18,9 +18,9 @@ from gsjax.data.consistency import check_photographs, check_recording
 from gsjax.data.errors import MissingFile
 from gsjax.data.open import SIMULATED_PREFIX, ReadOptions, is_dataset_file, is_photographs, is_recording
 from gsjax.data.pictures import warn_of_cut_off
-from gsjax.engine.folder import is_of_run, is_run
+from gsjax.engine.folder import SCRIPT, is_of_run, is_run
 from gsjax.engine.info_picture import by_camera, by_split, write_picture
-from gsjax.engine.info_run import describe_run
+from gsjax.engine.info_run import describe_film, describe_run
 from gsjax.engine.info_scene import describe_frames, describe_scene, origin_fact
 from gsjax.engine.messages import Notes
 from gsjax.engine.options import Common, Reading
@@ -42,8 +42,8 @@ class Options(Common, Reading):
     """Options of `gsjax info`."""
 
     path: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="DATASET|RUN|FILE")]
-    """Folder of a recording or of photographs; a built-in scene such as simulated:tabletop; folder of a run;
-    a file of Gaussians, or a folder of numbered ones."""
+    """Folder of a recording or of photographs; a built-in scene such as simulated:tabletop; folder of a run
+    or of a film; a file of Gaussians, or a folder of numbered ones."""
     picture: Path | None = None
     """Draw the cameras and the points, from above and from the side, into this file (.png, .svg or .pdf)."""
 
@@ -109,6 +109,8 @@ def _scene_at(path: Path) -> Callable[[], dict[str, str]] | None:
         )
     if is_run(path):
         return partial(describe_run, path)
+    if (path / SCRIPT).is_file():
+        return partial(describe_film, path)
     if files := frame_files(path):
         return partial(describe_frames, files)
     if is_scene(path / "meta.json"):

@@ -1,14 +1,15 @@
-"""What a run came to, as `gsjax info` prints it."""
+"""What a run or a film came to, as `gsjax info` prints it."""
 
 import warnings
 from pathlib import Path
 
 from gsjax.engine.compare.data import SCORES, data_in_words, data_of
-from gsjax.engine.folder import is_finished, is_resumable
+from gsjax.engine.folder import is_finished, is_resumable, read_values
 from gsjax.engine.info_scene import describe_scene
-from gsjax.engine.messages import describe
+from gsjax.engine.messages import counted, describe
 from gsjax.engine.records import EVALUATION, Record, kind_of, read_record
 from gsjax.engine.summary import cards_of
+from gsjax.io.parsed import parse_json
 
 
 def describe_run(path: Path) -> dict[str, str]:
@@ -35,6 +36,29 @@ def describe_run(path: Path) -> dict[str, str]:
             warnings.warn(describe(error), UserWarning, stacklevel=1)
     if (report := path / "report.html").is_file():
         facts["report"] = str(report)
+    return facts
+
+
+def describe_film(path: Path) -> dict[str, str]:
+    """Facts about a film of `gsjax edit`: its run, its edits, and how long it is.
+
+    Raises:
+        ValueError, OSError: its edits cannot be read, or its run is gone.
+    """
+    from gsjax.engine.parts.films import VIDEO, read_film  # slow to import
+
+    script, run = read_film(path)
+    found = read_values(path / "metrics.json", parse_json)
+    whole = "" if found.get("complete", True) else ", stopped before its end"
+    facts = {
+        "film": f"gsjax edit {run}{whole}",
+        "edits": "; ".join(edit.operation() for edit in script.edits),
+    }
+    facts["length"] = f"{found['seconds']:.2f} s, {counted(found['frames'], 'frame')}"
+    facts["Gaussians"] = f"{found['num_gaussians']:,}"
+    facts["video"] = str(path / VIDEO)
+    if notes := found.get("notes"):
+        facts["notes"] = "\n".join(map(str, notes))
     return facts
 
 

@@ -18,9 +18,9 @@ from gsjax.engine.distill.file import NAME
 from gsjax.engine.distill.query import QueryableField
 from gsjax.engine.distill.saved import AS_IT_WAS, FieldRun, Whereabouts, field_of, open_field_run
 from gsjax.engine.files import read_drawable, read_frames, reopen
-from gsjax.engine.folder import expect_run, is_run
+from gsjax.engine.folder import SCRIPT, expect_run, is_run
 from gsjax.engine.messages import Notes, describe
-from gsjax.engine.parts.films import SCRIPT, edited, read_film
+from gsjax.engine.parts.films import edited, read_film
 from gsjax.engine.parts.saved import blend_of, open_parts_run, read_parts
 from gsjax.engine.parts.viewer import Filmed, camera_names, editing_of
 from gsjax.engine.photographs import photographs_of_run

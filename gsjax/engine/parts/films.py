@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from gsjax.engine.files import write_scene
-from gsjax.engine.folder import expect_run, is_run, read_values
+from gsjax.engine.folder import SCRIPT, expect_run, is_run, read_values
 from gsjax.engine.machine import describe as describe_machine
 from gsjax.engine.messages import Notes, counted, reason
 from gsjax.engine.parts.saved import PartsRun, read_parts_about
@@ -38,8 +38,6 @@ from gsjax.scene.gaussians import Gaussians, take
 from gsjax.scene.handles import Blend
 from gsjax.scene.render import render_with_room
 
-SCRIPT = "edit.yaml"
-"""The edits, whose file marks the folder of a film."""
 VIDEO = "video.mp4"
 """The video, in the folder of a film."""
 _METRICS, _PLY = "metrics.json", "ply"

@@ -66,6 +66,14 @@ def test_a_film_is_viewed_over_its_own_time(film):
     assert scene.shots is not None
 
 
+def test_a_film_is_described(gsjax, made, film):
+    code, said = gsjax("info", film)
+    assert code == 0, said
+    assert f"gsjax edit {made[0]}" in said
+    assert "speed; move; fade; echo" in said
+    assert "0.87 s, 13 frames" in said
+
+
 def test_a_film_whose_run_is_gone_names_it(gsjax, film, tmp_path):
     alone = tmp_path / "alone"
     shutil.copytree(film, alone)
