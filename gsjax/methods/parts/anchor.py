@@ -121,7 +121,8 @@ def moved_pixels(
         for t in sorted(others):
             now = _blurred(load(t, c))
             different = difference_image(now, here) > limit
-            if surface is not None and (after := depth(t, c)) is not None:
+            after = None if depth is None else depth(t, c)
+            if surface is not None and after is not None:
                 different &= ~_is_covered(surface.depth, after)
                 different &= ~_is_lit_otherwise(surface, _Surface.of(now, after))
             changed.append(different)
