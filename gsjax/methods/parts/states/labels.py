@@ -93,7 +93,8 @@ def labels_of(
         taken = np.zeros(costs.shape)
         for k, j, rows, others in claims:
             taken[rows, k] = np.maximum(taken[rows, k], shares[others, j])
-        shares = _spread(costs + worth * np.clip(2 * taken, 0, 1), links)
+        likely = np.clip(2 * taken, 0, 1)  # wholly, from even chances on
+        shares = _spread(costs + worth * likely, links)
     return shares.argmax(-1)
 
 
