@@ -37,6 +37,10 @@ class Options(Common, Overwriting):
     """A YAML file of edits."""
     op: Annotated[tuple[str, ...], tyro.conf.UseAppendAction, tyro.conf.arg(metavar="OP:KEY=VALUE,...")] = ()
     """An edit, after those of the script: "speed:parts=drawer,factor=2"."""
+    fps: float | None = None
+    """Frames a second; default: those of the script, else of the recording."""
+    length: float | None = None
+    """Seconds; default: those of the script, else as long as the recording and the edits require."""
     out: Path | None = None
     """Folder for the film; default: RUN/edit/NAME, where NAME is the script's name or, without a script, ops,
     ops_2 and so on."""
@@ -118,7 +122,11 @@ def read_script(options: Options) -> Script:
             edits.append(parse_op(text, number))
         except ValueError as error:
             raise ValueError(f"--op {text!r}: {error}") from error
-    return replace(script, edits=(*script.edits, *edits))
+    given = {key: value for key in ("fps", "length") if (value := getattr(options, key)) is not None}
+    try:
+        return replace(script, edits=(*script.edits, *edits), **given)
+    except ValueError as error:
+        raise ValueError(f"--{error}") from error
 
 
 def _folder(options: Options) -> Path:

@@ -43,20 +43,20 @@ def describe_film(path: Path) -> dict[str, str]:
     """Facts about a film of `gsjax edit`: its run, its edits, and how long it is.
 
     Raises:
-        ValueError, OSError: its edits cannot be read, or its run is gone.
+        ValueError, OSError: its edits or its numbers cannot be read.
     """
-    from gsjax.engine.parts.films import VIDEO, read_film  # slow to import
+    from gsjax.engine.parts.films import VIDEO, read_edits_of  # slow to import
 
-    script, run = read_film(path)
+    edits = read_edits_of(path).edits
     found = read_values(path / "metrics.json", parse_json)
     whole = "" if found.get("complete", True) else ", stopped before its end"
     facts = {
-        "film": f"gsjax edit {run}{whole}",
-        "edits": "; ".join(edit.operation() for edit in script.edits),
+        "film": f"gsjax edit {found['run']}{whole}",
+        "edits": "; ".join(edit.operation() for edit in edits),
+        "length": f"{found['seconds']:.2f} s, {counted(found['frames'], 'frame')}",
+        "Gaussians": f"{found['num_gaussians']:,}",
+        "video": str(path / VIDEO),
     }
-    facts["length"] = f"{found['seconds']:.2f} s, {counted(found['frames'], 'frame')}"
-    facts["Gaussians"] = f"{found['num_gaussians']:,}"
-    facts["video"] = str(path / VIDEO)
     if notes := found.get("notes"):
         facts["notes"] = "\n".join(map(str, notes))
     return facts

@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from gsjax.engine.files import write_scene
-from gsjax.engine.folder import SCRIPT, expect_run, is_run, read_values
+from gsjax.engine.folder import SCRIPT, is_run, read_values
 from gsjax.engine.machine import describe as describe_machine
 from gsjax.engine.messages import Notes, counted, reason
 from gsjax.engine.parts.saved import PartsRun, read_parts_about
@@ -126,15 +126,28 @@ def read_film(folder: Path) -> tuple[Script, Path]:
         ValueError: the edits cannot be read.
         OSError: a file is missing, or the run is gone.
     """
-    try:
-        script = parse_script((folder / SCRIPT).read_text(encoding="utf-8"))
-    except ValueError as error:
-        raise ValueError(f"{folder / SCRIPT}: {error}") from error
+    script = read_edits_of(folder)
     around = folder.absolute().parent.parent
     made_from = Path(read_values(folder / _METRICS, parse_json).get("run", around))
     run = around if is_run(around) and not is_run(made_from) else made_from
-    expect_run(run, "`gsjax parts`")
+    if not is_run(run):
+        raise FileNotFoundError(
+            f"{folder}: expected the run of this film, {run}, found none there; move the film into its "
+            "run, as RUN/edit/NAME"
+        )
     return script, run
+
+
+def read_edits_of(folder: Path) -> Script:
+    """The edits of a film.
+
+    Raises:
+        ValueError: they cannot be read.
+    """
+    try:
+        return parse_script((folder / SCRIPT).read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise ValueError(f"{folder / SCRIPT}: {error}") from error
 
 
 def new_folder(parent: Path, name: str) -> Path:

@@ -108,7 +108,8 @@ def _next_steps(folder: RunFolder, found: Metrics) -> list[tuple[str, str]]:
         return []
     run = shlex.quote(str(folder.path))
     part = max(found["parts"], key=lambda row: row["moved_mm"])["part"]
+    fps = " --fps 15" if found["frames"]["followed"] == 2 else ""  # of two states nothing is seen in between
     return [
         ("view it, and edits of it", f"gsjax view {run}"),
-        ("a film of an edit", f'gsjax edit {run} --op "speed:parts={part},factor=2"'),
+        ("a film of an edit", f'gsjax edit {run} --op "speed:parts={part},factor=2"{fps}'),
     ]

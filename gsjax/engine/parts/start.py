@@ -59,8 +59,8 @@ def detect_motion(
         raise ValueError(
             f"{tracked.name}: expected depth of two frames by cameras that stand elsewhere in each, found "
             "none; what moved between two states is searched for in space. Add depth of both, measured or by "
-            "a network (docs/data.md), record more frames by cameras that stand still, or turn "
-            "discover.difference off, so that all segments may move"
+            "a network (docs/data.md), record more frames by cameras that stand still, or give "
+            "--parts.discover.no-difference, by which all segments may move"
         )
     chosen = choose_anchor(tracked.image, tracked.num_frames, cameras, anchor)
     depth = tracked.depth if tracked.has_depth else None

@@ -82,7 +82,10 @@ def test_a_film_whose_run_is_gone_names_it(gsjax, film, tmp_path):
     (alone / "metrics.json").write_text(json.dumps(found))
     code, said = gsjax("export", alone, tmp_path / "film.html")
     assert code != 0
-    assert "gone: expected the folder of a run of `gsjax parts`, found nothing there" in said
+    assert f"alone: expected the run of this film, {tmp_path / 'gone'}, found none there" in said
+    code, said = gsjax("info", alone)
+    assert code == 0, said
+    assert "13 frames" in said
     (alone / "edit.yaml").write_text("edits: 3")
     code, said = gsjax("export", alone, tmp_path / "film.html")
     assert code != 0
@@ -99,3 +102,13 @@ def test_a_film_goes_along_with_its_run(gsjax, made, film, tmp_path):
     notes = Notes(Console(quiet=True))
     assert open_viewable(moved / "edit" / "slow", notes)[0].num_frames == 13
     assert open_viewable(moved, notes)[0].num_frames == 4
+
+
+def test_frames_a_second_and_length_may_be_given(gsjax, made, tmp_path):
+    asked = ("edit", made[0], "--op", "speed:parts=drawer,factor=2", "--fps", 30, "--length", 0.5)
+    code, said = gsjax(*asked, "--out", tmp_path / "film")
+    assert code == 0, said
+    assert "0.50 s, 15 frames" in said
+    code, said = gsjax(*asked[:-3], "-1", "--out", tmp_path / "other")
+    assert code != 0
+    assert "--fps: expected frames a second, 0.1 to 1000, found -1" in said
