@@ -298,7 +298,8 @@ def _note_what_was_lost(
             between = f"between {lost[0]} and {last}" if len(lost) > 1 or to_the_end else f"number {lost[0]}"
             notes.say(f"{names[label]}: lost in {counted(len(lost), 'frame')}, {between}.")
         unknown = turn_unknown_from(tracking, values, label)
-        if unknown is not None and not (to_the_end and unknown >= lost[0]):
+        begins = lost[np.diff(lost, prepend=-1) > 1]  # where each loss begins; frame 0 is never lost
+        if unknown is not None and (not to_the_end or unknown < begins[-1]):
             why = "it was lost then" if unknown in lost else "other rotations agree as well"
             notes.say(f"{names[label]}: its rotation is unknown from frame {unknown} on: {why}.")
     for label in sorted({*groups.tolist()}):

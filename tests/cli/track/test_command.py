@@ -201,8 +201,9 @@ def test_segmented_objects_are_scored_as_what_they_cover(pristine, tmp_path, gsj
 def test_a_run_says_what_was_lost_and_whose_turn_is_not_known(
     pristine, tmp_path, gsjax_track, still, monkeypatch
 ):
-    """The can is lost in update 1 alone, as is the ball, whose turn is then known for one more update; from
-    update 3 on it is not. How the carton is turned is not known since it was lost, in update 2."""
+    """The can is lost in updates 1 and 3, the last, and its turn is not known from update 2 on. The ball is
+    lost in update 1; its turn is then known for one more update, and from update 3 on not. How the carton is
+    turned is not known since it was lost, in update 2."""
     ids: list[int] = []
 
     def flagged(scene, first, frames, config, **how):
@@ -210,7 +211,9 @@ def test_a_run_says_what_was_lost_and_whose_turn_is_not_known(
         for t, now in enumerate(still(scene, first, frames, config), 1):
             lost, known = np.zeros(len(ids), bool), np.ones(len(ids), bool)
             lost[[ids.index(CAN), ids.index(BALL)]] = t == 1
+            lost[ids.index(CAN)] |= t == 3
             lost[ids.index(CARTON)] = t == 2
+            known[ids.index(CAN)] = t < 2
             known[ids.index(BALL)] = t == 2
             known[ids.index(CARTON)] = t < 2
             yield replace(now, info=now.info | {"lost": lost, "turn_known": known})
@@ -221,26 +224,28 @@ def test_a_run_says_what_was_lost_and_whose_turn_is_not_known(
     assert [note for note in found["notes"] if note.startswith(("carton:", "can:", "ball:"))] == [
         "carton: lost in 1 frame, number 2.",
         "carton: its rotation is unknown from frame 2 on: it was lost then.",
-        "can: lost in 1 frame, number 1.",
+        "can: lost in 2 frames, between 1 and the end.",
+        "can: its rotation is unknown from frame 2 on: other rotations agree as well.",
         "ball: lost in 1 frame, number 1.",
         "ball: its rotation is unknown from frame 3 on: other rotations agree as well.",
     ]
     objects = found["objects"]
     lost = {name: o["frames_lost"] for name, o in objects.items() if o["frames_lost"]}
-    assert lost == {"carton": 1, "can": 1, "ball": 1}
+    assert lost == {"carton": 1, "can": 2, "ball": 1}
     unknown = {name: o["turn_unknown_from"] for name, o in objects.items() if o["turn_unknown_from"]}
-    assert unknown == {"carton": 2, "ball": 3}
+    assert unknown == {"carton": 2, "can": 2, "ball": 3}
     with np.load(tmp_path / "run" / "trajectory.npz") as stored:
         objects = stored["label_ids"][1:].tolist()
         frames, of = np.nonzero(stored["lost"])
         assert {(t, objects[k]) for t, k in zip(frames, of, strict=True)} == {
             (1, CAN),
+            (3, CAN),
             (1, BALL),
             (2, CARTON),
         }
         frames, of = np.nonzero(~stored["turn_known"])
         unknown = {(t, objects[k]) for t, k in zip(frames, of, strict=True)}
-        assert unknown == {(1, BALL), (3, BALL), (2, CARTON), (3, CARTON)}
+        assert unknown == {(1, BALL), (3, BALL), (2, CAN), (3, CAN), (2, CARTON), (3, CARTON)}
 
 
 def test_finished_run_is_kept_unless_asked(pristine, tmp_path, gsjax_track, still):
