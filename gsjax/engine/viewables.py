@@ -21,7 +21,7 @@ from gsjax.engine.files import read_drawable, read_frames, reopen
 from gsjax.engine.folder import SCRIPT, expect_run, is_run
 from gsjax.engine.messages import Notes, describe
 from gsjax.engine.parts.films import edited, read_film
-from gsjax.engine.parts.saved import blend_of, open_parts_run, read_parts
+from gsjax.engine.parts.saved import PartsRun, blend_of, open_parts_run, read_parts
 from gsjax.engine.parts.viewer import Filmed, camera_names, editing_of
 from gsjax.engine.photographs import photographs_of_run
 from gsjax.engine.query import asking_of
@@ -32,6 +32,9 @@ from gsjax.io.scenes import is_scene
 from gsjax.io.sequences import frame_files
 from gsjax.methods.deform import DeformResult
 from gsjax.methods.deform.query import most_likely
+from gsjax.methods.parts.film import Layer
+from gsjax.methods.parts.timeline import Names
+from gsjax.scene.handles import Blend
 from gsjax.scene.origin import moved_to
 from gsjax.viz.colors import to_uint8
 from gsjax.viz.viewer import Motion, Shots, Viewable, moved
@@ -260,18 +263,15 @@ def _of_track(path: Path, notes: Notes) -> Viewable:
 def _of_parts(path: Path, notes: Notes) -> Viewable:
     """The scene of a run of `gsjax parts` over time, with its cameras if the recording is still there."""
     layer, names, origin = read_parts(path)
-    saved, shots = None, None
+    saved = None
     try:
         saved = open_parts_run(path)
     except ValueError as error:
         notes.warn(f"its recording is not shown, and nothing can be edited: {error}")
     else:
-        if saved.complete:
-            shots = _shots_of_recording(saved.recording)
-        else:
+        if not saved.complete:
             notes.warn("a partial run: it has only the frames that were followed, and no cameras")
-    times, blend = np.asarray(layer.trajectory.times), blend_of(path) if saved is None else saved.blend
-    filmed = Filmed(path.absolute().name, names, blend, times - times[0], shots)
+    filmed = _filmed(path, layer, names, blend_of(path) if saved is None else saved.blend, saved)
     scene = filmed.viewable((layer,), None if saved is None else editing_of(saved, filmed))
     return replace(scene, origin=origin)
 
@@ -283,10 +283,15 @@ def _of_film(path: Path, notes: Notes) -> Viewable:
     film, doubts = edited(script, saved)
     for doubt in doubts:
         notes.warn(doubt)
-    times = np.asarray(saved.layer.trajectory.times)
-    shots = _shots_of_recording(saved.recording) if saved.complete else None
-    filmed = Filmed(path.absolute().name, saved.names, saved.blend, times - times[0], shots)
+    filmed = _filmed(path, saved.layer, saved.names, saved.blend, saved)
     return replace(filmed.viewable(film), origin=saved.recording.judged.origin)
+
+
+def _filmed(path: Path, layer: Layer, names: Names, blend: Blend, saved: PartsRun | None) -> Filmed:
+    """What the films of a run have in common, with its cameras if it is complete."""
+    times = np.asarray(layer.trajectory.times)
+    shots = None if saved is None or not saved.complete else _shots_of_recording(saved.recording)
+    return Filmed(path.absolute().name, names, blend, times - times[0], shots)
 
 
 def _shots_of(photographs: Photographs) -> Shots:

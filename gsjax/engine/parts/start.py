@@ -16,9 +16,7 @@ FIT = FitConfig(
     steps=3_000, cap=15_000, sh_degree=0, depth_weight=0.5, exposure=True, start=StartConfig(count=10_000)
 )
 """Default settings of the fit of the canonical scene."""
-_STANDS = (
-    1e-3  # by how much a pose may differ, in metres or as a rotation, for a camera to stand where it was
-)
+_STANDS = 1e-3  # largest difference of the poses of a camera that stands still, metres or of a rotation
 
 
 def has_two_states(tracked: Sequence) -> bool:

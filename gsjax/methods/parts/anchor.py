@@ -113,16 +113,16 @@ def moved_pixels(
     steps = [
         np.median(difference_image(_blurred(load(t, c)), heres[c])) for c in range(cameras) for t in beside
     ]
+    deep: LoadDepth = depth or (lambda t, c: None)
     limit, moved = max(threshold, _NOISE_FACTOR * float(np.median(steps))), []
     for c, here in enumerate(heres):
-        before = None if depth is None else depth(anchor.frame, c)
+        before = deep(anchor.frame, c)
         surface = None if before is None else _Surface.of(here, before)
         changed = []
         for t in sorted(others):
             now = _blurred(load(t, c))
             different = difference_image(now, here) > limit
-            after = None if depth is None else depth(t, c)
-            if surface is not None and after is not None:
+            if surface is not None and (after := deep(t, c)) is not None:
                 different &= ~_is_covered(surface.depth, after)
                 different &= ~_is_lit_otherwise(surface, _Surface.of(now, after))
             changed.append(different)
