@@ -18,6 +18,7 @@ from gsjax.methods.parts.states.registration import (
     Target,
     axes_of,
     guesses,
+    likeness,
     matched,
     moved,
     registered,
@@ -297,6 +298,18 @@ def test_a_hidden_wall_does_not_follow_what_slides_along_it(slides):
     motions = [np.eye(4), slide(0.3, 0)]
     labels = labels_of(costs, connections(wall, 0.01), wall, motions, 0.015)
     assert (labels[(x > 0.05) & (x < 0.35)] == slides).all()
+
+
+@pytest.mark.parametrize(("off", "worth"), [(0.0, 1.0), (0.01, 0.75), (0.018, 0.19)])
+def test_a_point_counts_less_the_farther_off_the_plane_it_comes(off, worth):
+    """Two drawers that had moved by five pixels more and less were one that had moved by the mean."""
+    flat = np.stack(np.meshgrid(np.arange(0, 0.4, 0.01), np.arange(0, 0.2, 0.01), indexing="ij"), -1)
+    points = np.insert(flat.reshape(-1, 2), 2, 0.0, axis=1)
+    normals, colors = np.tile([0, 0, 1.0], (len(points), 1)), np.full_like(points, 0.5)
+    sheet = Surface(points, normals, colors, *around(points, normals, colors, 0.01))
+    target = Target(sheet, 0.002, points.min(0) - 0.05, points.max(0) + 0.05)
+    found = likeness(slide(off, 2), sheet, target, 0.02, 0.15)
+    np.testing.assert_allclose(found, worth, atol=1e-6)
 
 
 def slide(by, axis):
