@@ -24,6 +24,26 @@ def nearest(
     return np.where(np.isfinite(distances), indices, -1), distances
 
 
+def nearest_neighbors(points: Float[np.ndarray, "n 3"], k: int) -> Int[np.ndarray, "n k"]:
+    """Indices of the `k` nearest other points of each point; the point itself where there are fewer, and for
+    a point that is not finite.
+
+    Args:
+        points: positions, metres.
+        k: number of neighbours.
+    """
+    found = np.tile(np.arange(len(points))[:, None], (1, k))
+    finite = np.flatnonzero(np.isfinite(points).all(axis=1))
+    count = min(k, len(finite) - 1)
+    if count < 1:
+        return found
+    _, nearby = cKDTree(points[finite]).query(points[finite], k=count + 1)
+    own = nearby == np.arange(len(finite))[:, None]
+    own[~own.any(axis=1), -1] = True  # of many points at one place, a point itself may not be among them
+    found[finite, :count] = finite[nearby[~own].reshape(-1, count)]
+    return found
+
+
 def neighbor_spacing(points: Float[np.ndarray, "n 3"], k: int = 3) -> Float[np.ndarray, "n"]:
     """Root mean square distance to the `k` nearest other points, metres; 3DGS initialises scales with it."""
     k = min(k, len(points) - 1)

@@ -31,50 +31,25 @@ from gsjax.methods.distill import (
     teacher_of_objects,
 )
 from gsjax.methods.query import relevancy, threshold_for
-from gsjax.rasterize.frozen import paint, paint_shown
+from gsjax.rasterize.frozen import paint_shown
 from gsjax.scene.feature_grid import FeatureGridConfig, locate
 from gsjax.scene.gaussians import gaussians_from_activated
-from tests.methods.around import cameras_around
+from tests.methods.two_balls import BOOK, DIMENSION, HEIGHT, WIDTH, cameras, painted, two_balls
 
-WIDTH, HEIGHT, DIMENSION = 48, 36, 24
 GRID = FeatureGridConfig(
     levels=4, least_resolution=4, most_resolution=16, log2_entries=10, features=4, hidden=16
 )
 QUICK = DistillConfig(iterations=120, channels=12, grid=GRID, contrast_patch=8)
-BOOK = np.linalg.qr(np.random.default_rng(0).normal(size=(DIMENSION, 3)))[0].T.astype(np.float32)
 
-painted = jax.jit(paint)
 features_now = jax.jit(features_of)
 rendered_now = jax.jit(rendered_features)
 cosines_now = jax.jit(gaussian_cosines)
 pixels_now = jax.jit(pixel_cosines)
 
 
-def cameras(count: int) -> list[Camera]:
-    angles = np.linspace(0, 2 * np.pi, count, endpoint=False)
-    return cameras_around(angles, WIDTH, HEIGHT)
-
-
-@pytest.fixture(scope="module")
-def two_balls():
-    """A ball of Gaussians in front of another, their labels 1 and 2, and masks of eight cameras."""
-    random = np.random.default_rng(1)
-    directions = random.normal(size=(160, 3))
-    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    centres = np.repeat([[0.0, -0.5, 0.0], [0.0, 0.5, 0.0]], 80, axis=0)
-    scene = gaussians_from_activated(
-        centres + 0.35 * directions,
-        random.normal(size=(160, 4)),
-        np.full((160, 3), 0.07),
-        np.full(160, 0.95),
-        random.uniform(size=(160, 3)),
-    )
-    labels = np.repeat([1, 2], 80)
-    masks = []
-    for view, plan in frozen_views(scene, cameras(8)):
-        shares = np.asarray(painted(view, np.eye(3, dtype=np.float32)[labels], plan)[0])
-        masks.append(np.where(shares.sum(-1) > 0.5, shares.argmax(-1), 0))
-    return scene, labels, masks
+@pytest.fixture(scope="module", name="two_balls")
+def of_two_balls():
+    return two_balls()
 
 
 @pytest.fixture(scope="module")

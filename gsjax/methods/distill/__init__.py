@@ -8,7 +8,9 @@ scores = now.result.scores(vectors)
 
 config.py   configuration
 teacher.py  target features of pixels
+views.py    the scene and the teacher in each view
 field.py    hash grid and convolution
+solve.py    a vector for each Gaussian, by least squares
 update.py   the loss, and one optimization step
 method.py   the method of the drive loop
 result.py   the field with its queries
@@ -17,7 +19,13 @@ inverse.py  a learned inverse of the convolution
 votes.py    labels by majority vote, the baseline
 """
 
-from gsjax.methods.distill.config import DistillConfig, DistillRatesConfig, DistillWeightsConfig
+from gsjax.methods.distill.config import (
+    PRESETS,
+    DistillConfig,
+    DistillRatesConfig,
+    DistillWeightsConfig,
+    SolveConfig,
+)
 from gsjax.methods.distill.field import (
     FeatureField,
     active_table,
@@ -27,7 +35,7 @@ from gsjax.methods.distill.field import (
     rendered_features,
 )
 from gsjax.methods.distill.inverse import learned_inverse
-from gsjax.methods.distill.method import Distill, Problem, frozen_views, view_batch
+from gsjax.methods.distill.method import Distill, Problem, field_step
 from gsjax.methods.distill.query import (
     back_projected_cosines,
     gaussian_cosines,
@@ -36,11 +44,14 @@ from gsjax.methods.distill.query import (
 )
 from gsjax.methods.distill.result import DistillResult
 from gsjax.methods.distill.teacher import Teacher, teacher_of_maps, teacher_of_objects, with_maps
-from gsjax.methods.distill.update import Batch, distill_loss
+from gsjax.methods.distill.solve import SolveBatch, solve_step
+from gsjax.methods.distill.update import distill_loss
 from gsjax.methods.distill.update import distill_step as step
+from gsjax.methods.distill.views import Batch, frozen_views, view_batch
 from gsjax.methods.distill.votes import label_votes, majority_labels
 
 __all__ = [
+    "PRESETS",
     "Batch",
     "Distill",
     "DistillConfig",
@@ -49,11 +60,14 @@ __all__ = [
     "DistillWeightsConfig",
     "FeatureField",
     "Problem",
+    "SolveBatch",
+    "SolveConfig",
     "Teacher",
     "active_table",
     "back_projected_cosines",
     "distill_loss",
     "features_of",
+    "field_step",
     "frozen_views",
     "full_table",
     "gaussian_cosines",
@@ -64,6 +78,7 @@ __all__ = [
     "pixel_cosines",
     "pixel_features",
     "rendered_features",
+    "solve_step",
     "step",
     "teacher_of_maps",
     "teacher_of_objects",

@@ -47,11 +47,35 @@ class DistillWeightsConfig:
 
 
 @dataclass(frozen=True)
+class SolveConfig:
+    """Configuration of a solution: a vector for each Gaussian by linear least squares."""
+
+    iterations: int = 15
+    """Iterations of conjugate gradients, each a pass over all views, after the vote."""
+    smoothness: float = 0.03
+    """Weight of the squared difference of neighbours in space, relative to the pixels that show a Gaussian in
+    the mean."""
+    neighbors: int = 8
+    """Number of neighbours of each Gaussian."""
+    energy: float = 0.9999
+    """Share of the teacher's features, squared, that the channels keep; `channels` is their largest number."""
+
+    def __post_init__(self):
+        expect(self, "solve.", iterations=(1, np.inf), smoothness=(0, np.inf), neighbors=(1, 64))
+        expect(self, "solve.", energy=(1e-6, 1))
+
+
+@dataclass(frozen=True)
 class DistillConfig:
     """Configuration of a distillation."""
 
+    start: Literal["random", "vote", "solve"] = "random"
+    """What training begins with: random values; a vote, in which each Gaussian has the mean feature of the
+    pixels that show it; or the vectors by which the views show the teacher's features best (least squares)."""
+    solve: SolveConfig = field(default_factory=SolveConfig)
+    """Settings of that start, unless it is random."""
     iterations: int = 1500
-    """Number of steps, of one view each."""
+    """Number of training steps, of one view each; 0: the vectors of the start are the field."""
     channels: int = 256
     """Channels of a Gaussian's feature; the convolution maps them to the teacher's channels."""
     encoding: Literal["grid", "table"] = "grid"
@@ -79,7 +103,7 @@ class DistillConfig:
     def __post_init__(self):
         expect(
             self,
-            iterations=(1, np.inf),
+            iterations=(1 if self.start == "random" else 0, np.inf),
             channels=(1, 4096),
             contrast_after=(0, 1),
             contrast_gamma=(1e-6, np.inf),
@@ -88,3 +112,13 @@ class DistillConfig:
         )
         if self.contrast_pool not in POOLS:
             raise ValueError(f"contrast_pool: expected one of {POOLS}, found {self.contrast_pool}")
+
+
+PRESETS = {
+    "vote": DistillConfig(start="vote", iterations=0),
+    "solve": DistillConfig(start="solve", iterations=0),
+    "field": DistillConfig(start="solve", iterations=200),
+    "paper": DistillConfig(),
+}
+"""Settings by name, the fastest first: the mean of the pixels that show each Gaussian; the least-squares
+solution; a hash grid that begins as that solution; and the training of FD-3DGS."""

@@ -17,13 +17,17 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from gsjax.methods.distill.config import DistillConfig
+from gsjax.optim.step import per_field_adam
 from gsjax.scene.feature_grid import FeatureGrid, Located, init_feature_grid, locate
 
 _MARGIN = 0.02  # of the box beyond the outermost Gaussians, as a share of its size
 _OUTLIERS = 0.01  # share of the Gaussians that may lie far out on either side of an axis
+_RATES = {"table": 2.5e-2, "layers": 5e-3}  # of the fit to vectors, as of the descent
+_FINAL_RATE, _SOME = 0.1, 4096
 _FAR_OUT = 0.5  # how far the box extends beyond the others, as a share of their extent
 
 
@@ -140,6 +144,47 @@ def rendered_features(
 def features_of(field: FeatureField, located: Located | None) -> Float[Array, "n channels"]:
     """The feature f of each Gaussian."""
     return field.encoding.at(located) if isinstance(field.encoding, FeatureGrid) else field.encoding
+
+
+def fitted_to_vectors(
+    field: FeatureField,
+    located: Located | None,
+    vectors: Float[Array, "n channels"],
+    key: PRNGKeyArray,
+    steps: int = 400,
+) -> FeatureField:
+    """A field whose encoding has the given vectors at the Gaussians, as far as it can.
+
+    Args:
+        field: the field before.
+        located: locations of the Gaussians in its grid; None for a vector per Gaussian.
+        vectors: the vector of each Gaussian.
+        key: random key that draws the Gaussians of each step.
+        steps: steps of Adam, of a few thousand Gaussians each.
+    """
+    if located is None:
+        return eqx.tree_at(lambda f: f.encoding, field, vectors)
+    return eqx.tree_at(lambda f: f.encoding, field, _fitted(field.encoding, located, vectors, key, steps))
+
+
+@partial(jax.jit, static_argnames="steps")
+def _fitted(grid: FeatureGrid, located: Located, vectors: Float[Array, "n c"], key, steps: int):
+    falling = optax.exponential_decay(1.0, steps, _FINAL_RATE)
+    rates = {name: lambda count, rate=rate: rate * falling(count) for name, rate in _RATES.items()}
+    optimizer = per_field_adam(rates)
+
+    def loss(grid, some):
+        found = grid.at(Located(*(a[some] for a in located)))
+        return jnp.mean(jnp.where(located.valid[some, None], (found - vectors[some]) ** 2, 0.0))
+
+    def step(carry, key):
+        grid, state = carry
+        some = jax.random.randint(key, (min(_SOME, len(vectors)),), 0, len(vectors))
+        updates, state = optimizer.update(jax.grad(loss)(grid, some), state)
+        return (eqx.apply_updates(grid, updates), state), None
+
+    (grid, _), _ = jax.lax.scan(step, (grid, optimizer.init(grid)), jax.random.split(key, steps))
+    return grid
 
 
 def active_table(

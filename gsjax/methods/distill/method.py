@@ -1,9 +1,10 @@
-"""The method of the drive loop: views with their teacher, and the field that they train."""
+"""The method of the drive loop: a solution of linear least squares, then the descent of the paper's losses."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,17 +12,19 @@ from jaxtyping import Array, Float, Int
 
 from gsjax.geometry.cameras import Camera
 from gsjax.methods.distill.config import DistillConfig
-from gsjax.methods.distill.field import active_table, init_field
+from gsjax.methods.distill.field import FeatureField, active_table, fitted_to_vectors, init_field
 from gsjax.methods.distill.result import DistillResult
-from gsjax.methods.distill.teacher import Teacher, max_rows, view_codebook
-from gsjax.methods.distill.update import Batch, contrast_begins, distill_step
+from gsjax.methods.distill.solve import SolveBatch, graph_of, passes, solve_step, unsolved
+from gsjax.methods.distill.teacher import Teacher, max_rows
+from gsjax.methods.distill.update import contrast_begins, distill_step
+from gsjax.methods.distill.views import Batch, expect_alike, frozen_views, view_batch
 from gsjax.methods.sampling import shuffled_index
 from gsjax.optim.method import Run
-from gsjax.optim.step import Step
-from gsjax.rasterize.frozen import FrozenView, freeze_views
-from gsjax.rasterize.plan import Plan
-from gsjax.scene.feature_grid import Located
+from gsjax.optim.step import Step, copied
+from gsjax.scene.feature_grid import FeatureGrid, Located
 from gsjax.scene.gaussians import Gaussians
+
+_FIT = 1  # folded into the seed for the key of the grid's fit to vectors
 
 
 class Problem(NamedTuple):
@@ -32,6 +35,10 @@ class Problem(NamedTuple):
         rows: indices of the grid's entries that are trained; None without a grid.
         means: centres of the scene's Gaussians, metres.
         source, scene: as in `DistillResult`.
+        neighbors: of each Gaussian, in a solution; None without one.
+        untrained: the field at which the descent after a solution begins, but for what it takes from that; None
+            without.
+        located: the locations of the Gaussians in its grid; None without one.
     """
 
     views: list[Batch]
@@ -39,11 +46,34 @@ class Problem(NamedTuple):
     means: Float[Array, "n 3"]
     source: Any
     scene: Mapping[str, Any]
+    neighbors: Int[Array, "n k"] | None = None
+    untrained: FeatureField | None = None
+    located: Located | None = None
+
+
+def field_step(config: DistillConfig) -> Step:
+    """`solve_step` for a `SolveBatch`, `distill_step` for a `Batch`; both advance a `FeatureField`.
+
+    Args:
+        config: configuration of the distillation.
+    """
+
+    def of(is_solving: bool) -> Step:
+        return solve_step(config) if is_solving else distill_step(config)
+
+    def init(params: FeatureField) -> Any:
+        return of(config.start != "random" and not isinstance(params.encoding, FeatureGrid)).init(params)
+
+    def update(params: FeatureField, state: Any, batch: SolveBatch | Batch, *, step: Any, key: Any):
+        return of(isinstance(batch, SolveBatch)).update(params, state, batch, step=step, key=key)
+
+    return Step(init, update)
 
 
 @dataclass(frozen=True)
 class Distill:
-    """Distillation of a semantic field of a static scene (`gsjax.optim.method.Method`).
+    """Distillation of a semantic field of a static scene (`gsjax.optim.method.Method`): first the passes of a
+    vote or a solution, if it does not start at random, then the steps of a descent.
 
     Attributes:
         config: configuration of the field and its training.
@@ -73,10 +103,16 @@ class Distill:
         Raises:
             ValueError: the teacher's views differ in number or size, or no Gaussian has a finite centre.
         """
-        _check(cameras, teacher)
-        config = self.config
-        found, located = init_field(jax.random.key(config.seed), config, gaussians.means, teacher.dimension)
-        found, located, rows = active_table(found, located)
+        expect_alike(cameras, teacher)
+        config, solved, located, rows, untrained = self.config, None, None, None, None
+        if config.start != "random":
+            solved = unsolved(teacher, gaussians.num, config)
+            config = replace(config, channels=solved.channels)
+        if config.iterations:
+            untrained, located = init_field(
+                jax.random.key(config.seed), config, gaussians.means, teacher.dimension
+            )
+            untrained, located, rows = active_table(untrained, located)
         most = max_rows(teacher)
         views = [
             view_batch(teacher, v, most, located, frozen)
@@ -85,87 +121,55 @@ class Distill:
         ]
         about = {"num_gaussians": gaussians.num, "rasterize_mode": rasterize_mode} | dict(scene or {})
         problem = Problem(views, rows, jnp.asarray(gaussians.means), source, about)
-        return problem, Run(found, jax.jit(self.step.init)(found))
+        if solved is None:
+            return problem, Run(untrained, jax.jit(self.step.init)(untrained))
+        neighbors = graph_of(gaussians.means, config)
+        problem = problem._replace(neighbors=neighbors, untrained=untrained, located=located)
+        return problem, Run(solved, jax.jit(self.step.init)(solved))
 
     @property
     def step(self) -> Step:
-        """See `distill_step`."""
-        return distill_step(self.config)
+        """See `field_step`."""
+        return field_step(self.config)
+
+    def steps_of_solution(self, problem: Problem) -> int:
+        """Number of steps before the descent: one for each view in each pass."""
+        return passes(self.config) * len(problem.views)
 
     def total(self, problem: Problem) -> int:
-        """Number of steps, `config.iterations`."""
-        return self.config.iterations
+        """Number of steps, those of the solution and `config.iterations`."""
+        return self.steps_of_solution(problem) + self.config.iterations
 
     def period(self, problem: Problem) -> int:
         """Number of views."""
         return len(problem.views)
 
     def between(self, problem: Problem, run: Run, progress: float) -> Run:
-        """The run, without its guard as the contrastive loss begins. Arguments as for `Method.between`."""
-        begins = self.config.weights.contrast and run.step == contrast_begins(self.config)
+        """The run, with the field of the descent after the last step of the solution; without its guard as
+        losses become others. Arguments as for `Method.between`."""
+        step = run.step - self.steps_of_solution(problem)
+        if step < 0:
+            return run if run.step % len(problem.views) else run.having(guard=None)  # a pass has one loss
+        if step == 0 and problem.untrained is not None:
+            key = jax.random.fold_in(jax.random.key(self.config.seed), _FIT)
+            solved: FeatureField = run.params
+            fitted = fitted_to_vectors(problem.untrained, problem.located, solved.encoding, key)
+            params = copied(eqx.tree_at(lambda f: f.lift, fitted, solved.lift))
+            return run.having(params=params, state=jax.jit(distill_step(self.config).init)(params))
+        begins = self.config.weights.contrast and step == contrast_begins(self.config)
         return run.having(guard=None) if begins else run
 
-    def batch(self, problem: Problem, run: Run, progress: float) -> tuple[Batch, tuple[str, ...]]:
-        """The next view, in shuffled order, with its own plan. Arguments as for `Method.batch`."""
-        return problem.views[shuffled_index(self.config.seed, run.step, len(problem.views))], ()
+    def batch(self, problem: Problem, run: Run, progress: float) -> tuple[SolveBatch | Batch, tuple[str, ...]]:
+        """The next view: in order for a solution, shuffled in the descent. Arguments as for `Method.batch`."""
+        begun, count = self.steps_of_solution(problem), len(problem.views)
+        if run.step < begun:
+            assert problem.neighbors is not None
+            turn, v = divmod(run.step, count)
+            return SolveBatch(problem.views[v], problem.neighbors, turn, v == count - 1), ()
+        v = shuffled_index(self.config.seed, run.step - begun, count)
+        return problem.views[v]._replace(begun=begun), ()
 
     def result(self, problem: Problem, run: Run) -> DistillResult:
         """The field. It shares the arrays of the run, which later steps may donate."""
-        return DistillResult(run.params, problem.rows, problem.source, problem.scene, problem.means)
-
-
-def view_batch(
-    teacher: Teacher, v: int, rows: int, located: Located | None, frozen: tuple[FrozenView, Plan]
-) -> Batch:
-    """The input of a step on one view.
-
-    Args:
-        teacher: teacher of all views.
-        v: index of the view.
-        rows: number of rows to pad its codebook to, at least `max_rows`.
-        located: locations of the Gaussians in the grid; None without one.
-        frozen: the scene in the view's camera, and its plan.
-    """
-    (view, plan), (ids, codebook) = frozen, view_codebook(teacher, v, rows)
-    pixels = None if teacher.maps is None else teacher.maps[v]
-    return Batch(view, located, *jax.device_put((ids, codebook)), pixels, plan)
-
-
-def frozen_views(
-    gaussians: Gaussians, cameras: Sequence[Camera], rasterize_mode: str = "classic"
-) -> list[tuple[FrozenView, Plan]]:
-    """The frozen scene in each camera. Views of one size share their plan and the lengths of their lists.
-
-    Args:
-        gaussians: the scene.
-        cameras: cameras of the views.
-        rasterize_mode: "classic" or "antialiased", as the scene was fitted.
-    """
-    kinds = [(camera.width, camera.height, camera.near, camera.fisheye is not None) for camera in cameras]
-    found: dict[int, tuple[FrozenView, Plan]] = {}
-    for kind in sorted(set(kinds)):
-        which, (width, height, near, bends) = [v for v, each in enumerate(kinds) if each == kind], kind
-        scene = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities)
-        viewmats, Ks, fisheye = (
-            jax.device_put(np.stack([getattr(cameras[v], name) for v in which])) if name else None
-            for name in ("viewmat", "K", "fisheye" if bends else None)
-        )
-        options = {"fisheye": fisheye, "near_plane": near, "rasterize_mode": rasterize_mode}
-        views, plan = freeze_views(*scene, viewmats, Ks, width, height, **options)
-        views = jax.device_get(views)
-        for place, v in enumerate(which):
-            found[v] = (jax.device_put(jax.tree.map(lambda a, place=place: a[place], views)), plan)
-    return [found[v] for v in range(len(cameras))]
-
-
-def _check(cameras: Sequence[Camera], teacher: Teacher) -> None:
-    if len(cameras) != len(teacher.ids):
-        raise ValueError(f"teacher: expected ids of {len(cameras)} views, found {len(teacher.ids)}")
-    if teacher.maps is not None and len(teacher.maps) != len(cameras):
-        raise ValueError(f"teacher: expected maps of {len(cameras)} views, found {len(teacher.maps)}")
-    for v, (camera, ids) in enumerate(zip(cameras, teacher.ids, strict=True)):
-        if ids.shape != (camera.height, camera.width):
-            raise ValueError(
-                f"teacher: expected {camera.width}x{camera.height} pixels in view {v} like its camera, found "
-                f"{ids.shape[1]}x{ids.shape[0]}"
-            )
+        rows = problem.rows if isinstance(run.params.encoding, FeatureGrid) else None
+        return DistillResult(run.params, rows, problem.source, problem.scene, problem.means)

@@ -23,32 +23,11 @@ from gsjax.losses.features import (
 from gsjax.losses.regularization import total_variation
 from gsjax.methods.distill.config import DistillConfig
 from gsjax.methods.distill.field import FeatureField, RenderedFeatures, rendered_features
+from gsjax.methods.distill.views import Batch, stretched
 from gsjax.optim.step import Step, gradient_step, per_field_adam
-from gsjax.rasterize.frozen import FrozenView, paint_shown, rows_within, strip_of
-from gsjax.rasterize.plan import Plan
-from gsjax.scene.feature_grid import Located
+from gsjax.rasterize.frozen import paint_shown, rows_within, strip_of
 
 _FINAL_RATE = 0.1
-
-
-class Batch(NamedTuple):
-    """A view and its teacher.
-
-    Attributes:
-        view: the static scene in the view's camera.
-        located: locations of its Gaussians in the grid; None without one.
-        ids: row of the codebook, or object, of each pixel; -1 where unknown.
-        codebook: the teacher's features in this view; None for a teacher of maps only.
-        map: the teacher's feature map, of any resolution; None without. It stays on the host until its step.
-        plan: plan of the view, which never grows, as the view is frozen.
-    """
-
-    view: FrozenView
-    located: Located | None
-    ids: Int[Array, "height width"]
-    codebook: Float[Array, "k d"] | None
-    map: Float[Array, "h w d"] | None
-    plan: Plan
 
 
 class _Sums(NamedTuple):
@@ -78,7 +57,7 @@ def distill_step(config: DistillConfig) -> Step:
 
 
 def contrast_begins(config: DistillConfig) -> int:
-    """The step from which on the contrastive loss counts."""
+    """The step of the descent from which on the contrastive loss counts."""
     return math.ceil(config.contrast_after * config.iterations)
 
 
@@ -104,7 +83,7 @@ def distill_loss(config: DistillConfig) -> Callable:
         if weights.contrast:
             assert pooled is not None
             aux["contrast"] = jax.lax.cond(
-                jnp.asarray(step) >= contrast_begins(config),
+                jnp.asarray(step) - batch.begun >= contrast_begins(config),
                 lambda: _contrast(pooled, pooled_ids(batch.ids, edge), corner, config),
                 lambda: jnp.zeros((), pooled.dtype),
             )
@@ -215,7 +194,7 @@ def _teacher_sums(
         cos += jnp.where(known, cosine_error(like), 0.0).sum()
         pixels += known.sum(dtype=zero.dtype)
     if batch.map is not None:
-        wanted = _stretched(jnp.asarray(batch.map), first_row, len(inside), batch.plan)
+        wanted = stretched(jnp.asarray(batch.map), first_row, len(inside), batch.plan)
         like = likeness_to_map(rendered, lifted, wanted.reshape(len(alphas), -1))
         known = jnp.repeat(inside, batch.plan.width)
         weight = jnp.where(known, 1.0 if batch.codebook is None else map_weight, 0.0)
@@ -223,23 +202,6 @@ def _teacher_sums(
         cos += (weight * cosine_error(like)).sum()
         pixels += weight.sum()
     return _Sums(rec, cos, pixels, zero)
-
-
-def _stretched(
-    teacher: Float[Array, "h w d"], first: Int[Array, ""] | int, rows: int, plan: Plan
-) -> Float[Array, "rows width d"]:
-    """Rows of a teacher's map resized bilinearly to the view."""
-    high, wide = teacher.shape[:2]
-
-    def places(centres, have: int, want: int):
-        at = jnp.clip(centres * (have / want) - 0.5, 0, have - 1)
-        low = jnp.minimum(at.astype(jnp.int32), have - 1)
-        return low, jnp.minimum(low + 1, have - 1), at - low
-
-    top, bottom, down = places(first + jnp.arange(rows) + 0.5, high, plan.height)
-    left, right, across = places(jnp.arange(plan.width) + 0.5, wide, plan.width)
-    lines = teacher[top] * (1 - down)[:, None, None] + teacher[bottom] * down[:, None, None]
-    return lines[:, left] * (1 - across)[:, None] + lines[:, right] * across[:, None]
 
 
 def _patch_shape(shape: tuple[int, ...], config: DistillConfig) -> tuple[int, int]:

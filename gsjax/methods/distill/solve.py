@@ -1,0 +1,357 @@
+"""Vectors of Gaussians that are solved for, not descended to.
+
+Rendering is linear in the vectors x_i of Gaussians. So what L_rec (FD-3DGS, eq. 4) asks of them is a linear
+least-squares problem. With the weight w_pi of Gaussian i in pixel p, the pixel's alpha, its teacher's feature
+e_p, and m_p = 1 where there is one,
+
+    min_x  sum_p m_p |sum_i w_pi x_i - alpha_p e_p|^2  +  lambda sum_(i,j) |x_i - x_j|^2
+
+over pairs (i, j) of neighbours in space, which give what few pixels show the vectors around it. The normal
+equations (W^T M W + lambda L) x = W^T M alpha e are the same for each channel, and W is only ever applied:
+a product is a view drawn and drawn back. Rows of W^T M W sum to D = W^T M alpha, so that D^-1 (W^T M W) has no
+eigenvalue above 1, and conjugate gradients with D as the preconditioner converge in a few passes.
+
+Each step sees one view, and the sums of a pass over all views make an iteration: the first pass gives the
+right-hand side and D, and their quotient is where the iterations begin. That is a vote: each Gaussian has the
+mean of the features of the pixels that show it, as in Occam's LGS (Cheng et al. 2024) and LightSplat. The
+second pass gives the residual, and each further one an iteration.
+"""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from gsjax.geometry.neighbors import nearest_neighbors
+from gsjax.methods.distill.config import DistillConfig
+from gsjax.methods.distill.field import FeatureField
+from gsjax.methods.distill.teacher import Teacher
+from gsjax.methods.distill.views import Batch, stretched
+from gsjax.optim.step import Step, all_finite, keep_if
+from gsjax.rasterize.frozen import paint_shown, rows_within, strip_of
+
+_LEAST = 1e-12
+_SPREAD = 64  # most neighbours over which a vector spreads to Gaussians that no pixel shows
+
+
+class SolveBatch(NamedTuple):
+    """The input of a step.
+
+    Attributes:
+        view: a view and its teacher.
+        neighbors: the nearest others of each Gaussian.
+        turn: index of the pass over the views; the first is the vote.
+        is_last: whether the view is the last of its pass.
+    """
+
+    view: Batch
+    neighbors: Int[Array, "n k"]
+    turn: Int[Array, ""] | int
+    is_last: Bool[Array, ""] | bool
+
+
+class SolveState(NamedTuple):
+    """Conjugate gradients, with a step length of its own for each of r channels.
+
+    Attributes:
+        total: the sums of the present pass over the views.
+        wanted: the right-hand side.
+        mass: D, how much pixels show of each Gaussian.
+        tie: lambda.
+        residual, direction: of the iterations.
+        squared: residual . D^-1 residual.
+        target: sum of the squared targets, sum_p m_p |alpha_p e_p|^2.
+        pixels: sum of m_p.
+        loss: the objective after the latest pass, per pixel.
+    """
+
+    total: Float[Array, "n r"]
+    wanted: Float[Array, "n r"]
+    mass: Float[Array, "n"]
+    tie: Float[Array, ""]
+    residual: Float[Array, "n r"]
+    direction: Float[Array, "n r"]
+    squared: Float[Array, "r"]
+    target: Float[Array, ""]
+    pixels: Float[Array, ""]
+    loss: Float[Array, ""]
+
+
+class _Sums(NamedTuple):
+    """What a view adds to a pass: to its Gaussians' rows, to `mass`, `target` and `pixels`."""
+
+    rows: Float[Array, "seen r"]
+    mass: Float[Array, "seen"]
+    target: Float[Array, ""]
+    pixels: Float[Array, ""]
+
+
+def solve_step(config: DistillConfig) -> Step:
+    """One view of a pass of the solution of a `FeatureField` with a vector for each Gaussian, whose `lift`
+    has orthonormal columns and does not change; given a `SolveBatch`. Neither `step` nor `key` is used.
+
+    `info` has `rec` in addition to what every step reports: the objective after the latest whole pass, a mean
+    over pixels and the teacher's channels as for L_rec. A view whose sums are not finite adds nothing.
+
+    Args:
+        config: settings of the solution, and the memory of a strip.
+    """
+
+    def init(field: FeatureField) -> SolveState:
+        empty = jnp.zeros_like(field.encoding)
+        zero = jnp.zeros((), empty.dtype)
+        each = jnp.zeros(len(empty), empty.dtype)
+        none = jnp.zeros(empty.shape[1], empty.dtype)
+        return SolveState(empty, empty, each, zero, empty, empty, none, zero, zero, zero)
+
+    def update(field: FeatureField, state: SolveState, batch: SolveBatch, *, step: Any, key: Any):
+        found = jax.lax.cond(
+            jnp.asarray(batch.turn) == 0,
+            lambda: _targets_drawn_back(field, batch.view, config),
+            lambda: _product(
+                jnp.where(jnp.asarray(batch.turn) == 1, field.encoding, state.direction), batch.view, config
+            ),
+        )
+        rows = batch.view.view.rows
+        summed = state._replace(
+            total=state.total.at[rows].add(found.rows),
+            mass=state.mass.at[rows].add(found.mass),
+            target=state.target + found.target,
+            pixels=state.pixels + found.pixels,
+        )
+        after = jax.lax.cond(
+            batch.is_last,
+            lambda: _after_pass(field, summed, batch, config),
+            lambda: (field, summed),
+        )
+        sound = all_finite(after)
+        field, state = keep_if(sound, after, (field, state))
+        seen = jnp.where(state.pixels > 0, state.target / jnp.maximum(state.pixels, 1.0), 0.0)
+        loss = jnp.where(jnp.asarray(batch.turn) == 0, seen, state.loss)
+        info = {"rec": loss / field.dimension, "loss": loss, "skipped": ~sound}
+        return field, state, info | {"overflow": jnp.asarray(False), "needed": jnp.int32(0)}
+
+    return Step(init, update)
+
+
+def passes(config: DistillConfig) -> int:
+    """The number of passes over the views: one for the vote, one for its residual, one for each iteration.
+
+    Args:
+        config: settings of the solution.
+    """
+    return {"random": 0, "vote": 1, "solve": 2 + config.solve.iterations}[config.start]
+
+
+def unsolved(teacher: Teacher, num: int, config: DistillConfig) -> FeatureField:
+    """The field before its first step: vectors of zeros, in the channels of a basis in which the teacher's
+    features have `solve.energy` of their squared length.
+
+    Args:
+        teacher: the teacher's features.
+        num: number of Gaussians.
+        config: the energy, and the most channels.
+    """
+    basis = basis_of(teacher, config)
+    return FeatureField(jnp.zeros((num, basis.shape[1]), basis.dtype), jnp.asarray(basis))
+
+
+def basis_of(teacher: Teacher, config: DistillConfig) -> Float[np.ndarray, "d r"]:
+    """Orthonormal columns that span the teacher's features, the most important first. On the host.
+
+    Args:
+        teacher: the teacher's features; each row of its codebook counts as much as the others, and as a view's
+            map.
+        config: the energy that is kept, and the most channels.
+    """
+    gram = np.zeros((teacher.dimension, teacher.dimension))
+    if teacher.codebook is not None:
+        gram += np.asarray(teacher.codebook.T @ teacher.codebook, np.float64)
+    for features in teacher.maps or ():
+        flat = np.asarray(features, np.float32).reshape(-1, teacher.dimension)
+        gram += (flat.T @ flat) / len(flat)
+    values, vectors = np.linalg.eigh(gram)
+    values, vectors = np.maximum(values[::-1], 0.0), vectors[:, ::-1]
+    kept = np.cumsum(values) / max(values.sum(), _LEAST)
+    rank = int(np.searchsorted(kept, config.solve.energy)) + 1
+    return vectors[:, : min(rank, config.channels, teacher.dimension)].astype(np.float32)
+
+
+def graph_of(means: Float[Array, "n 3"], config: DistillConfig) -> Int[Array, "n k"]:
+    """The neighbours of each Gaussian; itself where there are too few. On the host.
+
+    Args:
+        means: centres of the Gaussians, metres; one that is not finite is its own neighbour.
+        config: the number of neighbours.
+    """
+    return jnp.asarray(nearest_neighbors(np.asarray(means), config.solve.neighbors), jnp.int32)
+
+
+def _targets_drawn_back(field: FeatureField, batch: Batch, config: DistillConfig) -> _Sums:
+    """W^T M alpha e and W^T M alpha of a view."""
+    empty = jnp.zeros((len(batch.view.rows), field.channels + 1), field.lift.dtype)
+
+    def cotangent(first, inside, image, alphas):
+        targets, weights = _targets(field, batch, first, inside, config.weights.map)
+        shown = alphas[..., None] * targets
+        squares = jnp.where(weights > 0, jnp.sum(shown**2, axis=-1) / jnp.maximum(weights, _LEAST), 0.0)
+        joined = jnp.concatenate([shown, (weights * alphas)[..., None]], axis=-1)
+        return joined, squares.sum(), weights.sum()
+
+    back, target, pixels = _drawn_back(empty, batch, config, cotangent)
+    return _Sums(back[:, :-1], back[:, -1], target, pixels)
+
+
+def _product(values: Float[Array, "n r"], batch: Batch, config: DistillConfig) -> _Sums:
+    """W^T M W values, of a view."""
+
+    def cotangent(first, inside, image, alphas):
+        zero = jnp.zeros((), image.dtype)
+        return _weights(batch, first, inside, config.weights.map)[..., None] * image, zero, zero
+
+    back, target, pixels = _drawn_back(values[batch.view.rows], batch, config, cotangent)
+    return _Sums(back, jnp.zeros(len(back), back.dtype), target, pixels)
+
+
+def _drawn_back(values: Float[Array, "seen c"], batch: Batch, config: DistillConfig, cotangent):
+    """The values drawn, and what `cotangent(first_row, inside, image, alphas)` makes of each strip of the
+    image drawn back to the Gaussians; and the sums of the two numbers that it returns beside that."""
+    plan = batch.plan
+    rows = rows_within(config.strip_megabytes, 3 * values.shape[1], plan)
+    high = rows * plan.tile_size
+
+    def strip(carry, number):
+        view, strip_plan = strip_of(batch.view, plan, number * rows, rows)
+        (image, alphas), back = jax.vjp(lambda some: paint_shown(view, some, strip_plan), values)
+        inside = number * high + jnp.arange(high) < plan.height
+        wanted, *numbers = cotangent(number * high, inside, image, alphas)
+        (found,) = back((wanted, jnp.zeros_like(alphas)))
+        return jax.tree.map(jnp.add, carry, (found, *numbers)), None
+
+    zero = jnp.zeros((), values.dtype)
+    begin, strips = (jnp.zeros_like(values), zero, zero), -(-plan.tiles_y // rows)
+    if strips == 1:
+        return strip(begin, 0)[0]
+    return jax.lax.scan(strip, begin, jnp.arange(strips))[0]
+
+
+def _weights(batch: Batch, first, inside, map_weight: float) -> Float[Array, "high width"]:
+    """m_p in the rows of a strip. A pixel of a map has `map_weight` if there are masks too."""
+    weights = jnp.zeros((len(inside), batch.plan.width))
+    if batch.codebook is not None:
+        weights += _ids(batch, first, len(inside)) >= 0
+    if batch.map is not None:
+        weights += inside[:, None] * (1.0 if batch.codebook is None else map_weight)
+    return weights
+
+
+def _targets(field: FeatureField, batch: Batch, first, inside, map_weight: float):
+    """m_p e_p, in the channels of the basis, and m_p, in the rows of a strip."""
+    targets = jnp.zeros((len(inside), batch.plan.width, field.channels), field.lift.dtype)
+    if batch.codebook is not None:
+        ids = _ids(batch, first, len(inside))
+        vectors = jnp.matmul(batch.codebook, field.lift, precision="highest")
+        targets += jnp.where((ids >= 0)[..., None], vectors[jnp.maximum(ids, 0)], 0.0)
+    if batch.map is not None:
+        weight = inside[:, None] * (1.0 if batch.codebook is None else map_weight)
+        small = jnp.matmul(jnp.asarray(batch.map), field.lift, precision="highest")
+        targets += weight[..., None] * stretched(small, first, len(inside), batch.plan)
+    return targets, _weights(batch, first, inside, map_weight)
+
+
+def _ids(batch: Batch, first, high: int) -> Int[Array, "high width"]:
+    """Rows of the codebook in the rows of a strip; -1 below the image."""
+    padded = jnp.pad(batch.ids, ((0, high), (0, 0)), constant_values=-1)
+    return jax.lax.dynamic_slice_in_dim(padded, first, high)
+
+
+def _after_pass(field: FeatureField, state: SolveState, batch: SolveBatch, config: DistillConfig):
+    """The field and the state after the last view of a pass."""
+    turn = jnp.clip(jnp.asarray(batch.turn), 0, 2)
+    branches = (_voted, _begun, _advanced)
+    given = field, state, batch.neighbors
+    field, state = jax.lax.switch(turn, [lambda f=f: f(*given, config) for f in branches])
+    return field, state._replace(total=jnp.zeros_like(state.total))
+
+
+def _voted(field: FeatureField, state: SolveState, neighbors, config: DistillConfig):
+    """After the vote: it is the first guess, and what no pixel shows has the mean of its neighbours."""
+    seen = state.mass > _LEAST
+    votes = jnp.where(seen[:, None], state.total / jnp.maximum(state.mass, _LEAST)[:, None], 0.0)
+    tie = config.solve.smoothness * state.mass.sum() / jnp.maximum(seen.sum(), 1)
+    field = eqx.tree_at(lambda f: f.encoding, field, _spread(votes, seen, neighbors))
+    return field, state._replace(wanted=state.total, tie=tie)
+
+
+def _begun(field: FeatureField, state: SolveState, neighbors, config: DistillConfig):
+    """After the product with the first guess: the residual, along which the first iteration goes."""
+    x = field.encoding
+    residual = state.wanted - state.total - state.tie * _laplacian(x, neighbors)
+    state = state._replace(residual=residual, loss=_objective(x, residual, state))
+    return field, _along(state, jnp.zeros_like(x), neighbors)
+
+
+def _advanced(field: FeatureField, state: SolveState, neighbors, config: DistillConfig):
+    """After the product with a direction: an iteration of conjugate gradients."""
+    d = state.direction
+    product = state.total + state.tie * _laplacian(d, neighbors)
+    length = _quotient(state.squared, jnp.sum(d * product, axis=0))
+    x, residual = field.encoding + length * d, state.residual - length * product
+    state = state._replace(residual=residual, loss=_objective(x, residual, state))
+    return eqx.tree_at(lambda f: f.encoding, field, x), _along(state, d, neighbors)
+
+
+def _along(state: SolveState, before: Float[Array, "n r"], neighbors) -> SolveState:
+    """The next direction, conjugate to the one before."""
+    toward = state.residual / _preconditioner(state, neighbors)[:, None]
+    squared = jnp.sum(state.residual * toward, axis=0)
+    return state._replace(direction=toward + _quotient(squared, state.squared) * before, squared=squared)
+
+
+def _preconditioner(state: SolveState, neighbors: Int[Array, "n k"]) -> Float[Array, "n"]:
+    num, count = neighbors.shape
+    pairs = count + jnp.zeros(num).at[neighbors.ravel()].add(1.0)
+    return state.mass + state.tie * pairs + _LEAST
+
+
+def _objective(x: Float[Array, "n r"], residual: Float[Array, "n r"], state: SolveState) -> Float[Array, ""]:
+    """The objective per pixel: x.Ax - 2 b.x + target, with Ax = b - residual."""
+    return (state.target - jnp.sum(x * (state.wanted + residual))) / jnp.maximum(state.pixels, 1.0)
+
+
+def _laplacian(x: Float[Array, "n r"], neighbors: Int[Array, "n k"]) -> Float[Array, "n r"]:
+    """L x: the gradient of half of sum_(i,j) |x_i - x_j|^2 over the pairs of neighbours."""
+
+    def one(total, others):  # at a time, as there may be hundreds of channels
+        apart = x - x[others]
+        return (total + apart).at[others].add(-apart), None
+
+    return jax.lax.scan(one, jnp.zeros_like(x), neighbors.T)[0]
+
+
+def _spread(votes: Float[Array, "n r"], seen: Bool[Array, "n"], neighbors: Int[Array, "n k"]):
+    """The votes, with those that are missing filled in from neighbours, ring after ring."""
+
+    def ring(carry):
+        values, known, rings = carry
+        near = known[neighbors].sum(1)
+        total, _ = jax.lax.scan(
+            lambda sums, others: (sums + known[others, None] * values[others], None),
+            jnp.zeros_like(values),
+            neighbors.T,
+        )
+        mean = total / jnp.maximum(near, 1)[:, None]
+        return jnp.where(known[:, None], values, mean), known | (near > 0), rings + 1
+
+    def is_unfinished(carry):
+        _, known, rings = carry
+        return (rings < _SPREAD) & ~known.all()
+
+    return jax.lax.while_loop(is_unfinished, ring, (votes, seen, jnp.asarray(0)))[0]
+
+
+def _quotient(a: Float[Array, "r"], b: Float[Array, "r"]) -> Float[Array, "r"]:
+    return jnp.where(b > _LEAST, a / jnp.maximum(b, _LEAST), 0.0)
