@@ -1,7 +1,9 @@
 """`gsjax distill`: a semantic field for a static scene, which `gsjax query` queries."""
 
 from gsjax.engine.distill.run import Options, run
+from gsjax.engine.options import preset_options
 from gsjax.engine.teaching.cache import cache_folder
+from gsjax.methods.distill import PRESETS
 
 _KEPT = cache_folder()
 HELP = (
@@ -11,4 +13,9 @@ HELP = (
     + ("" if _KEPT is None else "delete that folder to have them computed again, or for its space.")
 )
 
-__all__ = ["HELP", "Options", "run"]
+__all__ = ["HELP", "Options", "options_for", "run"]
+
+
+def options_for(arguments: list[str]) -> tuple[type[Options], list[str]]:
+    """The options, with the defaults of the preset that is named."""
+    return preset_options(Options, arguments, "distill", PRESETS)

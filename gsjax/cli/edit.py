@@ -66,6 +66,7 @@ def run(options: Options) -> int:
         given = None if options.camera is None else saved.camera(options.camera)
         with stage(console, "editing"):
             film, doubts = edited(script, saved)
+        with stage(console, "looking for the camera that sees most of the edits"):
             camera = telling_camera(film, saved, script) if given is None else given
         folder = _folder(options)
         for doubt in doubts:

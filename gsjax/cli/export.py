@@ -82,6 +82,7 @@ def run(options: Options) -> int:
             look["background"] = scene.background
             if scene.shots is not None:  # a fit in the open has Gaussians far beyond what was photographed
                 look["view"] = tuple(place.tolist() for place in first_pose(scene)[:2])
+                look["near"] = scene.shots.near
         if numbered:
             return _write_frames(options, scene, rows, look, notes, console)
         moves = len(rows) > 1 and scene.num_moving > 0

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from gsjax.engine.files import read_frames
 from gsjax.engine.messages import describe
@@ -14,6 +14,8 @@ from gsjax.io.scene_file import SceneReport
 from gsjax.io.scenes import read_gaussians
 from gsjax.scene.gaussians import Gaussians
 from gsjax.scene.origin import in_numbers, in_world
+
+_MOST_LABELS = 8  # that are listed
 
 
 def describe_scene(file: Path) -> dict[str, str]:
@@ -45,7 +47,7 @@ def _facts_of(file: Path, gaussians: Gaussians, report: SceneReport) -> dict[str
     if report.antialiased is not None:
         facts["drawn"] = "antialiased" if report.antialiased else "classic"
     if report.labels is not None:
-        facts["labels"] = ", ".join(map(str, np.unique(report.labels)[:8])) or "none"
+        facts["labels"] = _in_short(np.unique(report.labels))
     if report.extra:
         facts["not read"] = ", ".join(report.extra)
     return facts
@@ -80,3 +82,11 @@ def origin_fact(origin: Float[np.ndarray, "3"] | None) -> dict[str, str]:
         origin: what was taken off; None for data near 0.
     """
     return {} if origin is None else {"origin": in_numbers(origin)}
+
+
+def _in_short(labels: Int[np.ndarray, "k"]) -> str:
+    """Labels in increasing order, in a few words."""
+    if len(labels) > 2 and labels[-1] - labels[0] == len(labels) - 1:
+        return f"{labels[0]} to {labels[-1]}"
+    more = f", ... ({len(labels)} in all)" if len(labels) > _MOST_LABELS else ""
+    return ", ".join(map(str, labels[:_MOST_LABELS])) + more or "none"

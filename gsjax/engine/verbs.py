@@ -17,7 +17,7 @@ from gsjax.engine.drive import Drive, Tick, drive
 from gsjax.engine.track.tracking import track as track
 from gsjax.losses.extra import ExtraLosses
 from gsjax.methods.deform import DeformConfig
-from gsjax.methods.distill import Distill, DistillConfig, Teacher
+from gsjax.methods.distill import PRESETS, Distill, DistillConfig, Teacher
 from gsjax.methods.fit import Fit, FitConfig, prune
 from gsjax.methods.parts import Parts, PartsConfig
 from gsjax.methods.parts.pictures import Problem as PartsProblem
@@ -129,7 +129,8 @@ def distill(
             outlines of masks, "auto" (classes where there are masks, else closed), a folder of feature files,
             a `TeacherChoice` with weights of CLIP or SAM, or a custom `Teacher` of the same photographs.
             Outputs of encoders and segmenters are cached in the user's cache folder.
-        config: settings (default: the paper's).
+        config: settings (default: `PRESETS["solve"]` of `gsjax.methods.distill`, which takes seconds;
+            `DistillConfig()` has the paper's).
         rasterize_mode: "antialiased" for a scene that was fitted with it.
         after: a tick of an earlier distillation of the same scene and photographs, to continue from.
 
@@ -144,7 +145,7 @@ def distill(
     """
     from gsjax.engine.teaching.teaching import teacher_for
 
-    method = Distill(DistillConfig() if config is None else config)
+    method = Distill(PRESETS["solve"] if config is None else config)
     teacher, source = teacher_for(photographs, teacher)
     cameras = [photographs.camera(i) for i in range(photographs.num)]
     problem, run = method.start(scene, cameras, teacher, rasterize_mode, source=source)

@@ -300,7 +300,8 @@ def _shots_of(photographs: Photographs) -> Shots:
         photographs.viewmats[None],
         photographs.Ks[None],
         photographs.sizes,
-        load_image=lambda _, v: photographs.image(v),
+        photographs.near,
+        lambda _, v: photographs.image(v),
     )
 
 
@@ -311,7 +312,8 @@ def _shots_of_recording(recording: Recording) -> Shots:
         sequence.viewmats,
         sequence.Ks,
         np.tile([sequence.width, sequence.height], (len(names), 1)),
-        load_image=lambda t, v: to_uint8(np.asarray(sequence.image(t, v))),
+        sequence.near,
+        lambda t, v: to_uint8(np.asarray(sequence.image(t, v))),
     )
 
 
@@ -328,4 +330,4 @@ def _shots_of_deformation(path: Path, result: DeformResult, notes: Notes) -> Sho
         notes.warn(f"its photographs are not shown: {describe(error)}")
     sizes = np.array([result.timeline.size])
     viewmats, Ks = result.timeline.viewmats[:, None], result.timeline.Ks[:, None]
-    return Shots(("camera",), viewmats, Ks, sizes, load_image=load)
+    return Shots(("camera",), viewmats, Ks, sizes, result.timeline.near, load)

@@ -53,6 +53,7 @@ def write_page(
     up: Sequence[float] = (0.0, -1.0, 0.0),
     background: Sequence[float] = (0.0, 0.0, 0.0),
     view: tuple[Sequence[float], Sequence[float]] | None = None,
+    near: float = 0.0,
     film: Film | None = None,
 ) -> None:
     """Write the page, atomically.
@@ -64,6 +65,7 @@ def write_page(
         up: unit vector; by default as in most PLY files, whose y points down.
         background: RGB, 0 to 1.
         view: where the page opens: the place of the eye and what it looks at; default: from the side.
+        near: distance from the eye below which nothing is drawn; at least a small share of the scene's size.
         film: the scene over time, which the page plays; `gaussians` in its first frame. None if it stands
             still.
     """
@@ -80,6 +82,7 @@ def write_page(
         "center": center.tolist(),
         "distance": float(max(radius, 1e-6) * 2.7),
         "view": None if view is None else [[float(value) for value in place] for place in view],
+        "near": float(near),
         "focal": _FOCAL,
         "motion": motion,
     }

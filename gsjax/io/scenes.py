@@ -39,6 +39,7 @@ class Format:
     options: tuple[str, ...] = ()
 
 
+_OF_PAGES = ("antialiased", "up", "background", "view", "near", "film")
 FORMATS = {
     ".compressed.ply": Format("PlayCanvas's compressed PLY", write_compressed_ply, options=("order",)),
     ".ply": Format("PLY of 3DGS", ply.write_ply, options=("labels", "antialiased", "origin")),
@@ -46,9 +47,7 @@ FORMATS = {
     ".spz": Format("SPZ", spz.write_spz, options=("antialiased",)),
     ".sog": Format("SOG", sog.write_sog, options=("antialiased", "order")),
     ".glb": Format("glTF", glb.write_glb, options=("origin",)),
-    ".html": Format(
-        "a page", page.write_page, degree=0, options=("antialiased", "up", "background", "view", "film")
-    ),
+    ".html": Format("a page", page.write_page, degree=0, options=_OF_PAGES),
 }
 """The formats that are written, by the ending of a file; of two that fit, the first."""
 
@@ -122,6 +121,7 @@ def write_gaussians(
     up: Sequence[float] | None = None,
     background: Sequence[float] | None = None,
     view: tuple[Sequence[float], Sequence[float]] | None = None,
+    near: float | None = None,
     film: page.Film | None = None,
 ) -> tuple[str, ...]:
     """Write Gaussians in the format that the ending of `path` names, atomically.
@@ -142,6 +142,7 @@ def write_gaussians(
         background: of a page alone: RGB, 0 to 1; default: black.
         view: of a page alone: the place of the eye and what it looks at, as the page opens; default: from the
             side.
+        near: of a page alone: distance from the eye below which nothing is drawn; default: next to nothing.
         film: of a page alone: the scene over time, which it plays; `gaussians` is its first frame.
 
     Returns:
@@ -179,7 +180,8 @@ def write_gaussians(
         if "labels" not in written.options and len(np.unique(labels)) == 1:
             labels = None
     asked = {"labels": labels, "antialiased": antialiased or None, "origin": origin}
-    asked |= {"order": order, "up": up, "background": background, "view": view, "film": film}
+    asked |= {"order": order, "up": up, "background": background, "view": view}
+    asked |= {"near": near, "film": film}
     options = {name: value for name, value in asked.items() if value is not None}
     no_room = {"labels": "labels", "antialiased": "that the scene is antialiased"}
     if origin is not None:

@@ -90,18 +90,29 @@ def deform_step_case():
     return method.step, run.params, batch, sick
 
 
-def distill_step_case():
+def little_distillation(config: DistillConfig):
+    """The step, the run, and the first batch, of one view."""
     random = np.random.default_rng(0)
     means, colors = random.uniform(-0.5, 0.5, (40, 3)), random.uniform(size=(40, 3))
     scene = jax.tree.map(jnp.asarray, gaussians_from_points(means, colors))
     thing = np.indices((24, 32)).sum(axis=0) // 8 % 3
     teacher = teacher_of_objects([thing], [np.eye(3, 5, dtype=np.float32)])
-    method = Distill(
-        DistillConfig(iterations=20, channels=4, grid=GRID, contrast_after=0.1, contrast_patch=4)
-    )
-    _, run, batch = started(lambda: (method, *method.start(scene, cameras_around([0.3], 32, 24), teacher)))
+    method = Distill(config)
+    return started(lambda: (method, *method.start(scene, cameras_around([0.3], 32, 24), teacher)))
+
+
+def distill_step_case():
+    config = DistillConfig(iterations=20, channels=4, grid=GRID, contrast_after=0.1, contrast_patch=4)
+    step, run, batch = little_distillation(config)
     sick = batch._replace(codebook=batch.codebook.at[0, 0].set(jnp.nan))
-    return method.step, run.params, batch, sick
+    return step, run.params, batch, sick
+
+
+def solve_step_case():
+    """The vote of a solution, of one view."""
+    step, run, batch = little_distillation(DistillConfig(start="solve", iterations=0))
+    codebook = batch.view.codebook.at[0, 0].set(jnp.nan)
+    return step, run.params, batch, batch._replace(view=batch.view._replace(codebook=codebook))
 
 
 def stream_step_case():
@@ -156,6 +167,7 @@ def features_case():
 STEPS = {
     "fit": fit_step_case,
     "distill": distill_step_case,
+    "distill, solved": solve_step_case,
     "deform": deform_step_case,
     "parts, a frame": stream_step_case,
     "parts, all frames": refine_step_case,
@@ -163,7 +175,7 @@ STEPS = {
     "features": features_case,
 }
 
-WITHOUT_PLAN = ("distill",)  # draws frozen views
+WITHOUT_PLAN = ("distill", "distill, solved")  # draws frozen views
 
 
 def enlarged(tree):

@@ -8,6 +8,7 @@ import re
 import shutil
 import subprocess
 import zlib
+from dataclasses import replace
 
 import cv2
 import equinox as eqx
@@ -172,19 +173,23 @@ def test_a_browser_plays_it(tmp_path):
 
 
 @pytest.mark.skipif(BROWSER is None, reason="there is no Chromium")
-@pytest.mark.parametrize(("antialiased", "frame"), [(False, None), (True, None), (False, 2)])
-def test_a_browser_shows_what_the_rasterizer_does(tmp_path, antialiased, frame):
+@pytest.mark.parametrize(
+    ("antialiased", "frame", "near"),
+    [(False, None, None), (True, None, None), (False, 2, None), (False, None, 14.0)],
+)
+def test_a_browser_shows_what_the_rasterizer_does(tmp_path, antialiased, frame, near):
     scene = flat(make_scene(200))
     scene = eqx.tree_at(lambda g: g.means, scene, scene.means.at[0].set(jnp.array([0, 0, 2000.0])))
     page, picture = tmp_path / "scene.html", tmp_path / "page.png"
     film = None if frame is None else film_of(scene, scales=True)
-    write_gaussians(page, scene, antialiased=antialiased, film=film)
+    write_gaussians(page, scene, antialiased=antialiased, near=near, film=film)
     write_gaussians(tmp_path / "scene.splat", scene if film is None else film.at(frame))
     view = (0.4, 0.3, 14.0, (1.0, 1.0, 1.0))
     address = f"{page.as_uri()}#{view[0]},{view[1]},{view[2]},1,1,1" + ("" if frame is None else f",{frame}")
     browse("--timeout=10000", f"--screenshot={picture}", address)
     shown = cv2.imread(str(picture))[..., ::-1] / 255
     held, camera = read_gaussians(tmp_path / "scene.splat")[0], camera_at(*view[:3], np.array(view[3]))
+    camera = camera if near is None else replace(camera, near=near)
     plan = plan_render(held, camera, rasterize_mode="antialiased" if antialiased else "classic")
     wanted = np.clip(np.asarray(render(held, camera, plan).colors)[0], 0, 1)
     assert wanted.std() > 0.1

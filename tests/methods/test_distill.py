@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from gsjax.engine.drive import drive
-from gsjax.geometry.cameras import Camera
 from gsjax.methods.distill import (
     Distill,
     DistillConfig,
@@ -33,7 +32,6 @@ from gsjax.methods.distill import (
 from gsjax.methods.query import relevancy, threshold_for
 from gsjax.rasterize.frozen import paint_shown
 from gsjax.scene.feature_grid import FeatureGridConfig, locate
-from gsjax.scene.gaussians import gaussians_from_activated
 from tests.methods.two_balls import BOOK, DIMENSION, HEIGHT, WIDTH, cameras, painted, two_balls
 
 GRID = FeatureGridConfig(

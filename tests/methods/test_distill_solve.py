@@ -1,4 +1,4 @@
-"""Vectors of Gaussians are solved for: a vote, then conjugate gradients, against a dense solution in float64."""
+"""Vectors of Gaussians are solved for: a vote, then conjugate gradients, as a dense solution in float64."""
 
 from dataclasses import replace
 
@@ -73,7 +73,7 @@ def dense(gaussians, teacher, config, problem):
         d += W.T @ (m * alpha)
     near = np.asarray(problem.neighbors)
     L = np.zeros((n, n))
-    for i, j in ((i, j) for i in range(n) for j in near[i] if i != j):
+    for i, j in [(row, other) for row in range(n) for other in near[row] if row != other]:
         L[[i, j], [i, j]] += 1
         L[i, j] -= 1
         L[j, i] -= 1
@@ -92,7 +92,8 @@ def test_conjugate_gradients_reach_the_dense_solution_in_float64(scene, kind):
     found = np.asarray(field.encoding, np.float64) @ np.asarray(field.lift, np.float64).T
     assert np.abs(found - wanted).max() < 2e-5 * np.abs(wanted).max()
     losses = np.array([info["loss"] for info in infos])[15::8]  # after each pass but the vote
-    assert (np.diff(losses) <= 1e-6 * infos[7]["loss"]).all() and not any(info["skipped"] for info in infos)
+    assert (np.diff(losses) <= 1e-6 * infos[7]["loss"]).all()
+    assert not any(info["skipped"] for info in infos)
 
 
 def test_a_vote_is_the_mean_of_the_pixels_that_show_a_gaussian(scene):
@@ -100,13 +101,17 @@ def test_a_vote_is_the_mean_of_the_pixels_that_show_a_gaussian(scene):
     teacher = teacher_with(masks)
     config = PRESETS["vote"]
     ticks, infos = solved(gaussians, teacher, config)
-    _, b, d = dense(gaussians, teacher, replace(config, solve=SOLVE), ticks.problem._replace(neighbors=[[]] * 160))
+    _, b, d = dense(
+        gaussians, teacher, replace(config, solve=SOLVE), ticks.problem._replace(neighbors=[[]] * 160)
+    )
     field = ticks.result.field
     found = np.asarray(field.encoding) @ np.asarray(field.lift).T
     seen = d > 1e-3
     np.testing.assert_allclose(found[seen], b[seen] / d[seen, None], atol=1e-4)
     assert len(infos) == 8
-    assert (np.asarray(gaussian_cosines(field, None, jnp.asarray(BOOK)))[:, 1:].argmax(-1) + 1 == labels).all()
+    assert (
+        np.asarray(gaussian_cosines(field, None, jnp.asarray(BOOK)))[:, 1:].argmax(-1) + 1 == labels
+    ).all()
 
 
 def test_strips_change_nothing(scene):
@@ -119,7 +124,7 @@ def test_strips_change_nothing(scene):
 
 
 def test_what_no_pixel_shows_has_the_vector_of_its_neighbours(scene):
-    gaussians, labels, masks = scene
+    gaussians, _labels, masks = scene
     inside = np.array([[0.0, -0.5, 0.0], [0.0, 0.5, 0.0]], np.float32)  # of the balls, hidden by their shells
     means = np.concatenate([np.asarray(gaussians.means), inside, [[np.nan] * 3]]).astype(np.float32)
     rows = [*range(160), 0, 159, 0]
@@ -127,36 +132,48 @@ def test_what_no_pixel_shows_has_the_vector_of_its_neighbours(scene):
     both = both.__class__(**{**vars(both), "means": jnp.asarray(means)})
     ticks, _ = solved(both, teacher_with(masks), DistillConfig(start="solve", solve=SOLVE, iterations=0))
     cosines = np.asarray(gaussian_cosines(ticks.result.field, None, jnp.asarray(BOOK)))
-    assert cosines[160:162, 1:].argmax(-1).tolist() == [0, 1] and np.isfinite(cosines).all()
+    assert cosines[160:162, 1:].argmax(-1).tolist() == [0, 1]
+    assert np.isfinite(cosines).all()
 
 
 def test_a_descent_begins_where_the_solution_ended(scene):
     gaussians, labels, masks = scene
-    config = DistillConfig(start="solve", solve=replace(SOLVE, iterations=8), iterations=40, grid=GRID, contrast_patch=8)
+    config = DistillConfig(
+        start="solve", solve=replace(SOLVE, iterations=8), iterations=40, grid=GRID, contrast_patch=8
+    )
     teacher = teacher_of_objects([np.where(mask > 0, mask, -1) for mask in masks], [BOOK] * 8)
     ticks, infos = solved(gaussians, teacher, config)
-    assert isinstance(ticks.result.field.encoding, FeatureGrid) and ticks.result.rows is not None
-    assert infos[80]["cos"] < 0.05 and infos[80]["loss"] < 1  # about 1 and 20 from a random field
+    assert isinstance(ticks.result.field.encoding, FeatureGrid)
+    assert ticks.result.rows is not None
+    assert infos[80]["cos"] < 0.05
+    assert infos[80]["loss"] < 1
     cosines = ticks.result.cosines(BOOK)
     assert (np.asarray(cosines)[:, 1:].argmax(-1) + 1 == labels).mean() > 0.95
     table, _ = solved(gaussians, teacher_with(masks), replace(config, encoding="table", iterations=3))
-    assert table.result.rows is None and len(table.result.field.encoding) == 160
+    assert table.result.rows is None
+    assert len(table.result.field.encoding) == 160
 
 
 def test_a_resumed_solution_is_the_same_to_the_bit(scene):
     gaussians, _, masks = scene
-    config = DistillConfig(start="solve", solve=replace(SOLVE, iterations=3), iterations=5, grid=GRID, contrast_patch=8)
+    config = DistillConfig(
+        start="solve", solve=replace(SOLVE, iterations=3), iterations=5, grid=GRID, contrast_patch=8
+    )
     method = Distill(config)
     whole, _ = solved(gaussians, teacher_with(masks), config)
     problem, run = method.start(gaussians, cameras(8), teacher_with(masks))
     for stop in (13, 41, 44):
-        ticks = drive(method, problem, jax.tree.map(lambda a: jnp.array(a) if isinstance(a, jax.Array) else a, run))
+        ticks = drive(
+            method, problem, jax.tree.map(lambda a: jnp.array(a) if isinstance(a, jax.Array) else a, run)
+        )
         for now in ticks:
             if now.step == stop:
                 break
         run = ticks.run
     *_, last = drive(method, problem, run)
-    same = jax.tree.map(lambda a, b: bool((np.asarray(a) == np.asarray(b)).all()), last.run.params, whole.run.params)
+    same = jax.tree.map(
+        lambda a, b: bool((np.asarray(a) == np.asarray(b)).all()), last.run.params, whole.run.params
+    )
     assert all(jax.tree.leaves(same))
 
 

@@ -75,6 +75,7 @@ class TestScripts:
             ("edits: [speed]", "edits: edit 1: expected a mapping with the key op, found 'speed'"),
             ("edits: [{op: fade, parts: 1}, {op: sped}]", "edit 2: op: expected one of isolate, freeze, "),
             ("edits: [{op: sped, parts: 1}]", "found 'sped'; did you mean 'speed'?"),
+            ("edits: [{op: remove, parts: 1}]", "found 'remove'; fade with opacity 0 takes parts away"),
             ("edits: [{op: [1], parts: 1}]", "edit 1: op: expected one of "),
             ("edits: [{op: speed, parts: 1}]", "edit 1 (speed): factor: expected a factor from 0.01 to 100"),
             ("edits: [{op: speed, parts: 1}]", ", found nothing"),

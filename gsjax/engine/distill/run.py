@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from time import perf_counter
-from typing import Any
+from typing import Any, Literal
 
 import jax
 from rich.console import Console
@@ -37,7 +37,7 @@ from gsjax.engine.teaching.cache import FeatureCache
 from gsjax.engine.teaching.choice import TeacherChoice
 from gsjax.engine.teaching.teaching import Teaching
 from gsjax.io.atomic import atomic_write
-from gsjax.methods.distill import Distill, DistillConfig
+from gsjax.methods.distill import PRESETS, Distill, DistillConfig
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,7 +46,11 @@ class Options(Common, Resuming, Timed, Seeded, TeacherChoice, SceneOptions):
 
     out: Path | None = None
     """Folder for the field. Default: `field` in the run's folder."""
-    distill: DistillConfig = dataclasses.field(default_factory=DistillConfig)
+    preset: Literal["vote", "solve", "field", "paper"] = "solve"
+    """Default settings, the fastest first: vote (each Gaussian has the mean feature of the pixels that show
+    it), solve (the features that the views show best, by least squares), field (a hash grid that begins as
+    that solution), paper (the training of FD-3DGS, which takes tens of minutes)."""
+    distill: DistillConfig = dataclasses.field(default_factory=lambda: PRESETS["solve"])
     """Settings of the field and its training."""
 
 
@@ -113,6 +117,7 @@ def run(options: Options) -> int:
         found = {
             "kind": "distill",
             "dataset": photographs.name,
+            "preset": options.preset,
             "features": teaching.source.kind,
             "second": options.second,
             "features_are": teaching.about,
@@ -141,7 +146,9 @@ def with_paths(options: Options) -> Options:
 
 def _words(row: Mapping[str, Any]) -> str:
     """A row of means in words."""
-    return "1 - cosine to the teacher " + ("–" if row["cos"] is None else f"{row['cos']:.3f}")
+    if row["cos"] is not None:
+        return f"1 - cosine to the teacher {row['cos']:.3f}"
+    return "no finite loss" if row["loss"] is None else f"squared error {row['loss']:.3g}"
 
 
 def _out(options: Options, scene: Path) -> Path:

@@ -13,7 +13,7 @@ from gsjax.engine.folder import RunFolder
 from gsjax.engine.machine import describe as describe_machine
 from gsjax.engine.messages import Notes, counted, reason
 from gsjax.engine.parts.loop import update_seconds
-from gsjax.engine.parts.scoring import part_rows, score_parts
+from gsjax.engine.parts.scoring import part_rows, score_parts, warn_of_strays
 from gsjax.engine.parts.views import part_views
 from gsjax.engine.pictures import Film
 from gsjax.engine.progress import Progress
@@ -69,6 +69,7 @@ def finished(
             notes.warn(f"scoring was stopped after {counted(scores.num_frames, 'frame')} by {reason(error)}")
             progress.stopped = error if isinstance(error, KeyboardInterrupt) else None
     rows, against_truth = part_rows(scene, trajectory, joints), {}
+    warn_of_strays(rows, scene, notes)
     for row in rows if origin is not None else ():
         row["point"] = None if row["point"] is None else in_world(np.array(row["point"]), origin).tolist()
     if complete:

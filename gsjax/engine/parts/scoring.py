@@ -17,6 +17,7 @@ from gsjax.metrics.tracking import relative_motion, score_tracks
 from gsjax.scene.handles import Blend
 
 _NAMED_IOU = 0.25  # least overlap with a true part for a part to get its name
+_BUT_OUTLIERS = (0.02, 0.98)  # quantiles between which a scene extends
 _AROUND = 0.05 * np.concatenate([np.eye(3), -np.eye(3)])  # metres, around an object without Gaussians
 _STILL_MM = 2.0  # a true part that moves less cannot be found by its motion, and counts as background
 
@@ -52,6 +53,22 @@ def part_rows(
             }
         )
     return rows
+
+
+def warn_of_strays(rows: list[dict[str, Any]], scene: PartScene, notes: Notes) -> None:
+    """Warn of parts that move farther than the scene is wide: what they are is not known well enough.
+
+    Args:
+        rows: from `part_rows`.
+        scene: the parts.
+        notes: receives the warning.
+    """
+    low, high = np.quantile(np.asarray(scene.gaussians.means, np.float64), _BUT_OUTLIERS, axis=0)
+    width = 1000 * float(np.linalg.norm(high - low))
+    strays = [row for row in rows if row["moved_mm"] > width]
+    if strays:
+        which = ", ".join(f"{row['part']} ({row['gaussians']} Gaussians)" for row in strays)
+        notes.warn(f"parts that leave the scene, so that their motion cannot be trusted: {which}")
 
 
 def score_parts(

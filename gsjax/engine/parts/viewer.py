@@ -144,5 +144,6 @@ def _at_times(shots: Shots, recorded: np.ndarray, times: np.ndarray) -> Shots:
         shots.viewmats[rows],
         shots.Ks[rows],
         shots.sizes,
-        load_image=None if load is None else lambda t, v: load(int(rows[t]), v),
+        shots.near,
+        None if load is None else lambda t, v: load(int(rows[t]), v),
     )

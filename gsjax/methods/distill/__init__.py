@@ -43,8 +43,8 @@ from gsjax.methods.distill.query import (
     pixel_features,
 )
 from gsjax.methods.distill.result import DistillResult
-from gsjax.methods.distill.teacher import Teacher, teacher_of_maps, teacher_of_objects, with_maps
 from gsjax.methods.distill.solve import SolveBatch, solve_step
+from gsjax.methods.distill.teacher import Teacher, teacher_of_maps, teacher_of_objects, with_maps
 from gsjax.methods.distill.update import distill_loss
 from gsjax.methods.distill.update import distill_step as step
 from gsjax.methods.distill.views import Batch, frozen_views, view_batch

@@ -58,7 +58,8 @@ class SolveConfig:
     neighbors: int = 8
     """Number of neighbours of each Gaussian."""
     energy: float = 0.9999
-    """Share of the teacher's features, squared, that the channels keep; `channels` is their largest number."""
+    """Share of the squared length of the teacher's features that its channels keep. There are at most
+    `channels`."""
 
     def __post_init__(self):
         expect(self, "solve.", iterations=(1, np.inf), smoothness=(0, np.inf), neighbors=(1, 64))
@@ -71,7 +72,8 @@ class DistillConfig:
 
     start: Literal["random", "vote", "solve"] = "random"
     """What training begins with: random values; a vote, in which each Gaussian has the mean feature of the
-    pixels that show it; or the vectors by which the views show the teacher's features best (least squares)."""
+    pixels that show it; or the least-squares solution, the vectors with which views show the teacher's
+    features best."""
     solve: SolveConfig = field(default_factory=SolveConfig)
     """Settings of that start, unless it is random."""
     iterations: int = 1500

@@ -1,4 +1,4 @@
-"""The method of the drive loop: a solution of linear least squares, then the descent of the paper's losses."""
+"""The method of the drive loop: a vote or a least-squares solution, then the descent of the losses."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -36,8 +36,7 @@ class Problem(NamedTuple):
         means: centres of the scene's Gaussians, metres.
         source, scene: as in `DistillResult`.
         neighbors: of each Gaussian, in a solution; None without one.
-        untrained: the field at which the descent after a solution begins, but for what it takes from that; None
-            without.
+        untrained: the field of the descent, before it is fitted to the solution; None without either.
         located: the locations of the Gaussians in its grid; None without one.
     """
 
@@ -159,8 +158,11 @@ class Distill:
         begins = self.config.weights.contrast and step == contrast_begins(self.config)
         return run.having(guard=None) if begins else run
 
-    def batch(self, problem: Problem, run: Run, progress: float) -> tuple[SolveBatch | Batch, tuple[str, ...]]:
-        """The next view: in order for a solution, shuffled in the descent. Arguments as for `Method.batch`."""
+    def batch(
+        self, problem: Problem, run: Run, progress: float
+    ) -> tuple[SolveBatch | Batch, tuple[str, ...]]:
+        """The next view: in order in a solution, shuffled in the descent. Arguments as for
+        `Method.batch`."""
         begun, count = self.steps_of_solution(problem), len(problem.views)
         if run.step < begun:
             assert problem.neighbors is not None

@@ -8,8 +8,8 @@ e_p, and m_p = 1 where there is one,
 
 over pairs (i, j) of neighbours in space, which give what few pixels show the vectors around it. The normal
 equations (W^T M W + lambda L) x = W^T M alpha e are the same for each channel, and W is only ever applied:
-a product is a view drawn and drawn back. Rows of W^T M W sum to D = W^T M alpha, so that D^-1 (W^T M W) has no
-eigenvalue above 1, and conjugate gradients with D as the preconditioner converge in a few passes.
+a product is a view drawn and drawn back. Rows of W^T M W sum to D = W^T M alpha, so that D^-1 (W^T M W)
+has no eigenvalue above 1, and conjugate gradients with D as the preconditioner converge in a few passes.
 
 Each step sees one view, and the sums of a pass over all views make an iteration: the first pass gives the
 right-hand side and D, and their quotient is where the iterations begin. That is a vote: each Gaussian has the
@@ -163,8 +163,7 @@ def basis_of(teacher: Teacher, config: DistillConfig) -> Float[np.ndarray, "d r"
     """Orthonormal columns that span the teacher's features, the most important first. On the host.
 
     Args:
-        teacher: the teacher's features; each row of its codebook counts as much as the others, and as a view's
-            map.
+        teacher: the teacher's features; each row of its codebook counts as much as the others, and as a map.
         config: the energy that is kept, and the most channels.
     """
     gram = np.zeros((teacher.dimension, teacher.dimension))

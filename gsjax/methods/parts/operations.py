@@ -258,6 +258,7 @@ OPERATIONS: dict[str, type[Edit]] = {
     )
 }
 """The operations by name."""
+_MEANT = dict.fromkeys(("remove", "delete", "hide"), "fade with opacity 0 takes parts away")
 
 
 def read_edits(found: Any, first: int = 1) -> tuple[Edit, ...]:
@@ -310,7 +311,9 @@ def _read_edit(found: Any, number: int) -> Edit:
     name, rest = found["op"], {k: value for k, value in found.items() if k != "op"}
     if not isinstance(name, str) or name not in OPERATIONS:
         known = f"one of {', '.join(OPERATIONS)}"
-        raise ValueError(f"edit {number}: op: expected {known}, found {did_you_mean(name, OPERATIONS)}")
+        meant = _MEANT.get(str(name))
+        found = f"{name!r}; {meant}" if meant else did_you_mean(name, OPERATIONS)
+        raise ValueError(f"edit {number}: op: expected {known}, found {found}")
     try:
         return read(OPERATIONS[name], rest)
     except ValueError as error:

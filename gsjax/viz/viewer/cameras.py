@@ -8,7 +8,7 @@ from jaxtyping import Float
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from gsjax.geometry.cameras import Camera, intrinsics
+from gsjax.geometry.cameras import NEAR, Camera, intrinsics
 from gsjax.scene.gaussians import Gaussians
 from gsjax.viz.viewer.pick import pick
 from gsjax.viz.viewer.viewable import Shots, Viewable
@@ -37,7 +37,12 @@ class Pose(NamedTuple):
 
 
 def browser_camera(
-    wxyz: Float[np.ndarray, "4"], position: Float[np.ndarray, "3"], fov: float, width: int, height: int
+    wxyz: Float[np.ndarray, "4"],
+    position: Float[np.ndarray, "3"],
+    fov: float,
+    width: int,
+    height: int,
+    near: float = NEAR,
 ) -> Camera:
     """A browser's camera as one camera [1] for our rasterizer.
 
@@ -46,12 +51,14 @@ def browser_camera(
         position: position in the world.
         fov: vertical field of view, radians.
         width, height: size of the picture, pixels.
+        near: distance of the near plane, metres.
     """
     rotation = Rotation.from_quat(np.asarray(wxyz, float), scalar_first=True).as_matrix().T
     viewmat = np.eye(4)
     viewmat[:3, :3], viewmat[:3, 3] = rotation, -rotation @ np.asarray(position, float)
     K = intrinsics(height / 2 / np.tan(fov / 2), width, height)
-    return Camera(jnp.asarray(viewmat, jnp.float32)[None], jnp.asarray(K, jnp.float32)[None], width, height)
+    viewmats, Ks = (jnp.asarray(matrix, jnp.float32)[None] for matrix in (viewmat, K))
+    return Camera(viewmats, Ks, width, height, near)
 
 
 def picture_size(width: int, window: tuple[int, int]) -> tuple[int, int]:

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from gsjax.geometry.cameras import NEAR
 from gsjax.scene.gaussians import Gaussians, take, valid_rows
 from gsjax.scene.selection import only
 
@@ -27,6 +28,7 @@ class Shots:
         viewmats: world to camera, OpenCV axes, [T,V,4,4].
         Ks: intrinsics in pixels, [T,V,3,3].
         sizes: width and height in pixels, [V,2].
+        near: distance of their near planes, metres: what is nearer was not fitted, and hides the rest.
         load_image: (t, v) -> RGB, [H,W,3] uint8; None if there are no pictures to show.
 
     Raises:
@@ -37,6 +39,7 @@ class Shots:
     viewmats: Float[np.ndarray, "..."]
     Ks: Float[np.ndarray, "..."]
     sizes: Int[np.ndarray, "..."]
+    near: float = NEAR
     load_image: Callable[[int, int], np.ndarray] | None = field(default=None, repr=False)
 
     def __post_init__(self):
