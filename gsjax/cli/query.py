@@ -42,6 +42,10 @@ class GaussianOptions:
     """Score above which a Gaussian is selected: a cosine (-1 to 1), or, compared with negatives or names, a
     share (0 to 1). Default: 1/2 for a share; for a text of the closed vocabulary, its own threshold; else
     the one that best divides the scores into two classes (Otsu)."""
+    top: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
+    """Select the N Gaussians with the best scores, instead of those above a threshold."""
+    within: Annotated[str | None, tyro.conf.arg(metavar="TEXT")] = None
+    """Find only what is part of what this text finds: `handle --within drawer`."""
     color: Annotated[tuple[float, float, float] | None, tyro.conf.arg(metavar="R G B")] = None
     """RGB, 0 to 1, that recolored.ply gives to what was found (default: pink)."""
     negatives: Annotated[tuple[str, ...] | None, tyro.conf.arg(metavar="TEXT [TEXT ...]")] = None
@@ -254,7 +258,9 @@ def _question(options: Options) -> Question:
         camera=options.camera,
         frame=deform.frame,
         frames=deform.frames,
+        within=gaussians.within,
         threshold=gaussians.threshold,
+        top=gaussians.top,
         negatives=gaussians.negatives,
         color=gaussians.color or Question.color,
         move=gaussians.move,

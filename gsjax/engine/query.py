@@ -33,6 +33,7 @@ from gsjax.viz.viewer import Answer, Asking
 SCENE_CAPTIONS = {"recolored": "recoloured", "moved": "moved"}
 """Captions of the scenes of `Question.changed`, by the names of their files."""
 _EXTRACTED = "extracted"  # folder of parts that the viewer saved, in that of the run
+_OUTSIDE = -1.0  # score of what is outside of where to look, the lowest possible
 _HIGHEST = 1.0  # highest score: a cosine is from -1 to 1, a share against others from 0 to 1
 
 
@@ -50,13 +51,16 @@ class Question:
         frame: frame number, in the recording, of point and box; its Gaussians are written (default: the
             first).
         frames: frames to draw, as a Python slice (default: the held-out ones).
+        within: a text; only what that finds can be found: "handle" within "drawer".
         threshold: score above which a Gaussian is selected (default: by a rule).
+        top: number of Gaussians to select, those with the best scores, instead of a threshold.
         negatives: texts to compare with (default: the encoder's own).
         color: RGB, 0 to 1, of what is found in recolored.ply.
         move: shift of it in moved.ply, metres; None writes none.
 
     Raises:
-        ValueError: no score can be above the threshold, or each is; a colour or a shift is out of range.
+        ValueError: no score can be above the threshold, or each is; it is given beside `top`, which is less
+            than 1; a colour or a shift is out of range.
     """
 
     text: str | None = None
@@ -66,7 +70,9 @@ class Question:
     camera: str | None = None
     frame: int | None = None
     frames: str | None = None
+    within: str | None = None
     threshold: float | None = None
+    top: int | None = None
     negatives: tuple[str, ...] | None = None
     color: tuple[float, float, float] = (1.0, 0.25, 0.6)
     move: tuple[float, float, float] | None = None
@@ -77,6 +83,9 @@ class Question:
                 f"--threshold: expected a finite number below {_HIGHEST:g}, the highest possible score, "
                 f"found {self.threshold:g}"
             )
+        if self.top is not None and (self.top < 1 or self.threshold is not None):
+            found = "--threshold too" if self.top >= 1 else self.top
+            raise ValueError(f"--top: expected 1 Gaussian or more, and no --threshold, found {found}")
         if any(not 0 <= value <= 1 for value in self.color):
             raise ValueError(f"--color: expected three numbers from 0 to 1, found {_spaced(self.color)}")
         if self.move is not None and not all(map(math.isfinite, self.move)):
@@ -90,7 +99,8 @@ class Question:
             return f"what is at {self.point[0]:g},{self.point[1]:g}{camera}"
         if self.box is not None:
             return "what is in {:g},{:g} to {:g},{:g}".format(*self.box)
-        return repr(self.text) if self.image is None else f"what {self.image.name} shows"
+        words = repr(self.text) if self.image is None else f"what {self.image.name} shows"
+        return words if self.within is None else f"{words} within {self.within!r}"
 
     def changed(self, gaussians: Gaussians, selected: Bool[np.ndarray, "n"]) -> dict[str, Gaussians]:
         """Scenes with the selected Gaussians changed, by the names of their files."""
@@ -208,15 +218,33 @@ def select(run: Queryable, question: Question, frame: int, prompt: Prompt | None
         prompt: of the query (default: that of the question).
 
     Raises:
-        ValueError, FileNotFoundError: as for `Queryable.prompt`.
+        ValueError, FileNotFoundError: as for `Queryable.prompt`; or nothing is found that the rest is to be
+            within.
     """
+    inside = None if question.within is None else _place(run, question, frame)
     prompt = run.prompt(question, frame) if prompt is None else prompt
     score = run.scorer(prompt, frame)
     jax.block_until_ready(score())  # compiles
     begun = perf_counter()
     scores, seconds = np.asarray(score()), perf_counter() - begun
-    threshold = prompt.threshold(scores, question.threshold)
+    considered = scores if inside is None else scores[inside]
+    if question.top is None:
+        threshold = prompt.threshold(considered, question.threshold)
+    else:
+        known = np.sort(considered[np.isfinite(considered)])
+        least = known[max(0, len(known) - question.top)] if len(known) else np.inf
+        threshold = Threshold(float(np.nextafter(least, -np.inf)), f"the {question.top} best")
+    if inside is not None:
+        scores = np.where(inside, scores, min(np.float32(_OUTSIDE), scores.min()))
     return Selection(question, frame, prompt, scores, threshold, seconds)
+
+
+def _place(run: Queryable, question: Question, frame: int) -> Bool[np.ndarray, "n"]:
+    """The Gaussians within which a question is to be answered."""
+    place = select(run, Question(text=question.within, negatives=question.negatives), frame).selected
+    if not place.any():
+        raise ValueError(f"--within {question.within!r}: expected something to look within, found none of it")
+    return place
 
 
 def answer(
@@ -260,6 +288,7 @@ def answer(
         info = {
             "text": question.text,
             "point": question.point,
+            "within": question.within,
             "features": run.kind,
             **run.about(question, frame),
             "meant": found.prompt.name,

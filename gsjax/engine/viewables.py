@@ -146,7 +146,7 @@ def _of_field(path: Path, notes: Notes, now: Whereabouts) -> Viewable:
         antialiased=run.rasterize_mode == "antialiased",
         unit=run.unit,
         origin=run.origin,
-        asking=asking_of(QueryableField(run, many=True)),
+        asking=asking_of(QueryableField(run)),
     )
 
 
@@ -200,7 +200,7 @@ def _of_fit(path: Path, notes: Notes, now: Whereabouts, shown: bool) -> Viewable
         background=background,
         antialiased=antialiased,
         origin=origin,
-        asking=None if field is None else asking_of(QueryableField(field, many=True)),
+        asking=None if field is None else asking_of(QueryableField(field)),
     )
 
 

@@ -1,7 +1,6 @@
 """Queries of a field: the Gaussians that match a text, a picture or a point, and pictures of them."""
 
 from collections.abc import Callable
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -23,7 +22,7 @@ from gsjax.geometry.cameras import Camera, camera_centers
 from gsjax.geometry.spherical_harmonics import evaluate_sh
 from gsjax.io.brief import shortened
 from gsjax.io.pictures import write_png
-from gsjax.methods.distill import FeatureField, frozen_views, pixel_features
+from gsjax.methods.distill import frozen_views, pixel_features
 from gsjax.methods.query import Prompt, encoded_prompt
 from gsjax.optim.compiler import host_options
 from gsjax.rasterize.frozen import strip_of
@@ -41,15 +40,7 @@ _MOST = 0.5  # share of a pixel's light above which it shows the object
 class QueryableField(Queryable):
     """A field and its scene, which stands still: there is one frame, 0."""
 
-    def __init__(self, run: FieldRun, *, many: bool = False):
-        """
-        Args:
-            run: the field and its scene.
-            many: whether many queries follow; features are then computed once.
-        """
-        if many:
-            field = FeatureField(run.stored.features(), run.stored.field.lift)
-            run = replace(run, stored=replace(run.stored, field=field, rows=None))
+    def __init__(self, run: FieldRun):
         source = run.stored.source
         self.run, self._source = run, source
         super().__init__(
@@ -98,9 +89,7 @@ class QueryableField(Queryable):
         return Prompt(np.stack([vector, *(run.encoder.embed_text(text) for text in against)]), against)
 
     def like(self, row: int, frame: int) -> Prompt:
-        stored = self.run.stored
-        vector = jnp.matmul(stored.field.lift, stored.features()[row], precision="highest")
-        return Prompt(np.asarray(vector)[None])
+        return Prompt(np.asarray(self.run.stored.direction(row))[None])
 
     def scorer(self, prompt: Prompt, frame: int) -> Callable[[], Float[Array, "n"]]:
         return partial(self.run.stored.scores, prompt.vectors)

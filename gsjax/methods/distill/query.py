@@ -32,8 +32,37 @@ def gaussian_cosines(
         located: their locations in its grid; None for a vector per Gaussian.
         queries: vectors in the teacher's channels.
     """
+    return cosines_of(*directions_of(field, located), queries)
+
+
+@partial(jax.jit, inline=True)
+def directions_of(
+    field: FeatureField, located: Located | None
+) -> tuple[Float[Array, "n r"], Float[Array, "d r"]]:
+    """The rendered features of Gaussians, scaled so that W f_i has length 1, 0 where it has length 0; and the
+    map from them to the teacher's channels: all that queries need, made once for many of them.
+
+    Args:
+        field: the field of all Gaussians.
+        located: their locations in its grid; None for a vector per Gaussian.
+    """
     parts = rendered_features(field, located)
-    return _cosines(_of_gaussians(parts), parts.lifted(field.lift), queries)
+    lifted = parts.lifted(field.lift)
+    return _unit(_of_gaussians(parts), lifted), lifted
+
+
+@partial(jax.jit, inline=True)
+def cosines_of(
+    directions: Float[Array, "n r"], lifted: Float[Array, "d r"], queries: Float[Array, "q d"]
+) -> Float[Array, "n q"]:
+    """Cosines of Gaussians and queries.
+
+    Args:
+        directions, lifted: from `directions_of`.
+        queries: vectors in the teacher's channels.
+    """
+    toward = jnp.matmul(_normalised(queries), lifted, precision="highest")
+    return jnp.matmul(directions, toward.T, precision="highest")
 
 
 def pixel_cosines(
@@ -49,7 +78,8 @@ def pixel_cosines(
     """
     image, alphas = paint_shown(view, parts.values, plan)
     rendered = parts.joined(image.reshape(alphas.size, -1), alphas.ravel())
-    cosines = _cosines(rendered, parts.lifted(field.lift), queries)
+    lifted = parts.lifted(field.lift)
+    cosines = cosines_of(_unit(rendered, lifted), lifted, queries)
     return cosines.reshape(*alphas.shape, len(queries)), alphas
 
 
@@ -94,14 +124,11 @@ def _of_gaussians(parts: RenderedFeatures) -> Float[Array, "n r"]:
     return parts.joined(parts.values, jnp.ones(len(parts.values), parts.values.dtype))
 
 
-def _cosines(
-    rendered: Float[Array, "n r"], lifted: Float[Array, "d r"], queries: Float[Array, "q d"]
-) -> Float[Array, "n q"]:
+def _unit(rendered: Float[Array, "n r"], lifted: Float[Array, "d r"]) -> Float[Array, "n r"]:
+    """Rendered features, scaled so that what they are in the teacher's channels has length 1."""
     gram = jnp.matmul(lifted.T, lifted, precision="highest")
     squared = jnp.sum(jnp.matmul(rendered, gram, precision="highest") * rendered, axis=-1, keepdims=True)
-    toward = jnp.matmul(_normalised(queries), lifted, precision="highest")
-    product = jnp.matmul(rendered, toward.T, precision="highest")
-    return jnp.where(squared > _LEAST_NORM, product / jnp.sqrt(jnp.maximum(squared, _LEAST_NORM)), 0.0)
+    return jnp.where(squared > _LEAST_NORM, rendered / jnp.sqrt(jnp.maximum(squared, _LEAST_NORM)), 0.0)
 
 
 def _normalised(rows: Float[Array, "n d"]) -> Float[Array, "n d"]:

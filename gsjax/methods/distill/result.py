@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Int
 
 from gsjax.methods.distill.field import FeatureField, features_of
-from gsjax.methods.distill.query import gaussian_cosines
+from gsjax.methods.distill.query import cosines_of, directions_of
 from gsjax.methods.protocols import LanguageEncoder
 from gsjax.methods.query import encoded_prompt, relevancy
 from gsjax.scene.feature_grid import FeatureGrid, Located, locate
@@ -86,6 +86,11 @@ class DistillResult:
         """The field's feature of each Gaussian; `field.lift` maps it to the teacher's channels."""
         return features_of(*self.placed)
 
+    def direction(self, row: int) -> Float[Array, "d"]:
+        """The feature of a Gaussian in the teacher's channels, of length 1, or 0 where it has none."""
+        directions, lifted = self._directions
+        return jnp.matmul(lifted, directions[row], precision="highest")
+
     def cosines(self, vectors: Float[ArrayLike, "q d"]) -> Float[Array, "n q"]:
         """Cosines of the features of Gaussians and vectors in the teacher's channels.
 
@@ -95,7 +100,7 @@ class DistillResult:
         Raises:
             ValueError: the vectors' number of channels is not the teacher's.
         """
-        return _cosines(*self.placed, self._queries(vectors))
+        return cosines_of(*self._directions, self._queries(vectors))
 
     def scores(self, vectors: Float[ArrayLike, "q d"]) -> Float[Array, "n"]:
         """Score of each Gaussian for the first vector, against the others (`relevancy`).
@@ -106,7 +111,7 @@ class DistillResult:
         Raises:
             ValueError: as for `cosines`.
         """
-        return _scores(*self.placed, self._queries(vectors))
+        return _scores(*self._directions, self._queries(vectors))
 
     def query(
         self,
@@ -152,6 +157,11 @@ class DistillResult:
         with open(path, "wb") as stream:
             np.savez_compressed(stream, **arrays, about=np.array(json.dumps(about)))
 
+    @cached_property
+    def _directions(self) -> tuple[Float[Array, "n r"], Float[Array, "d r"]]:
+        """All that scores need, made by the first query."""
+        return directions_of(*self.placed)
+
     def _queries(self, vectors: Float[ArrayLike, "q d"]) -> Float[Array, "q d"]:
         queries = jnp.asarray(vectors, self.field.lift.dtype)
         if queries.shape[1] != self.field.dimension:
@@ -162,9 +172,6 @@ class DistillResult:
         return queries
 
 
-_cosines = jax.jit(gaussian_cosines)
-
-
 @jax.jit
-def _scores(field, located, queries):
-    return relevancy(gaussian_cosines(field, located, queries))
+def _scores(directions, lifted, queries):
+    return relevancy(cosines_of(directions, lifted, queries))

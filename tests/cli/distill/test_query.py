@@ -56,6 +56,37 @@ def panels(folder):
 # what it finds
 
 
+def test_a_text_within_another_finds_what_both_mean(gsjax, field, closed, scene, tmp_path):
+    """In the field of colours and names, the blue things within the can; and within it no ball."""
+    closed = shutil.copytree(closed, tmp_path / "closed")
+    assert gsjax("query", closed, "can")[0] == 0
+    cans = found_of(closed)["indices"]
+    assert gsjax("query", closed, "blue")[0] == 0
+    blues = found_of(closed)["indices"]
+    code, said = gsjax("query", closed, "blue", "--within", "can")
+    assert code == 0, said
+    assert "'blue' within 'can'" in said
+    both = np.intersect1d(cans, blues)
+    assert len(both) > 0
+    np.testing.assert_array_equal(found_of(closed)["indices"], both)
+    code, said = gsjax("query", field, "ball", "--within", "can")
+    assert code == 2
+    assert "'ball' within 'can' matches nothing in this scene" in said
+
+
+def test_the_best_few_are_found_whatever_their_scores(gsjax, closed, tmp_path):
+    closed = shutil.copytree(closed, tmp_path / "closed")
+    assert gsjax("query", closed, "red", "--top", 1)[0] == 0
+    found, told = found_of(closed), told_of(closed)
+    assert told["rule"] == "the 1 best"
+    best = np.nanmax(found["all_scores"])
+    np.testing.assert_array_equal(found["indices"], np.flatnonzero(found["all_scores"] == best))
+    for options, words in (((0,), "found 0"), ((5, "--threshold", 0.5), "found --threshold too")):
+        code, said = gsjax("query", closed, "red", "--top", *options)
+        assert code == 2
+        assert f"--top: expected 1 Gaussian or more, and no --threshold, {words}" in said
+
+
 def test_a_text_gives_gaussians_masks_and_scenes(gsjax, field, scene, pristine):
     code, said = gsjax("query", field, "can", "--move", 0, 0, 0.5)
     assert code == 0, said

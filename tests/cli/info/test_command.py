@@ -12,6 +12,7 @@ import gsjax
 from gsjax.cli import main
 from gsjax.data import DataWarning, open_photographs, open_sequence, photographs_of
 from gsjax.engine.info_picture import by_camera, by_split, scene_points
+from gsjax.engine.info_scene import describe_scene
 from gsjax.io.ply import write_ply
 from gsjax.io.scenes import write_gaussians
 from gsjax.viz.cameras import cameras_and_points
@@ -250,3 +251,17 @@ def test_a_recording_that_is_also_photographs_is_told_as_what_it_is_over_time(sh
     out = capfd.readouterr().out
     assert "60" in out
     assert "tracks of 784 points" in out
+
+
+@pytest.mark.parametrize(
+    ("labels", "words"),
+    [
+        (range(30), "0 to 29"),
+        ([0, 4], "0, 4"),
+        ([*range(0, 40, 2), *range(10)], "0, 1, 2, 3, 4, 5, 6, 7, ... (25 in all)"),
+    ],
+)
+def test_labels_of_a_scene_in_short(tmp_path, labels, words):
+    scene = make_scene(30)
+    write_ply(tmp_path / "scene.ply", scene, labels=np.resize(np.array(labels), 30))
+    assert describe_scene(tmp_path / "scene.ply")["labels"] == words
