@@ -50,9 +50,9 @@ class DistillWeightsConfig:
 class SolveConfig:
     """Configuration of a solution: a vector for each Gaussian by linear least squares."""
 
-    iterations: int = 15
+    iterations: int = 4
     """Iterations of conjugate gradients, each a pass over all views, after the vote."""
-    smoothness: float = 0.03
+    smoothness: float = 0.1
     """Weight of the squared difference of neighbours in space, relative to the pixels that show a Gaussian in
     the mean."""
     neighbors: int = 8

@@ -13,8 +13,8 @@ has no eigenvalue above 1, and conjugate gradients with D as the preconditioner 
 
 Each step sees one view, and the sums of a pass over all views make an iteration: the first pass gives the
 right-hand side and D, and their quotient is where the iterations begin. That is a vote: each Gaussian has the
-mean of the features of the pixels that show it, as in Occam's LGS (Cheng et al. 2024) and LightSplat. The
-second pass gives the residual, and each further one an iteration.
+mean of the features of the pixels that show it, as in Occam's LGS (Cheng et al. 2024) and LUDVIG (Marrie et
+al. 2024). The second pass gives the residual, and each further one an iteration.
 """
 
 from typing import Any, NamedTuple
@@ -30,6 +30,7 @@ from gsjax.methods.distill.config import DistillConfig
 from gsjax.methods.distill.field import FeatureField
 from gsjax.methods.distill.teacher import Teacher
 from gsjax.methods.distill.views import Batch, stretched
+from gsjax.optim.conjugate_gradients import Conjugate, advanced, turned
 from gsjax.optim.step import Step, all_finite, keep_if
 from gsjax.rasterize.frozen import paint_shown, rows_within, strip_of
 
@@ -54,15 +55,14 @@ class SolveBatch(NamedTuple):
 
 
 class SolveState(NamedTuple):
-    """Conjugate gradients, with a step length of its own for each of r channels.
+    """The sums of the present pass, and of those before what the iterations need, for r channels.
 
     Attributes:
         total: the sums of the present pass over the views.
         wanted: the right-hand side.
         mass: D, how much pixels show of each Gaussian.
         tie: lambda.
-        residual, direction: of the iterations.
-        squared: residual . D^-1 residual.
+        conjugate: the state of the iterations.
         target: sum of the squared targets, sum_p m_p |alpha_p e_p|^2.
         pixels: sum of m_p.
         loss: the objective after the latest pass, per pixel.
@@ -72,9 +72,7 @@ class SolveState(NamedTuple):
     wanted: Float[Array, "n r"]
     mass: Float[Array, "n"]
     tie: Float[Array, ""]
-    residual: Float[Array, "n r"]
-    direction: Float[Array, "n r"]
-    squared: Float[Array, "r"]
+    conjugate: Conjugate
     target: Float[Array, ""]
     pixels: Float[Array, ""]
     loss: Float[Array, ""]
@@ -104,15 +102,17 @@ def solve_step(config: DistillConfig) -> Step:
         empty = jnp.zeros_like(field.encoding)
         zero = jnp.zeros((), empty.dtype)
         each = jnp.zeros(len(empty), empty.dtype)
-        none = jnp.zeros(empty.shape[1], empty.dtype)
-        return SolveState(empty, empty, each, zero, empty, empty, none, zero, zero, zero)
+        nothing = Conjugate(empty, empty, jnp.zeros(empty.shape[1], empty.dtype))
+        return SolveState(empty, empty, each, zero, nothing, zero, zero, zero)
 
     def update(field: FeatureField, state: SolveState, batch: SolveBatch, *, step: Any, key: Any):
         found = jax.lax.cond(
             jnp.asarray(batch.turn) == 0,
             lambda: _targets_drawn_back(field, batch.view, config),
             lambda: _product(
-                jnp.where(jnp.asarray(batch.turn) == 1, field.encoding, state.direction), batch.view, config
+                jnp.where(jnp.asarray(batch.turn) == 1, field.encoding, state.conjugate.direction),
+                batch.view,
+                config,
             ),
         )
         rows = batch.view.view.rows
@@ -289,25 +289,17 @@ def _begun(field: FeatureField, state: SolveState, neighbors, config: DistillCon
     """After the product with the first guess: the residual, along which the first iteration goes."""
     x = field.encoding
     residual = state.wanted - state.total - state.tie * _laplacian(x, neighbors)
-    state = state._replace(residual=residual, loss=_objective(x, residual, state))
-    return field, _along(state, jnp.zeros_like(x), neighbors)
+    first = turned(state.conjugate, residual, _preconditioner(state, neighbors))
+    return field, state._replace(conjugate=first, loss=_objective(x, residual, state))
 
 
 def _advanced(field: FeatureField, state: SolveState, neighbors, config: DistillConfig):
     """After the product with a direction: an iteration of conjugate gradients."""
-    d = state.direction
-    product = state.total + state.tie * _laplacian(d, neighbors)
-    length = _quotient(state.squared, jnp.sum(d * product, axis=0))
-    x, residual = field.encoding + length * d, state.residual - length * product
-    state = state._replace(residual=residual, loss=_objective(x, residual, state))
-    return eqx.tree_at(lambda f: f.encoding, field, x), _along(state, d, neighbors)
-
-
-def _along(state: SolveState, before: Float[Array, "n r"], neighbors) -> SolveState:
-    """The next direction, conjugate to the one before."""
-    toward = state.residual / _preconditioner(state, neighbors)[:, None]
-    squared = jnp.sum(state.residual * toward, axis=0)
-    return state._replace(direction=toward + _quotient(squared, state.squared) * before, squared=squared)
+    product = state.total + state.tie * _laplacian(state.conjugate.direction, neighbors)
+    scale = _preconditioner(state, neighbors)
+    x, after = advanced(field.encoding, state.conjugate, product, scale)
+    field = eqx.tree_at(lambda f: f.encoding, field, x)
+    return field, state._replace(conjugate=after, loss=_objective(x, after.residual, state))
 
 
 def _preconditioner(state: SolveState, neighbors: Int[Array, "n k"]) -> Float[Array, "n"]:
@@ -350,7 +342,3 @@ def _spread(votes: Float[Array, "n r"], seen: Bool[Array, "n"], neighbors: Int[A
         return (rings < _SPREAD) & ~known.all()
 
     return jax.lax.while_loop(is_unfinished, ring, (votes, seen, jnp.asarray(0)))[0]
-
-
-def _quotient(a: Float[Array, "r"], b: Float[Array, "r"]) -> Float[Array, "r"]:
-    return jnp.where(b > _LEAST, a / jnp.maximum(b, _LEAST), 0.0)

@@ -30,6 +30,7 @@ from gsjax.geometry.cameras import Camera
 from gsjax.geometry.neighbors import nearest
 from gsjax.methods.track.motion import Pose, place
 from gsjax.methods.track.scene import TrackedScene
+from gsjax.optim.conjugate_gradients import Conjugate, advanced, turned
 from gsjax.optim.step import Step, all_finite, keep_if
 from gsjax.rasterize.plan import Plan
 from gsjax.scene.frame import Frame
@@ -159,15 +160,12 @@ def feature_distiller() -> Step:
         # W is linear: the same render computes the residual in the first update and applies W^T W later.
         at, towards = jnp.where(begun, state.direction, params), jnp.where(begun, 0.0, maps)
         pull, (overflow, needed) = _residual(at, towards, gaussians, cameras, valid, plan)
-        along = damping * state.direction - pull
-        length = _ratio(state.energy, jnp.sum(state.direction * along, axis=0))
-        features = jnp.where(begun, params + length * state.direction, params)
-        first = pull + damping * (prior - params)
-        residual = jnp.where(begun, state.residual - length * along, first)
-        scaled = residual / (weights + damping + 1e-6)[:, None]
-        energy = jnp.sum(residual * scaled, axis=0)
-        direction = scaled + _ratio(energy, state.energy) * state.direction
-        new = (features, DistillState(residual, direction, energy, jnp.asarray(True)))
+        scale = weights + damping + 1e-6
+        known = Conjugate(state.residual, state.direction, state.energy)
+        features, moved = advanced(params, known, damping * state.direction - pull, scale)
+        first = turned(known, pull + damping * (prior - params), scale)
+        features = jnp.where(begun, features, params)
+        new = (features, DistillState(*keep_if(begun, moved, first), jnp.asarray(True)))
         sound = all_finite(new[:1] + new[1][:3]) & ~overflow
         params, state = keep_if(sound, new, (params, state))
         info = {"loss": state.energy.sum(), "energy": state.energy, "skipped": ~sound}
@@ -240,11 +238,6 @@ def _project(
         found, _ = nearest(points[lacking], points[giving])
         features[lacking[found >= 0]] = features[giving[found[found >= 0]]]
     return features, weights
-
-
-def _ratio(a: Float[Array, "d"], b: Float[Array, "d"]) -> Float[Array, "d"]:
-    """a / b, and 0 for a channel that has converged."""
-    return jnp.where(b > 0, a / jnp.where(b > 0, b, 1.0), 0.0)
 
 
 def _checked(maps: Array | np.ndarray, frame: Frame) -> tuple[Array, Array]:
