@@ -23,7 +23,8 @@ from gsjax.methods.distill import (
     with_maps,
 )
 from gsjax.methods.distill.teacher import max_rows, view_codebook
-from gsjax.methods.distill.update import _stretched, strip_rows
+from gsjax.methods.distill.update import strip_rows
+from gsjax.methods.distill.views import stretched
 from gsjax.rasterize.frozen import paint
 from gsjax.scene.feature_grid import FeatureGridConfig
 from gsjax.scene.gaussians import gaussians_from_activated
@@ -139,9 +140,9 @@ def test_maps_are_stretched_as_opencv_does(scene, size):
     plan = problem.views[0].plan
     features = np.random.default_rng(2).normal(size=(*size, 3)).astype(np.float32)
     want = cv2.resize(features, (WIDTH, HEIGHT), interpolation=cv2.INTER_LINEAR)
-    stretched = jax.jit(_stretched, static_argnums=2)
-    np.testing.assert_allclose(stretched(features, 0, HEIGHT, plan), want, atol=1e-4)
-    np.testing.assert_allclose(stretched(features, 8, 4, plan), want[8:12], atol=1e-4)
+    compiled = jax.jit(stretched, static_argnums=2)
+    np.testing.assert_allclose(compiled(features, 0, HEIGHT, plan), want, atol=1e-4)
+    np.testing.assert_allclose(compiled(features, 8, 4, plan), want[8:12], atol=1e-4)
 
 
 def test_the_length_of_an_encoders_vectors_does_not_matter(scene):

@@ -161,8 +161,8 @@ class Distill:
     def batch(
         self, problem: Problem, run: Run, progress: float
     ) -> tuple[SolveBatch | Batch, tuple[str, ...]]:
-        """The next view: in order in a solution, shuffled in the descent. Arguments as for
-        `Method.batch`."""
+        """The next view: in order in a solution, shuffled in the descent.
+        Arguments as for `Method.batch`."""
         begun, count = self.steps_of_solution(problem), len(problem.views)
         if run.step < begun:
             assert problem.neighbors is not None

@@ -10,7 +10,6 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
-from gsjax.geometry.cameras import NEAR
 from gsjax.viz.viewer import markup
 from gsjax.viz.viewer.ask_folder import AskFolder
 from gsjax.viz.viewer.cameras import (
@@ -288,9 +287,7 @@ class Page:
         """The browser's camera for a picture of this width, and the range of depths it sees."""
         camera = self._client.camera
         width, height = picture_size(width, (camera.image_width, camera.image_height))
-        shots = now.scene.shots
-        near = NEAR if shots is None else shots.near
-        seen = browser_camera(camera.wxyz, camera.position, camera.fov, width, height, near)
+        seen = browser_camera(camera.wxyz, camera.position, camera.fov, width, height, now.scene.near)
         means = np.asarray(now.gaussians.means)
         return seen, depth_range(means, np.asarray(seen.viewmat[0]), camera.fov, width / height)
 

@@ -212,6 +212,11 @@ class Viewable:
             _check("times", self.times, (self.num_frames,))
 
     @property
+    def near(self) -> float:
+        """Distance of the near plane of its photographs' cameras, metres."""
+        return NEAR if self.shots is None else self.shots.near
+
+    @property
     def num_frames(self) -> int:
         """Number of frames; 1 if nothing moves."""
         return 1 if self.motion is None else self.motion.num_frames

@@ -44,7 +44,7 @@ def images(pristine):
 def distilled(pristine, scene, tmp_path_factory):
     """The field of the classes of the recording's masks."""
     out = tmp_path_factory.mktemp("fields") / "field"
-    steps = ("--distill.iterations", STEPS, *TABLE)
+    steps = ("--preset", "paper", "--distill.iterations", STEPS, *TABLE)
     assert main([str(a) for a in ("distill", scene, "--out", out, *images(pristine), *SMALL, *steps)]) == 0
     return out
 
@@ -86,6 +86,19 @@ def _metrics(field):
 
 def _told(run):
     return json.loads((run / "query" / "query.json").read_text())
+
+
+@pytest.mark.parametrize("preset", ["vote", "solve"])
+def test_a_field_without_descent_takes_passes_over_the_views(gsjax, pristine, scene, tmp_path, preset):
+    """Its vectors are one for each class, and name most of what the masks show."""
+    out = tmp_path / "field"
+    code, said = gsjax("distill", scene, "--out", out, *images(pristine), "--preset", preset)
+    assert code == 0, said
+    found = _metrics(out)
+    assert (found["preset"], found["steps"]) == (preset, 3 if preset == "vote" else 18)
+    assert found["test"]["miou_3d"] > 0.6
+    assert found["trained"] == found["num_gaussians"] * 6 + 512 * 6
+    assert gsjax("query", out, "can")[0] == 0
 
 
 def test_what_was_distilled_can_be_asked(gsjax, field, pristine):
