@@ -21,7 +21,7 @@ from experiments.shared.fields import (
 from gsjax.data import ReadOptions
 from gsjax.engine.distill.scene import FieldScene
 from gsjax.engine.distill.scores import classes_of
-from gsjax.engine.drive import drive
+from gsjax.engine.drive import Clock, drive
 from gsjax.methods.distill import PRESETS, Distill, DistillConfig, DistillResult, Teacher, teacher_of_objects
 from gsjax.methods.fit import FitConfig, StartConfig
 from gsjax.optim.compiler import host_options
@@ -102,9 +102,10 @@ def trained(
 ) -> tuple[DistillResult, dict[str, float]]:
     """A field, and its time from the Gaussians and the teacher on: in all but compiling, and compiling."""
     cameras = [scene.photographs.camera(i) for i in scene.taught]
-    begun, method = perf_counter(), Distill(config)
+    clock, method = Clock(), Distill(config)
     problem, first = method.start(scene.gaussians, cameras, teacher, scene.rasterize_mode)
-    seconds, compiling, memory = perf_counter() - begun, 0.0, memory_mb(method, problem, first)
+    seconds, compiling = clock.read()
+    memory = memory_mb(method, problem, first)
     ticks = drive(method, problem, first)
     for now in ticks:
         seconds, compiling = seconds + now.seconds, compiling + now.compile_seconds

@@ -42,10 +42,6 @@ class GaussianOptions:
     """Score above which a Gaussian is selected: a cosine (-1 to 1), or, compared with negatives or names, a
     share (0 to 1). Default: 1/2 for a share; for a text of the closed vocabulary, its own threshold; else
     the one that best divides the scores into two classes (Otsu)."""
-    top: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
-    """Select the N Gaussians with the best scores, instead of those above a threshold."""
-    within: Annotated[str | None, tyro.conf.arg(metavar="TEXT")] = None
-    """Find only what is part of what this text finds: `handle --within drawer`."""
     color: Annotated[tuple[float, float, float] | None, tyro.conf.arg(metavar="R G B")] = None
     """RGB, 0 to 1, that recolored.ply gives to what was found (default: pink)."""
     negatives: Annotated[tuple[str, ...] | None, tyro.conf.arg(metavar="TEXT [TEXT ...]")] = None
@@ -62,6 +58,10 @@ class FieldOptions:
 
     image: Path | None = None
     """A picture of the thing to find; with an alpha channel, only its opaque part."""
+    top: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
+    """Select the N Gaussians with the best scores, instead of those above a threshold."""
+    within: Annotated[str | None, tyro.conf.arg(metavar="TEXT")] = None
+    """Find only what is part of what this text finds: `handle --within drawer`."""
     scene: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """Present path of the scene's file, if it was moved (default: its first path, or next to the field)."""
     images: Annotated[str | None, tyro.conf.arg(metavar="FOLDER")] = None
@@ -230,11 +230,13 @@ def _print(question: Question, unit: str, seen_in: str, info: dict[str, Any], se
     meant = f", {info['meant']!r}" if info["meant"] and info["meant"] != info["text"] else ""
     against = f", against {', '.join(info['against'][:_LISTED])}" if info["against"] else ""
     unit = f" {unit}" if unit else ""
+    least = "above" if question.top is None else "at least"
     rows = {
         "found": f"{question.words}{meant}: {info['gaussians']:,} of {info['of']:,} Gaussians",
         "centre": ", ".join(f"{x:.3f}" for x in info["center"]) + unit,
         "size": " x ".join(f"{x:.3f}" for x in info["size"]) + unit,
-        "score": f"above {info['threshold']:.2f} ({info['rule']}), {info['best_score']:.2f} at best{against}",
+        "score": f"{least} {info['threshold']:.2f} ({info['rule']}), {info['best_score']:.2f} at best"
+        + against,
     }
     if pixels := info["pixels"]:
         unseen = [name for name, count in pixels.items() if not count]
@@ -258,9 +260,9 @@ def _question(options: Options) -> Question:
         camera=options.camera,
         frame=deform.frame,
         frames=deform.frames,
-        within=gaussians.within,
+        within=options.field.within,
         threshold=gaussians.threshold,
-        top=gaussians.top,
+        top=options.field.top,
         negatives=gaussians.negatives,
         color=gaussians.color or Question.color,
         move=gaussians.move,

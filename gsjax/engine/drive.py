@@ -182,7 +182,9 @@ def drive(
 
 def _guard_of(before: Run, run: Run) -> Guard:
     """The guard of the next step. It begins anew where losses can no longer be compared: with other
-    parameters or constants, or where `between` dropped it."""
+    parameters or constants, or where `between` dropped it. One that rests goes on to rest."""
+    if run.guard is not None and run.guard.is_resting:
+        return run.guard
     old, new = (jax.tree.leaves((one.params, one.kept)) for one in (before, run))
     is_same = len(old) == len(new) and all(map(operator.is_, old, new))
     return run.guard if run.guard is not None and is_same else begun(run.params, before.guard)

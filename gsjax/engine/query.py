@@ -33,7 +33,6 @@ from gsjax.viz.viewer import Answer, Asking
 SCENE_CAPTIONS = {"recolored": "recoloured", "moved": "moved"}
 """Captions of the scenes of `Question.changed`, by the names of their files."""
 _EXTRACTED = "extracted"  # folder of parts that the viewer saved, in that of the run
-_OUTSIDE = -1.0  # score of what is outside of where to look, the lowest possible
 _HIGHEST = 1.0  # highest score: a cosine is from -1 to 1, a share against others from 0 to 1
 
 
@@ -94,13 +93,16 @@ class Question:
     @property
     def words(self) -> str:
         """A short description of the query, for messages."""
+        return self._what if self.within is None else f"{self._what} within {self.within!r}"
+
+    @property
+    def _what(self) -> str:
         if self.point is not None:
             camera = "" if self.camera is None else f" of {self.camera}"
             return f"what is at {self.point[0]:g},{self.point[1]:g}{camera}"
         if self.box is not None:
             return "what is in {:g},{:g} to {:g},{:g}".format(*self.box)
-        words = repr(self.text) if self.image is None else f"what {self.image.name} shows"
-        return words if self.within is None else f"{words} within {self.within!r}"
+        return repr(self.text) if self.image is None else f"what {self.image.name} shows"
 
     def changed(self, gaussians: Gaussians, selected: Bool[np.ndarray, "n"]) -> dict[str, Gaussians]:
         """Scenes with the selected Gaussians changed, by the names of their files."""
@@ -120,7 +122,8 @@ class Selection:
         frame: index of the frame whose Gaussians were scored.
         prompt: of the query.
         scores: of all Gaussians.
-        threshold: score above which they are selected.
+        threshold: score above which they are selected, within what the question names.
+        selected: which are.
         seconds: time that it took to score all Gaussians.
     """
 
@@ -129,12 +132,8 @@ class Selection:
     prompt: Prompt
     scores: Float[np.ndarray, "n"]
     threshold: Threshold
+    selected: Bool[np.ndarray, "n"]
     seconds: float
-
-    @property
-    def selected(self) -> Bool[np.ndarray, "n"]:
-        """The Gaussians that score above the threshold."""
-        return self.scores > self.threshold.value
 
 
 @dataclass(eq=False)
@@ -221,22 +220,22 @@ def select(run: Queryable, question: Question, frame: int, prompt: Prompt | None
         ValueError, FileNotFoundError: as for `Queryable.prompt`; or nothing is found that the rest is to be
             within.
     """
-    inside = None if question.within is None else _place(run, question, frame)
     prompt = run.prompt(question, frame) if prompt is None else prompt
     score = run.scorer(prompt, frame)
     jax.block_until_ready(score())  # compiles
     begun = perf_counter()
     scores, seconds = np.asarray(score()), perf_counter() - begun
-    considered = scores if inside is None else scores[inside]
+    inside = np.isfinite(scores)
+    if question.within is not None:
+        inside &= _place(run, question, frame)
     if question.top is None:
-        threshold = prompt.threshold(considered, question.threshold)
+        threshold = prompt.threshold(scores[inside], question.threshold)
+        selected = inside & (scores > threshold.value)
     else:
-        known = np.sort(considered[np.isfinite(considered)])
-        least = known[max(0, len(known) - question.top)] if len(known) else np.inf
-        threshold = Threshold(float(np.nextafter(least, -np.inf)), f"the {question.top} best")
-    if inside is not None:
-        scores = np.where(inside, scores, min(np.float32(_OUTSIDE), scores.min()))
-    return Selection(question, frame, prompt, scores, threshold, seconds)
+        best = np.argsort(np.where(inside, -scores, np.inf), kind="stable")[: min(question.top, inside.sum())]
+        selected = np.isin(np.arange(len(scores)), best)
+        threshold = Threshold(float(scores[best].min(initial=np.inf)), f"the {question.top} best")
+    return Selection(question, frame, prompt, scores, threshold, selected, seconds)
 
 
 def _place(run: Queryable, question: Question, frame: int) -> Bool[np.ndarray, "n"]:
@@ -289,6 +288,7 @@ def answer(
             "text": question.text,
             "point": question.point,
             "within": question.within,
+            "top": question.top,
             "features": run.kind,
             **run.about(question, frame),
             "meant": found.prompt.name,

@@ -84,6 +84,7 @@ class Guard(eqx.Module):
         candidate: a better one, until the steps after it confirm its parameters, which no loss has seen.
         returns: number of returns to the best parameters, in all stretches.
         is_settled: whether the parameters at the end of the run are the best rather than the latest.
+        is_resting: whether nothing is watched; see `resting`.
     """
 
     share: Float[Array, ""]
@@ -94,6 +95,7 @@ class Guard(eqx.Module):
     candidate: Level | None = None
     returns: int = 0
     is_settled: bool = False
+    is_resting: bool = False
 
     @property
     def level(self) -> Level:
@@ -109,6 +111,8 @@ class Guard(eqx.Module):
             params: parameters after the step.
             window: number of steps that are compared.
         """
+        if self.is_resting:
+            return self, params
         losses = np.append(self.losses, loss)[-window:]
         guard = replace(self, losses=losses, steps=self.steps + 1, is_settled=False)
         candidate, beginning = guard.candidate, guard.beginning
@@ -140,6 +144,8 @@ class Guard(eqx.Module):
         Args:
             params: the latest parameters.
         """
+        if self.is_resting:
+            return self, params
         level, tail = self.level, self.losses[-_TAIL:]
         is_known = len(tail) >= _TAIL or np.isnan(tail).any()
         if not is_known or not np.isfinite(level.mean):
@@ -170,6 +176,19 @@ def begun(params: PyTree, before: Guard | None = None) -> Guard:
     """
     beginning = Level(-np.inf, None, jax.tree.map(np.array, params))
     return Guard(jnp.ones((), jnp.float32), beginning, returns=0 if before is None else before.returns)
+
+
+def resting(before: Guard | None) -> Guard:
+    """A guard that watches nothing and keeps no parameters, for steps that are parts of an iteration which
+    cannot diverge, and whose losses do not tell how good the parameters are.
+
+    Args:
+        before: the guard before, whose count of returns goes on.
+    """
+    if before is not None and before.is_resting:
+        return before
+    nothing, returns = Level(-np.inf, None, None), 0 if before is None else before.returns
+    return Guard(jnp.ones((), jnp.float32), nothing, returns=returns, is_resting=True)
 
 
 def window_of(total: int, period: int) -> int:

@@ -17,6 +17,7 @@ from gsjax.scene.initialize import gaussians_from_points
 def test_a_part_that_moves_farther_than_the_scene_is_wide_is_warned_of(moved_mm):
     means = np.random.default_rng(0).uniform(size=(500, 3))  # a cube of a metre, and one far away
     means[0] = 100.0
+    means[1] = np.nan
     gaussians = gaussians_from_points(means, means[:, ::-1].clip(0, 1))
     scene = PartScene(gaussians, jnp.ones((500, 1)), jnp.zeros((1, 3)))
     rows = [

@@ -204,3 +204,16 @@ def test_neighbours_are_the_nearest_others():
 def test_no_steps_at_all_are_refused():
     with pytest.raises(ValueError, match="iterations: expected"):
         DistillConfig(iterations=0)
+
+
+def test_many_views_of_which_the_last_show_more_end_with_their_vote(scene):
+    """The energy of what is to be voted for rises with them, which is no divergence."""
+    gaussians, _, masks = scene
+    some = [np.where((mask > 0) | (i < 120), mask, -1) for i, mask in enumerate(masks * 19)]
+    method = Distill(PRESETS["vote"])
+    teacher = teacher_of_objects(some, [BOOK] * 152)
+    ticks = drive(method, *method.start(gaussians, cameras(8) * 19, teacher))
+    *_, last = ticks
+    assert last.step == 152
+    assert not last.run.guard.is_settled
+    assert np.abs(np.asarray(last.result.field.encoding)).sum(1).min() > 0

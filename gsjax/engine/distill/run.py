@@ -39,6 +39,16 @@ from gsjax.engine.teaching.teaching import Teaching
 from gsjax.io.atomic import atomic_write
 from gsjax.methods.distill import PRESETS, Distill, DistillConfig
 
+_OF_TRAINING = (
+    "encoding",
+    "grid",
+    "rates",
+    "contrast_after",
+    "contrast_gamma",
+    "contrast_pool",
+    "contrast_patch",
+)
+
 
 @dataclass(frozen=True, kw_only=True)
 class Options(Common, Resuming, Timed, Seeded, TeacherChoice, SceneOptions):
@@ -66,6 +76,7 @@ def run(options: Options) -> int:
     budget = Budget(options.minutes, begun)
     with Notes(console) as notes:
         options.check()
+        _note_unused(options.distill, notes)
         scene = open_field_scene(options)
         sha256 = digest(scene.file)
         out = _out(options, scene.file)
@@ -144,11 +155,21 @@ def with_paths(options: Options) -> Options:
     return replace(options, **options.located(), scene=Path(located(str(options.scene))), images=images)
 
 
+def _note_unused(config: DistillConfig, notes: Notes) -> None:
+    """Warn of settings that differ from the defaults and change nothing, as no training follows."""
+    plain, given = asdict(DistillConfig()), asdict(config)
+    if config.iterations == 0:
+        changed = [name for name in _OF_TRAINING if given[name] != plain[name]]
+        if changed:
+            flags = ", ".join(f"--distill.{name.replace('_', '-')}" for name in changed)
+            notes.warn(f"settings without an effect: {flags}; no training follows (--distill.iterations)")
+
+
 def _words(row: Mapping[str, Any]) -> str:
     """A row of means in words."""
     if row["cos"] is not None:
         return f"1 - cosine to the teacher {row['cos']:.3f}"
-    return "no finite loss" if row["loss"] is None else f"squared error {row['loss']:.3g}"
+    return "a vote of the views" if row["rec"] is None else f"squared error {row['rec']:.3g}"
 
 
 def _out(options: Options, scene: Path) -> Path:

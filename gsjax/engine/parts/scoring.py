@@ -63,7 +63,8 @@ def warn_of_strays(rows: list[dict[str, Any]], scene: PartScene, notes: Notes) -
         scene: the parts.
         notes: receives the warning.
     """
-    low, high = np.quantile(np.asarray(scene.gaussians.means, np.float64), _BUT_OUTLIERS, axis=0)
+    means = np.asarray(scene.gaussians.means, np.float64)
+    low, high = np.quantile(means[np.isfinite(means).all(axis=1)], _BUT_OUTLIERS, axis=0)
     width = 1000 * float(np.linalg.norm(high - low))
     strays = [row for row in rows if row["moved_mm"] > width]
     if strays:

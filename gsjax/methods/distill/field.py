@@ -99,16 +99,28 @@ def init_field(
     lift = jax.random.uniform(second, (dimension, config.channels), minval=-bound, maxval=bound)
     if config.encoding == "table":
         return FeatureField(1e-2 * jax.random.normal(first, (len(means), config.channels)), lift), None
+    low, high = _box(expect_finite(means))
+    room = _MARGIN * max((high - low).max(), 1e-3)
+    grid = init_feature_grid(first, config.grid, config.channels, np.stack([low - room, high + room]))
+    return FeatureField(grid, lift), locate(grid, jnp.asarray(means))
+
+
+def expect_finite(means: Float[Array, "n 3"]) -> Float[np.ndarray, "some 3"]:
+    """The centres of Gaussians that are finite. On the host.
+
+    Args:
+        means: centres, metres.
+
+    Raises:
+        ValueError: none is.
+    """
     points = np.asarray(means)
     points = points[np.isfinite(points).all(axis=1)]
     if not len(points):
         raise ValueError(
             f"means: expected finite centres of Gaussians, found {len(means)}, none of them finite"
         )
-    low, high = _box(points)
-    room = _MARGIN * max((high - low).max(), 1e-3)
-    grid = init_feature_grid(first, config.grid, config.channels, np.stack([low - room, high + room]))
-    return FeatureField(grid, lift), locate(grid, jnp.asarray(means))
+    return points
 
 
 def _box(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "2 3"]:

@@ -12,13 +12,20 @@ from jaxtyping import Array, Float, Int
 
 from gsjax.geometry.cameras import Camera
 from gsjax.methods.distill.config import DistillConfig
-from gsjax.methods.distill.field import FeatureField, active_table, fitted_to_vectors, init_field
+from gsjax.methods.distill.field import (
+    FeatureField,
+    active_table,
+    expect_finite,
+    fitted_to_vectors,
+    init_field,
+)
 from gsjax.methods.distill.result import DistillResult
 from gsjax.methods.distill.solve import SolveBatch, graph_of, passes, solve_step, unsolved
 from gsjax.methods.distill.teacher import Teacher, max_rows
 from gsjax.methods.distill.update import contrast_begins, distill_step
-from gsjax.methods.distill.views import Batch, expect_alike, frozen_views, view_batch
+from gsjax.methods.distill.views import Batch, expect_alike, frozen_views, in_basis, view_batch
 from gsjax.methods.sampling import shuffled_index
+from gsjax.optim.guard import resting
 from gsjax.optim.method import Run
 from gsjax.optim.step import Step, copied
 from gsjax.scene.feature_grid import FeatureGrid, Located
@@ -35,6 +42,7 @@ class Problem(NamedTuple):
         rows: indices of the grid's entries that are trained; None without a grid.
         means: centres of the scene's Gaussians, metres.
         source, scene: as in `DistillResult`.
+        solving: the views with their teacher in the channels of a solution; empty without one.
         neighbors: of each Gaussian, in a solution; None without one.
         untrained: the field of the descent, before it is fitted to the solution; None without either.
         located: the locations of the Gaussians in its grid; None without one.
@@ -45,6 +53,7 @@ class Problem(NamedTuple):
     means: Float[Array, "n 3"]
     source: Any
     scene: Mapping[str, Any]
+    solving: tuple[Batch, ...] = ()
     neighbors: Int[Array, "n k"] | None = None
     untrained: FeatureField | None = None
     located: Located | None = None
@@ -103,6 +112,7 @@ class Distill:
             ValueError: the teacher's views differ in number or size, or no Gaussian has a finite centre.
         """
         expect_alike(cameras, teacher)
+        expect_finite(gaussians.means)
         config, solved, located, rows, untrained = self.config, None, None, None, None
         if config.start != "random":
             solved = unsolved(teacher, gaussians.num, config)
@@ -123,7 +133,8 @@ class Distill:
         if solved is None:
             return problem, Run(untrained, jax.jit(self.step.init)(untrained))
         neighbors = graph_of(gaussians.means, config)
-        problem = problem._replace(neighbors=neighbors, untrained=untrained, located=located)
+        solving = tuple(in_basis(view, solved.lift) for view in views)
+        problem = problem._replace(solving=solving, neighbors=neighbors, untrained=untrained, located=located)
         return problem, Run(solved, jax.jit(self.step.init)(solved))
 
     @property
@@ -148,7 +159,9 @@ class Distill:
         losses become others. Arguments as for `Method.between`."""
         step = run.step - self.steps_of_solution(problem)
         if step < 0:
-            return run if run.step % len(problem.views) else run.having(guard=None)  # a pass has one loss
+            return run.having(guard=resting(run.guard))
+        if step == 0:
+            run = run.having(guard=None)
         if step == 0 and problem.untrained is not None:
             key = jax.random.fold_in(jax.random.key(self.config.seed), _FIT)
             solved: FeatureField = run.params
@@ -167,7 +180,7 @@ class Distill:
         if run.step < begun:
             assert problem.neighbors is not None
             turn, v = divmod(run.step, count)
-            return SolveBatch(problem.views[v], problem.neighbors, turn, v == count - 1), ()
+            return SolveBatch(problem.solving[v], problem.neighbors, turn, v == count - 1), ()
         v = shuffled_index(self.config.seed, run.step - begun, count)
         return problem.views[v]._replace(begun=begun), ()
 

@@ -31,7 +31,7 @@ from gsjax.methods.distill.field import FeatureField
 from gsjax.methods.distill.teacher import Teacher
 from gsjax.methods.distill.views import Batch, stretched
 from gsjax.optim.conjugate_gradients import Conjugate, advanced, turned
-from gsjax.optim.step import Step, all_finite, keep_if
+from gsjax.optim.step import Step, all_finite
 from gsjax.rasterize.frozen import paint_shown, rows_within, strip_of
 
 _LEAST = 1e-12
@@ -42,7 +42,7 @@ class SolveBatch(NamedTuple):
     """The input of a step.
 
     Attributes:
-        view: a view and its teacher.
+        view: a view and its teacher, in the channels of the field (`gsjax.methods.distill.views.in_basis`).
         neighbors: the nearest others of each Gaussian.
         turn: index of the pass over the views; the first is the vote.
         is_last: whether the view is the last of its pass.
@@ -62,7 +62,7 @@ class SolveState(NamedTuple):
         wanted: the right-hand side.
         mass: D, how much pixels show of each Gaussian.
         tie: lambda.
-        conjugate: the state of the iterations.
+        conjugate: the state of the iterations; None for a vote.
         target: sum of the squared targets, sum_p m_p |alpha_p e_p|^2.
         pixels: sum of m_p.
         loss: the objective after the latest pass, per pixel.
@@ -72,7 +72,7 @@ class SolveState(NamedTuple):
     wanted: Float[Array, "n r"]
     mass: Float[Array, "n"]
     tie: Float[Array, ""]
-    conjugate: Conjugate
+    conjugate: Conjugate | None
     target: Float[Array, ""]
     pixels: Float[Array, ""]
     loss: Float[Array, ""]
@@ -91,8 +91,10 @@ def solve_step(config: DistillConfig) -> Step:
     """One view of a pass of the solution of a `FeatureField` with a vector for each Gaussian, whose `lift`
     has orthonormal columns and does not change; given a `SolveBatch`. Neither `step` nor `key` is used.
 
-    `info` has `rec` in addition to what every step reports: the objective after the latest whole pass, a mean
-    over pixels and the teacher's channels as for L_rec. A view whose sums are not finite adds nothing.
+    The loss is the objective after the latest whole pass, a mean over pixels; until the second pass knows
+    that of the vote, it is that of vectors of zeros. `info` also has `rec`, the loss as a mean over the
+    teacher's channels like L_rec, NaN as long as it is that of zeros. A view whose sums are not finite adds
+    nothing, but the pass goes on.
 
     Args:
         config: settings of the solution, and the memory of a strip.
@@ -103,35 +105,38 @@ def solve_step(config: DistillConfig) -> Step:
         zero = jnp.zeros((), empty.dtype)
         each = jnp.zeros(len(empty), empty.dtype)
         nothing = Conjugate(empty, empty, jnp.zeros(empty.shape[1], empty.dtype))
+        nothing = None if config.start == "vote" else nothing
         return SolveState(empty, empty, each, zero, nothing, zero, zero, zero)
 
     def update(field: FeatureField, state: SolveState, batch: SolveBatch, *, step: Any, key: Any):
-        found = jax.lax.cond(
-            jnp.asarray(batch.turn) == 0,
-            lambda: _targets_drawn_back(field, batch.view, config),
-            lambda: _product(
-                jnp.where(jnp.asarray(batch.turn) == 1, field.encoding, state.conjugate.direction),
-                batch.view,
-                config,
-            ),
-        )
-        rows = batch.view.view.rows
+        turn, rows = jnp.asarray(batch.turn), batch.view.view.rows
+        if (known := state.conjugate) is None:
+            found = _targets_drawn_back(batch.view, config)
+        else:
+            found = jax.lax.cond(
+                turn == 0,
+                lambda: _targets_drawn_back(batch.view, config),
+                lambda: _product(jnp.where(turn == 1, field.encoding, known.direction), batch.view, config),
+            )
+        sound = all_finite(found)
+        found = jax.tree.map(lambda a: jnp.where(sound, a, 0.0), found)
         summed = state._replace(
             total=state.total.at[rows].add(found.rows),
             mass=state.mass.at[rows].add(found.mass),
             target=state.target + found.target,
             pixels=state.pixels + found.pixels,
         )
-        after = jax.lax.cond(
+        summed = summed._replace(
+            loss=jnp.where(turn == 0, summed.target / jnp.maximum(summed.pixels, 1.0), summed.loss)
+        )
+        field, state = jax.lax.cond(
             batch.is_last,
             lambda: _after_pass(field, summed, batch, config),
             lambda: (field, summed),
         )
-        sound = all_finite(after)
-        field, state = keep_if(sound, after, (field, state))
-        seen = jnp.where(state.pixels > 0, state.target / jnp.maximum(state.pixels, 1.0), 0.0)
-        loss = jnp.where(jnp.asarray(batch.turn) == 0, seen, state.loss)
-        info = {"rec": loss / field.dimension, "loss": loss, "skipped": ~sound}
+        is_known = (turn > 1) | ((turn == 1) & jnp.asarray(batch.is_last))
+        rec = jnp.where(is_known, state.loss / field.dimension, jnp.nan)
+        info = {"rec": rec, "loss": state.loss, "skipped": ~sound}
         return field, state, info | {"overflow": jnp.asarray(False), "needed": jnp.int32(0)}
 
     return Step(init, update)
@@ -189,12 +194,14 @@ def graph_of(means: Float[Array, "n 3"], config: DistillConfig) -> Int[Array, "n
     return jnp.asarray(nearest_neighbors(np.asarray(means), config.solve.neighbors), jnp.int32)
 
 
-def _targets_drawn_back(field: FeatureField, batch: Batch, config: DistillConfig) -> _Sums:
+def _targets_drawn_back(batch: Batch, config: DistillConfig) -> _Sums:
     """W^T M alpha e and W^T M alpha of a view."""
-    empty = jnp.zeros((len(batch.view.rows), field.channels + 1), field.lift.dtype)
+    features = batch.map if batch.codebook is None else batch.codebook
+    assert features is not None
+    empty = jnp.zeros((len(batch.view.rows), features.shape[-1] + 1), features.dtype)
 
     def cotangent(first, inside, image, alphas):
-        targets, weights = _targets(field, batch, first, inside, config.weights.map)
+        targets, weights = _targets(batch, first, inside, config.weights.map)
         shown = alphas[..., None] * targets
         squares = jnp.where(weights > 0, jnp.sum(shown**2, axis=-1) / jnp.maximum(weights, _LEAST), 0.0)
         joined = jnp.concatenate([shown, (weights * alphas)[..., None]], axis=-1)
@@ -247,17 +254,15 @@ def _weights(batch: Batch, first, inside, map_weight: float) -> Float[Array, "hi
     return weights
 
 
-def _targets(field: FeatureField, batch: Batch, first, inside, map_weight: float):
-    """m_p e_p, in the channels of the basis, and m_p, in the rows of a strip."""
-    targets = jnp.zeros((len(inside), batch.plan.width, field.channels), field.lift.dtype)
+def _targets(batch: Batch, first, inside, map_weight: float):
+    """m_p e_p and m_p in the rows of a strip."""
+    targets: Any = 0.0
     if batch.codebook is not None:
         ids = _ids(batch, first, len(inside))
-        vectors = jnp.matmul(batch.codebook, field.lift, precision="highest")
-        targets += jnp.where((ids >= 0)[..., None], vectors[jnp.maximum(ids, 0)], 0.0)
+        targets += jnp.where((ids >= 0)[..., None], batch.codebook[jnp.maximum(ids, 0)], 0.0)
     if batch.map is not None:
         weight = inside[:, None] * (1.0 if batch.codebook is None else map_weight)
-        small = jnp.matmul(jnp.asarray(batch.map), field.lift, precision="highest")
-        targets += weight[..., None] * stretched(small, first, len(inside), batch.plan)
+        targets += weight[..., None] * stretched(batch.map, first, len(inside), batch.plan)
     return targets, _weights(batch, first, inside, map_weight)
 
 
@@ -269,8 +274,8 @@ def _ids(batch: Batch, first, high: int) -> Int[Array, "high width"]:
 
 def _after_pass(field: FeatureField, state: SolveState, batch: SolveBatch, config: DistillConfig):
     """The field and the state after the last view of a pass."""
-    turn = jnp.clip(jnp.asarray(batch.turn), 0, 2)
-    branches = (_voted, _begun, _advanced)
+    branches = (_voted,) if state.conjugate is None else (_voted, _begun, _advanced)
+    turn = jnp.clip(jnp.asarray(batch.turn), 0, len(branches) - 1)
     given = field, state, batch.neighbors
     field, state = jax.lax.switch(turn, [lambda f=f: f(*given, config) for f in branches])
     return field, state._replace(total=jnp.zeros_like(state.total))
@@ -289,12 +294,14 @@ def _begun(field: FeatureField, state: SolveState, neighbors, config: DistillCon
     """After the product with the first guess: the residual, along which the first iteration goes."""
     x = field.encoding
     residual = state.wanted - state.total - state.tie * _laplacian(x, neighbors)
+    assert state.conjugate is not None
     first = turned(state.conjugate, residual, _preconditioner(state, neighbors))
     return field, state._replace(conjugate=first, loss=_objective(x, residual, state))
 
 
 def _advanced(field: FeatureField, state: SolveState, neighbors, config: DistillConfig):
     """After the product with a direction: an iteration of conjugate gradients."""
+    assert state.conjugate is not None
     product = state.total + state.tie * _laplacian(state.conjugate.direction, neighbors)
     scale = _preconditioner(state, neighbors)
     x, after = advanced(field.encoding, state.conjugate, product, scale)

@@ -82,6 +82,20 @@ def frozen_views(
     return [found[v] for v in range(len(cameras))]
 
 
+def in_basis(batch: Batch, basis: Float[Array, "d r"]) -> Batch:
+    """The batch with the teacher's features in the channels of a basis.
+
+    Args:
+        batch: the view and its teacher.
+        basis: orthonormal columns.
+    """
+    codebook, pixels = (
+        None if features is None else jnp.matmul(jnp.asarray(features), basis, precision="highest")
+        for features in (batch.codebook, batch.map)
+    )
+    return batch._replace(located=None, codebook=codebook, map=pixels)
+
+
 def expect_alike(cameras: Sequence[Camera], teacher: Teacher) -> None:
     """Raises ValueError if a teacher's views differ from the cameras in number or size."""
     if len(cameras) != len(teacher.ids):
