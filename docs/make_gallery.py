@@ -34,7 +34,7 @@ COMMANDS = {
     "demo": f"track simulated:tabletop?width=240&height=180 --out {RUNS}/demo --frames 0:30 --cameras 0 1 "
     "--mask-camera 1 --eval-cameras 2 --track.start.iterations 60",
     "table": f"track {TABLE} --out {RUNS}/table",
-    "table/field": f"distill {RUNS}/table --distill.iterations 150",
+    "table/field": f"distill {RUNS}/table",
     "table/field/query": f"query {RUNS}/table/field can",
     "tissue": f"deform {TISSUE} --tools draw --deform.warmup 60 --deform.iterations 240 --out {RUNS}/tissue",
     "tissue/query": f"query {RUNS}/tissue tool",

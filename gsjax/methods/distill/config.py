@@ -119,7 +119,7 @@ class DistillConfig:
 PRESETS = {
     "vote": DistillConfig(start="vote", iterations=0),
     "solve": DistillConfig(start="solve", iterations=0),
-    "field": DistillConfig(start="solve", iterations=200),
+    "field": DistillConfig(start="solve", iterations=60),
     "paper": DistillConfig(),
 }
 """Settings by name, the fastest first: the mean of the pixels that show each Gaussian; the least-squares

@@ -105,10 +105,12 @@ class RefineConfig:
     iterations: int = 400
     """Steps; with 0 the scene stays as fitted to the anchor frame, as in the paper."""
     rate: float = 0.05
-    """Learning rate: distance that Gaussians and parts move in the first step, pixels."""
+    """Learning rate of the scene: distance that Gaussians move in the first step, pixels."""
+    pose_rate: float = 0.05
+    """Learning rate of the poses: distance that parts move in the first step, pixels."""
 
     def __post_init__(self):
-        expect(self, "refine.", iterations=(0, np.inf), rate=(0, np.inf))
+        expect(self, "refine.", iterations=(0, np.inf), rate=(0, np.inf), pose_rate=(0, np.inf))
 
 
 @dataclass(frozen=True)
