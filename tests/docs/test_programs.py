@@ -26,10 +26,7 @@ SHORTER = {
     "fit": {"steps=500, cap=5000": "steps=4, cap=300, coarse_until=0.0"},
     "track": {"gsjax.TrackConfig()": "TRACK", "frames=4": "frames=2"},
     "parts": {"gsjax.PartsConfig()": "PARTS", "frames=[0, 5, 10, 15]": "frames=[0, 5]"},
-    "distill": {
-        "steps=500, cap=5000": "steps=4, cap=300, coarse_until=0.0",
-        "iterations=200": "iterations=3",
-    },
+    "distill": {"steps=500, cap=5000": "steps=4, cap=300, coarse_until=0.0"},
     "deform": {"warmup=100, iterations=200": "warmup=2, iterations=3, nodes=64"},
 }
 """Less to do for each program: text of it, and what stands for it here."""
