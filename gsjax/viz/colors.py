@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float, Integer, Num, UInt8
 BACKGROUND = (158, 160, 164)  # label 0
 INVALID = (38, 40, 44)  # pixels without depth
 _INK = (245, 245, 245)
+_CHIP = (22, 24, 28)  # behind it
 _LARGE_ERROR, _LABEL_WEIGHT = 0.3, 0.65
 
 # Okabe and Ito's colours, then darker ones from Tol's muted scheme: any two neighbours are distinct to
@@ -181,13 +182,13 @@ def side_by_side(
     Args:
         image, render: colours.
         error: a picture of the error (default: the `error_heatmap` of the two).
-        labels: rendered labels, laid over the dimmed input; left out if None.
+        labels: rendered labels, laid over the dimmed input, with their numbers; left out if None.
         captions: one per picture; extra ones are ignored.
     """
     image, render = to_uint8(image), to_uint8(render)
     pictures = [image, render, error_heatmap(image, render) if error is None else error]
     if labels is not None:
-        pictures.append(overlay_labels(image, labels))
+        pictures.append(numbered(overlay_labels(image, labels), labels))
     columns = 2 if len(pictures) == 4 and image.shape[1] > 1.2 * image.shape[0] else len(pictures)
     return in_rows(dict(zip(captions, pictures, strict=False)), columns)
 
@@ -226,6 +227,29 @@ def overlay_labels(
     return np.broadcast_to(mixed, (*labels.shape, 3)).astype(np.uint8)
 
 
+def numbered(
+    picture: UInt8[np.ndarray, "h w 3"], labels: Integer[np.ndarray, "h w"]
+) -> UInt8[np.ndarray, "h w 3"]:
+    """The picture with the number of each label but 0 where the label is widest, if there is room for it.
+
+    Args:
+        picture: colours.
+        labels: label of each pixel.
+    """
+    picture, scale = picture.copy(), max(len(picture) / 650, 0.36)
+    for label in np.unique(labels[labels > 0]).tolist():
+        inside = np.pad((labels == label).astype(np.uint8), 1)  # the picture's edge is an edge of the label
+        _, widest, _, (x, y) = cv2.minMaxLoc(cv2.distanceTransform(inside, cv2.DIST_L2, 3))
+        (wide, high), _ = cv2.getTextSize(str(label), cv2.FONT_HERSHEY_SIMPLEX, scale, 1)
+        if widest < 0.5 * high:
+            continue
+        origin = (x - 1 - wide // 2, y - 1 + high // 2)
+        for color, thickness in ((_CHIP, 3), (_INK, 1)):
+            where = (picture, str(label), origin, cv2.FONT_HERSHEY_SIMPLEX, scale, color)
+            cv2.putText(*where, thickness, cv2.LINE_AA)
+    return picture
+
+
 def _to_float(image: np.ndarray) -> np.ndarray:
     return image.astype(np.float32) / 255 if image.dtype == np.uint8 else image.astype(np.float32)
 
@@ -249,6 +273,6 @@ def _write(picture: UInt8[np.ndarray, "h w 3"], text: str, beside: tuple[int, in
     wide, high = text_width + 2 * pad, text_height + baseline + 2 * pad
     left, top = (0, 0) if beside is None else (max(beside[0] - wide, 0), max(beside[1] - high // 2, 0))
     chip = picture[top : top + high, left : left + wide]
-    chip[:] = (0.25 * chip + 0.75 * np.array([22, 24, 28])).astype(np.uint8)
+    chip[:] = (0.25 * chip + 0.75 * np.array(_CHIP)).astype(np.uint8)
     origin = (left + pad, top + pad + text_height)
     cv2.putText(picture, text, origin, cv2.FONT_HERSHEY_SIMPLEX, scale, _INK, 1, cv2.LINE_AA)

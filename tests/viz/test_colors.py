@@ -122,3 +122,16 @@ def test_what_is_highlighted_keeps_its_colours_and_the_rest_loses_them():
     assert np.ptp(picture[5, 50].astype(int)) == 0
     assert picture[10, 20, 1] > 150  # the outline
     assert (image == (200, 40, 40)).all()
+
+
+def test_labels_have_their_numbers_where_there_is_room():
+    labels = np.zeros((240, 320), int)
+    labels[40:140, 60:160] = 7
+    labels[200:202, 200:300] = 3  # too thin
+    plain = np.full((240, 320, 3), 128, np.uint8)
+    changed = (colors.numbered(plain, labels) != plain).any(-1)
+    rows, columns = np.nonzero(changed)
+    assert abs(rows.mean() - 90) < 4
+    assert abs(columns.mean() - 110) < 4
+    assert (labels[changed] == 7).all()
+    np.testing.assert_array_equal(colors.numbered(plain, np.zeros_like(labels)), plain)
