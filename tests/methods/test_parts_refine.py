@@ -21,7 +21,7 @@ from gsjax.methods.parts import (
     moved_pixels,
     refine_step,
 )
-from gsjax.methods.parts.pictures import Problem
+from gsjax.methods.parts.pictures import Problem, order_of_pictures
 from gsjax.optim.method import Run
 from gsjax.scene.feature_grid import FeatureGridConfig
 from gsjax.scene.handles import HandlePose
@@ -113,6 +113,24 @@ def test_the_result_is_what_was_refined(boxes, astray):
     movable, fixed, _ = now.run.params
     np.testing.assert_array_equal(moved, jnp.concatenate([movable.sh0, fixed.sh0]))
     assert now.result.done.all()
+
+
+@pytest.mark.parametrize(("cameras", "each"), [(3, 4), (27, 2), (6, 3)])
+def test_pictures_are_used_equally_often(cameras, each):
+    frames = (0, 2, 3, 7)
+    order = order_of_pictures(0, frames, cameras, each * len(frames) * cameras)
+    times = {(t, c): order.count((t, c)) for t in frames for c in range(cameras)}
+    assert sum(times.values()) == len(order)
+    assert max(times.values()) - min(times.values()) <= 1 + (cameras > 4)  # the last round is begun
+    assert order != order_of_pictures(1, frames, cameras, len(order))
+
+
+def test_by_default_each_picture_has_two_steps(boxes):
+    method = Parts(replace(CONFIG, refine=RefineConfig()))
+    assert method.steps_of_refinement(Problem(boxes)) == 400  # of few pictures
+    still = linear(150, (0, 0, 0))
+    longer = MovingBoxes([Box((0, 0, 0.05), (0.12, 0.08, 0.1), still, still)])
+    assert method.steps_of_refinement(Problem(longer)) == 2 * 150 * longer.num_cameras > 400
 
 
 def test_settings_without_meaning_are_refused():

@@ -78,7 +78,7 @@ class Loop:
     def refine(self) -> None:
         """Fit the scene and all poses to all frames, until it is stopped. An OSError ends it early, and the
         run is complete all the same."""
-        steps, begun = self.method.config.refine.iterations, perf_counter()
+        steps, begun = self.method.steps_of_refinement(self.problem), perf_counter()
         first, total = self.method.steps_of_frames(self.problem), self.method.total(self.problem)
         skipped = self.progress.skipped
 

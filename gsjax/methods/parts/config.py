@@ -102,15 +102,15 @@ class UnifyConfig:
 class RefineConfig:
     """Settings of the final fit of the scene and all poses to all frames."""
 
-    iterations: int = 400
-    """Steps; with 0 the scene stays as fitted to the anchor frame, as in the paper."""
+    iterations: int | None = None
+    """Steps (default: two for each picture, at least 400); with 0 the scene stays as fitted to the anchor
+    frame, as in the paper."""
     rate: float = 0.05
-    """Learning rate of the scene: distance that Gaussians move in the first step, pixels."""
-    pose_rate: float = 0.05
-    """Learning rate of the poses: distance that parts move in the first step, pixels."""
+    """Learning rate: distance that Gaussians and parts move in the first step, pixels."""
 
     def __post_init__(self):
-        expect(self, "refine.", iterations=(0, np.inf), rate=(0, np.inf), pose_rate=(0, np.inf))
+        known = {} if self.iterations is None else {"iterations": (0, np.inf)}
+        expect(self, "refine.", rate=(0, np.inf), **known)
 
 
 @dataclass(frozen=True)

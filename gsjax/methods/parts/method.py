@@ -42,6 +42,7 @@ from gsjax.scene.gaussians import Gaussians
 from gsjax.scene.render import plan_render
 
 _PLANS = {HALF: "half", FULL: "whole"}
+_LEAST_STEPS, _PASSES = 400, 2  # of the refinement, by default; passes over all pictures
 _REFINING = "refining"  # the plan of the refinement, which renders whole pictures
 
 
@@ -82,9 +83,16 @@ class Parts:
         frames = 0 if problem.at_once else problem.sequence.num_frames - 1
         return frames * self.config.stream.iterations
 
+    def steps_of_refinement(self, problem: Problem) -> int:
+        """Number of steps of the refinement over all frames."""
+        asked, sequence = self.config.refine.iterations, problem.sequence
+        if asked is not None:
+            return asked
+        return max(_LEAST_STEPS, _PASSES * sequence.num_frames * sequence.num_cameras)
+
     def total(self, problem: Problem) -> int:
         """Number of steps, with the refinement."""
-        return self.steps_of_frames(problem) + self.config.refine.iterations
+        return self.steps_of_frames(problem) + self.steps_of_refinement(problem)
 
     def period(self, problem: Problem) -> int:
         """1, as pictures are drawn anew for each step."""
@@ -184,7 +192,7 @@ class Parts:
             full_picture(problem, discovery, t, camera),
             jnp.asarray(t),
             jnp.asarray(discovery.anchor),
-            i / self.config.refine.iterations,
+            i / self.steps_of_refinement(problem),
             run.plans[_REFINING],
             problem.at_once,  # surfaces in space tell poses better than pictures do
         )
@@ -192,14 +200,14 @@ class Parts:
 
     def _order_of_all(self, problem: Problem, discovery: Discovery) -> list[tuple[int, int]]:
         frames = tuple(np.flatnonzero(discovery.done).tolist())
-        cameras, steps = problem.sequence.num_cameras, self.config.refine.iterations
+        cameras, steps = problem.sequence.num_cameras, self.steps_of_refinement(problem)
         return order_of_pictures(self.config.seed, frames, cameras, steps)
 
     def _missing_plans(self, problem: Problem, run: Run) -> dict[str, Plan]:
         """Plans for what is rendered for the first time."""
         discovery: Discovery = run.kept
         if isinstance(run.params, RefineParams):
-            if _REFINING in run.plans or not self.config.refine.iterations:
+            if _REFINING in run.plans or not self.steps_of_refinement(problem):
                 return {}
             t, _ = self._order_of_all(problem, discovery)[0]
             scene, cameras = self._posed(discovery, t), problem.sequence.frame(t).cameras

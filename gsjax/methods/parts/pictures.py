@@ -81,7 +81,8 @@ def draws_of(seed: int, t: int, cameras: int, past: tuple[int, ...], count: int,
 
 @lru_cache(maxsize=8)
 def order_of_pictures(seed: int, frames: tuple[int, ...], cameras: int, steps: int) -> list[tuple[int, int]]:
-    """(frame, camera) for each step of the refinement, with several cameras of a frame in a row.
+    """(frame, camera) for each step of the refinement, with several cameras of a frame in a row. Each picture
+    comes as often as the others.
 
     Args:
         seed: random seed of the discovery.
@@ -90,9 +91,12 @@ def order_of_pictures(seed: int, frames: tuple[int, ...], cameras: int, steps: i
         steps: number of steps.
     """
     rng, order = np.random.default_rng((seed, 1)), []
+    left: dict[int, list[int]] = {t: [] for t in frames}
     while len(order) < steps:
-        t = int(rng.choice(np.array(frames)))
-        order += [(t, int(c)) for c in rng.permutation(cameras)[:_CAMERAS]]
+        for t in rng.permutation(np.array(frames)).tolist():
+            if len(left[t]) < min(_CAMERAS, cameras):
+                left[t] += rng.permutation(cameras).tolist()
+            order += [(t, left[t].pop(0)) for _ in range(min(_CAMERAS, cameras))]
     return order[:steps]
 
 

@@ -116,19 +116,17 @@ def refine_step(config: PartsConfig, extra_losses: ExtraLosses = ()) -> Step:
 
         (value, info), slope = jax.value_and_grad(loss, (0, 1), has_aux=True)(both(params), pose)
         fall = _FINAL_RATE**batch.progress
-        pixel = fall * batch.canonical.pixel
+        length = config.refine.rate * fall * batch.canonical.pixel
         gaussians, known = [], []
         for before, down, was in zip(both(params), slope[0], state[0], strict=True):
             moves, now = scene(params).update(down, was)
             moves = eqx.tree_at(
-                lambda g: g.means,
-                jax.tree.map(lambda a: fall * a, moves),
-                config.refine.rate * pixel * moves.means,
+                lambda g: g.means, jax.tree.map(lambda a: fall * a, moves), length * moves.means
             )
             gaussians.append(optax.apply_updates(before, moves))
             known.append(now)
         moves, pose_state = poses.update(slope[1], pose_state)
-        far = jnp.where((batch.t == batch.anchor) | batch.held, 0.0, config.refine.pose_rate * pixel)
+        far = jnp.where((batch.t == batch.anchor) | batch.held, 0.0, length)
         pose = pose_after(pose, moves, batch.canonical, far, far)
         everywhere = jax.tree.map(
             lambda every, one: every.at[batch.t].set(one), (params.poses, state[1]), (pose, pose_state)
