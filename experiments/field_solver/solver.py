@@ -93,6 +93,7 @@ def descent(method: Distill, problem: Problem, first: Run, rate: float) -> tuple
 def gradient_of(problem: Problem, run: Run) -> Callable[[Array], tuple[Array, Array]]:
     """The objective and its gradient, view after view."""
     lift, tie, neighbors = run.params.lift, run.state.tie, problem.neighbors
+    assert neighbors is not None
 
     def of_view(x, batch):
         image, alphas = paint_shown(batch.view, x[batch.view.rows], batch.plan)
