@@ -300,8 +300,8 @@ def _shots_of(photographs: Photographs) -> Shots:
         photographs.viewmats[None],
         photographs.Ks[None],
         photographs.sizes,
-        photographs.near,
         lambda _, v: photographs.image(v),
+        photographs.near,
     )
 
 
@@ -312,8 +312,8 @@ def _shots_of_recording(recording: Recording) -> Shots:
         sequence.viewmats,
         sequence.Ks,
         np.tile([sequence.width, sequence.height], (len(names), 1)),
-        sequence.near,
         lambda t, v: to_uint8(np.asarray(sequence.image(t, v))),
+        sequence.near,
     )
 
 
@@ -330,4 +330,4 @@ def _shots_of_deformation(path: Path, result: DeformResult, notes: Notes) -> Sho
         notes.warn(f"its photographs are not shown: {describe(error)}")
     sizes = np.array([result.timeline.size])
     viewmats, Ks = result.timeline.viewmats[:, None], result.timeline.Ks[:, None]
-    return Shots(("camera",), viewmats, Ks, sizes, result.timeline.near, load)
+    return Shots(("camera",), viewmats, Ks, sizes, load, result.timeline.near)

@@ -144,6 +144,6 @@ def _at_times(shots: Shots, recorded: np.ndarray, times: np.ndarray) -> Shots:
         shots.viewmats[rows],
         shots.Ks[rows],
         shots.sizes,
-        shots.near,
         None if load is None else lambda t, v: load(int(rows[t]), v),
+        shots.near,
     )

@@ -28,8 +28,8 @@ class Shots:
         viewmats: world to camera, OpenCV axes, [T,V,4,4].
         Ks: intrinsics in pixels, [T,V,3,3].
         sizes: width and height in pixels, [V,2].
-        near: distance of their near planes, metres: what is nearer was not fitted, and hides the rest.
         load_image: (t, v) -> RGB, [H,W,3] uint8; None if there are no pictures to show.
+        near: distance of their near planes, metres: what is nearer was not fitted, and hides the rest.
 
     Raises:
         ValueError: shapes disagree.
@@ -39,8 +39,8 @@ class Shots:
     viewmats: Float[np.ndarray, "..."]
     Ks: Float[np.ndarray, "..."]
     sizes: Int[np.ndarray, "..."]
-    near: float = NEAR
     load_image: Callable[[int, int], np.ndarray] | None = field(default=None, repr=False)
+    near: float = NEAR
 
     def __post_init__(self):
         frames, count = len(self.viewmats), len(self.names)
