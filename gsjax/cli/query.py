@@ -235,7 +235,7 @@ def _print(question: Question, unit: str, seen_in: str, info: dict[str, Any], se
         "found": f"{question.words}{meant}: {info['gaussians']:,} of {info['of']:,} Gaussians",
         "centre": ", ".join(f"{x:.3f}" for x in info["center"]) + unit,
         "size": " x ".join(f"{x:.3f}" for x in info["size"]) + unit,
-        "score": f"{least} {info['threshold']:.2f} ({info['rule']}), {info['best_score']:.2f} at best"
+        "score": f"{least} {info['threshold']:.3f} ({info['rule']}), {info['best_score']:.3f} at best"
         + against,
     }
     if pixels := info["pixels"]:

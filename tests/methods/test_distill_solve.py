@@ -202,7 +202,9 @@ def test_neighbours_are_the_nearest_others():
 
 
 def test_no_steps_at_all_are_refused():
-    with pytest.raises(ValueError, match="iterations: expected"):
+    with pytest.raises(
+        ValueError, match="iterations: expected at least 1 where the start is random, found 0"
+    ):
         DistillConfig(iterations=0)
 
 

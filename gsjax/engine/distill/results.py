@@ -22,7 +22,7 @@ SCORES = (
     Score("mIoU 3D", "miou_3d", "", 3, "more", at("test", "miou_3d")),
     Score("boundary mIoU 3D", "mboundary_iou_3d", "", 3, "more", at("test", "mboundary_iou_3d")),
     Score("Gaussians", "num_gaussians", "", None, None, at("num_gaussians")),
-    Score("trained parameters", "trained", "", None, "less", at("trained")),
+    Score("parameters", "trained", "", None, "less", at("trained")),
     Score("time", "minutes", "min", 2, "less", minutes(), "machine"),
     Score("steps", "steps", "", None, None, at("steps")),
 )
@@ -39,7 +39,7 @@ _VIEWS = (Column("view", "view"), Column("cosine to the teacher", "cosine", "", 
 def summarize(folder: RunFolder, found: Metrics) -> Summary:
     """The summary of a distillation, whose losses are drawn into the folder."""
     plots, judged, views = [], found["judged_by"], found["views"]
-    if found["curve"]:
+    if len(found["curve"]) > 1:
         plot = save(losses_over_steps(found["curve"]), folder.plot("losses"))
         plots.append(Media(plot, "Losses, unweighted, over steps"))
     names = [f"Names: {', '.join(found['names'])}."] if found["names"] else []

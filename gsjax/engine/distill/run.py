@@ -116,6 +116,11 @@ def run(options: Options) -> int:
         ticks = drive(method, problem, run)
         total, losses = method.total(problem), means_of("rec", "cos", "contrast", "tv")
         schedule = Schedule("distilling", total, losses, _words)
+        if not options.distill.iterations:  # each pass over the views ends with an objective of its own
+            of_pass = method.period(problem)
+            schedule = Schedule(
+                "distilling", total, lambda now, infos: losses(now, infos[-1:]), _words, of_pass
+            )
         watch(ticks, progress, schedule, folder, console, budget=budget)
         steps, result = ticks.run.step, ticks.result
         with atomic_write(folder.path / NAME) as temporary:

@@ -105,13 +105,18 @@ class DistillConfig:
     def __post_init__(self):
         expect(
             self,
-            iterations=(1 if self.start == "random" else 0, np.inf),
+            iterations=(0, np.inf),
             channels=(1, 4096),
             contrast_after=(0, 1),
             contrast_gamma=(1e-6, np.inf),
             contrast_patch=(2, 64),
             strip_megabytes=(0.1, np.inf),
         )
+        if self.start == "random" and not self.iterations:
+            raise ValueError(
+                "iterations: expected at least 1 where the start is random, found 0, by which nothing is "
+                "learned; start with vote or solve"
+            )
         if self.contrast_pool not in POOLS:
             raise ValueError(f"contrast_pool: expected one of {POOLS}, found {self.contrast_pool}")
 

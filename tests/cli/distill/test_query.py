@@ -121,7 +121,7 @@ def test_a_text_gives_gaussians_masks_and_scenes(gsjax, field, scene, pristine):
     # And in a few words.
     center = ", ".join(f"{x:.3f}" for x in found["means"].mean(0))
     assert f"found 'can': {len(rows):,} of {whole.num:,} Gaussians centre {center} m size" in said
-    assert "score above 0.50 (better than each negative)" in said
+    assert "score above 0.500 (better than each negative)" in said
     assert "seen in 3 of 3 photographs" in said
     assert "s, of which the query took" in said
 
