@@ -112,7 +112,7 @@ def trained(
         assert not bool(now.info["skipped"])
     if config.start != "random" and config.iterations:
         memory = max(memory, memory_mb(method, problem, ticks.run.having(step=ticks.run.step - 1)))
-    return ticks.result, {"seconds": seconds, "compile_seconds": compiling, "memory_mb": memory}
+    return ticks.result, {"taken_seconds": seconds, "compile_seconds": compiling, "memory_mb": memory}
 
 
 def memory_mb(method: Distill, problem: Any, run: Any) -> float:
@@ -146,7 +146,7 @@ def figure(rows: list[dict[str, Any]], path: Path) -> None:
         mine = [row for row in rows if row["scene"] == scene]
         presets = list(dict.fromkeys(row["preset"] for row in mine))
         groups = [[row for row in mine if row["preset"] == preset] for preset in presets]
-        seconds = [np.mean([row["seconds"] for row in group]) for group in groups]
+        seconds = [np.mean([row["taken_seconds"] for row in group]) for group in groups]
         for key, words in scores.items():
             values = [[row[key] for row in group if row.get(key) is not None] for group in groups]
             if not all(values):

@@ -46,7 +46,7 @@ def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
         "passes": len(losses) - 1,
         "within_10": passes_to(excess, 0.1),
         "within_1": passes_to(excess, 0.01),
-        "seconds": seconds,
+        "pass_seconds": seconds,
     }
 
 
