@@ -44,7 +44,7 @@ COMMANDS: dict[str, tuple[str, ...]] = {
     "fit": ("fit", _TABLE, "--frames", "0:1", "--test-every", "0", "--fit.steps", "20"),
     "parts": ("parts", "simulated:articulated?width=160&height=120", "--frames", "0:9:4",
               "--parts.refine.iterations", "0"),
-    "distill": ("distill", "{fit}", "--distill.iterations", "10"),
+    "distill": ("distill", "{fit}", "--preset", "paper", "--distill.iterations", "10"),
     "deform": ("deform", _TISSUE, "--deform.iterations", "10"),
     "view": ("view", "{fit}"),
 }  # fmt: skip
