@@ -10,6 +10,7 @@ from jaxtyping import Float, Int
 from gsjax.engine.files import read_frames
 from gsjax.engine.messages import describe
 from gsjax.engine.terminal import in_bytes
+from gsjax.io.brief import shortened
 from gsjax.io.scene_file import SceneReport
 from gsjax.io.scenes import read_gaussians
 from gsjax.scene.gaussians import Gaussians
@@ -88,5 +89,5 @@ def _in_short(labels: Int[np.ndarray, "k"]) -> str:
     """Labels in increasing order, in a few words."""
     if len(labels) > 2 and labels[-1] - labels[0] == len(labels) - 1:
         return f"{labels[0]} to {labels[-1]}"
-    more = f", ... ({len(labels)} in all)" if len(labels) > _MOST_LABELS else ""
-    return ", ".join(map(str, labels[:_MOST_LABELS])) + more or "none"
+    count = f" ({len(labels)} in all)" if len(labels) > _MOST_LABELS else ""
+    return shortened(map(str, labels), _MOST_LABELS) + count or "none"

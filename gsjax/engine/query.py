@@ -233,7 +233,8 @@ def select(run: Queryable, question: Question, frame: int, prompt: Prompt | None
         selected = inside & (scores > threshold.value)
     else:
         best = np.argsort(np.where(inside, -scores, np.inf), kind="stable")[: min(question.top, inside.sum())]
-        selected = np.isin(np.arange(len(scores)), best)
+        selected = np.zeros(len(scores), bool)
+        selected[best] = True
         threshold = Threshold(float(scores[best].min(initial=np.inf)), f"the {question.top} best")
     return Selection(question, frame, prompt, scores, threshold, selected, seconds)
 

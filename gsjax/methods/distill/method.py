@@ -160,14 +160,13 @@ class Distill:
         step = run.step - self.steps_of_solution(problem)
         if step < 0:
             return run.having(guard=resting(run.guard))
-        if step == 0:
-            run = run.having(guard=None)
         if step == 0 and problem.untrained is not None:
             key = jax.random.fold_in(jax.random.key(self.config.seed), _FIT)
             solved: FeatureField = run.params
             fitted = fitted_to_vectors(problem.untrained, problem.located, solved.encoding, key)
             params = copied(eqx.tree_at(lambda f: f.lift, fitted, solved.lift))
-            return run.having(params=params, state=jax.jit(distill_step(self.config).init)(params))
+            state = jax.jit(distill_step(self.config).init)(params)
+            return run.having(params=params, state=state, guard=None)
         begins = self.config.weights.contrast and step == contrast_begins(self.config)
         return run.having(guard=None) if begins else run
 

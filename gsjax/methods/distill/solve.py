@@ -120,14 +120,13 @@ def solve_step(config: DistillConfig) -> Step:
             )
         sound = all_finite(found)
         found = jax.tree.map(lambda a: jnp.where(sound, a, 0.0), found)
+        target, pixels = state.target + found.target, state.pixels + found.pixels
         summed = state._replace(
             total=state.total.at[rows].add(found.rows),
             mass=state.mass.at[rows].add(found.mass),
-            target=state.target + found.target,
-            pixels=state.pixels + found.pixels,
-        )
-        summed = summed._replace(
-            loss=jnp.where(turn == 0, summed.target / jnp.maximum(summed.pixels, 1.0), summed.loss)
+            target=target,
+            pixels=pixels,
+            loss=jnp.where(turn == 0, target / jnp.maximum(pixels, 1.0), state.loss),
         )
         field, state = jax.lax.cond(
             batch.is_last,
