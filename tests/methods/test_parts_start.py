@@ -7,7 +7,8 @@ import pytest
 
 from gsjax.methods.parts.anchor import Anchor, choose_anchor, difference_image, moved_pixels
 from gsjax.methods.parts.config import DiscoverConfig, PartsConfig
-from gsjax.methods.parts.discover import begin, pixel_width
+from gsjax.methods.parts.discover import begin
+from gsjax.methods.parts.sizes import pixel_width
 from gsjax.methods.parts.lift import label_votes, lift_masks
 from gsjax.methods.parts.masks import (
     masks_from_labels,

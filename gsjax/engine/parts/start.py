@@ -61,7 +61,7 @@ def detect_motion(
             "--parts.discover.no-difference, by which all segments may move"
         )
     chosen = choose_anchor(tracked.image, tracked.num_frames, cameras, anchor)
-    depth = tracked.depth if tracked.has_depth else None
+    depth = tracked.depth if tracked.has_depth and discover.depth else None
     return chosen, moved_pixels(
         tracked.image, chosen, cameras, frames=discover.frames, threshold=discover.threshold, depth=depth
     )

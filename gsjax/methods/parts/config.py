@@ -24,6 +24,9 @@ class DiscoverConfig:
     the part that it touches, if no mask shows it."""
     difference: bool = True
     """Restrict parts to segments that changed (I_d); otherwise every segment may move."""
+    depth: bool = True
+    """Where cameras measure depth, do not take for motion what something passes in front of, or what is only
+    lit otherwise, as in a shadow."""
     lift_iterations: int = 32
     """Optimisation steps that lift the masks to logits of Gaussians."""
 
@@ -34,12 +37,14 @@ class DiscoverConfig:
 
 @dataclass(frozen=True)
 class StreamConfig:
-    """Settings of the optimisation of each frame's pose."""
+    """Settings of the optimisation of each frame's pose. Pixels are those of pictures of about 320x240, as
+    which larger ones are seen."""
 
     iterations: int = 60
     """Steps per frame."""
     coarse: float = 0.7
-    """Share of the steps that use images at half resolution."""
+    """Share of the steps that use coarse pictures, of about 160x120; the others use twice that. The
+    refinement sees whole ones."""
     l1_weight: float = 0.8
     """Weight of L1 in the loss (lambda); the remainder is the weight of 1 - SSIM."""
     depth_weight: float = 0.1
@@ -106,11 +111,13 @@ class RefineConfig:
     """Steps (default: two for each picture, at least 400); with 0 the scene stays as fitted to the anchor
     frame, as in the paper."""
     rate: float = 0.05
-    """Learning rate: distance that Gaussians and parts move in the first step, pixels."""
+    """Learning rate of the scene: distance that Gaussians move in the first step, pixels."""
+    pose_rate: float = 0.05
+    """Learning rate of the poses: distance that parts, and their borders, move in the first step, pixels."""
 
     def __post_init__(self):
         known = {} if self.iterations is None else {"iterations": (0, np.inf)}
-        expect(self, "refine.", rate=(0, np.inf), **known)
+        expect(self, "refine.", rate=(0, np.inf), pose_rate=(0, np.inf), **known)
 
 
 @dataclass(frozen=True)
@@ -130,6 +137,8 @@ class PartsConfig:
         )
     )
     """Hash grid of the skinning weights."""
+    exposures: bool = True
+    """Give the pictures of each camera the exposure and white balance of the scene."""
     headroom: float = 1.6
     """Capacity of a render plan, relative to what is needed."""
     seed: int = 0

@@ -11,10 +11,11 @@ from scipy.special import softmax
 from gsjax.geometry.cameras import Camera
 from gsjax.methods.parts.anchor import Anchor
 from gsjax.methods.parts.config import PartsConfig
-from gsjax.methods.parts.exposure import exposures_of
+from gsjax.methods.parts.exposure import AS_GIVEN, exposures_of
 from gsjax.methods.parts.lift import label_votes, lift_masks
 from gsjax.methods.parts.masks import propagate_masks, view_order
 from gsjax.methods.parts.motion import changes_of, changing_views, with_what_moves
+from gsjax.methods.parts.sizes import pixel_width
 from gsjax.methods.parts.stream import Canonical
 from gsjax.methods.parts.trajectory import BACKGROUND
 from gsjax.methods.parts.weights import Field, fit_field_to_weights, new_field
@@ -113,7 +114,7 @@ def begin(
     weights = softmax(np.asarray(logits), axis=-1)
     if moves is not None:
         weights = with_what_moves(weights, gaussians, moves)
-    exposures = exposures_of(drawn, frame)
+    exposures = exposures_of(drawn, frame) if config.exposures else np.tile(AS_GIVEN, (len(drawn), 1, 1))
     return start_from(anchor, gaussians, weights, frame.cameras, exposures, masks, config, key, lifting)
 
 
@@ -250,13 +251,6 @@ def radii_of(
     sums, counts = (np.bincount(labels, w, len(centers)) for w in (squared, np.ones_like(squared)))
     radii = np.sqrt(sums / np.maximum(counts, 1))
     return np.where(radii > 0, radii, 1.0).astype(means.dtype)
-
-
-def pixel_width(points: Float[np.ndarray, "n 3"], cameras: Camera) -> float:
-    """The width of a pixel at the depth of the points, metres; the median over cameras."""
-    viewmats, Ks = np.asarray(cameras.viewmat), np.asarray(cameras.K)
-    depths = np.median(points @ viewmats[:, 2, :3].T + viewmats[:, 2, 3], axis=0)
-    return float(np.median(np.maximum(depths, 1e-6) / Ks[:, 0, 0]))
 
 
 def _movable_first(

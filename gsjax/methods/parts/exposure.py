@@ -12,6 +12,8 @@ from jaxtyping import Array, Float
 from gsjax.scene.frame import Frame
 from gsjax.scene.render import Rendered
 
+AS_GIVEN = np.eye(3, 4, dtype=np.float32)
+"""The map that leaves colours as they are."""
 _LEAST_ALPHA = 0.5  # pixels with a lower rendered alpha are ignored
 _TRUSTED = 0.2  # difference of colours, 0 to 1, above which something else is seen
 _ROUNDS = 3  # fits, each without what the one before explains badly

@@ -15,6 +15,7 @@ from gsjax.methods.parts.discovery import Discovery, join_parts, weights_of_run
 from gsjax.methods.parts.exposure import corrected
 from gsjax.methods.parts.pictures import with_part_masks
 from gsjax.methods.parts.refine import RefineParams, refine_step
+from gsjax.methods.parts.sizes import coarse_factor
 from gsjax.methods.parts.stream import Canonical, picture_loss, posed
 from gsjax.methods.parts.trajectory import BACKGROUND, PartScene, Trajectory, trajectory_of
 from gsjax.methods.protocols import SequenceLike
@@ -24,10 +25,9 @@ from gsjax.optim.step import copied
 from gsjax.rasterize.plan import with_room
 from gsjax.scene.frame import Frame, one_camera, part_of
 from gsjax.scene.handles import HandlePose
-from gsjax.scene.region import TILE
 from gsjax.scene.render import plan_render, render
 
-_PICTURES, _CAMERAS, _SHRINK = 12, 2, 2  # by which parts are evaluated, those of a frame at least, half size
+_PICTURES, _CAMERAS = 12, 2  # by which parts are evaluated, and those of a frame at least
 _LEAST_CONTACT = 0.05  # share of a part's neighbours that another part must have to touch it
 _LEAST_WEIGHT = 0.02
 
@@ -137,10 +137,11 @@ class _MeanLoss:
         )
         self._pictures: list[tuple[HandlePose, Frame]] = []
         for i, t in enumerate(frames.tolist()):
-            frame = part_of(corrected(sequence.frame(t), discovery.exposures), (), _SHRINK)
+            frame = corrected(sequence.frame(t), discovery.exposures)
+            frame = part_of(frame, (), coarse_factor(frame.cameras))
             cameras = {(i + k * count // cameras_of_one) % count for k in range(cameras_of_one)}
             place = self._canonical, jnp.asarray(weights), discovery.pose(t)
-            seen = with_part_masks(frame, *place, TILE // _SHRINK, blend=config.stream.blend)
+            seen = with_part_masks(frame, *place, blend=config.stream.blend)
             self._pictures += [(discovery.pose(t), one_camera(seen, c)) for c in sorted(cameras)]
         scene = posed(self._canonical, jnp.asarray(weights), discovery.pose(int(done[0])))
         self._plan = plan_render(scene, frame.cameras, headroom=self._headroom)

@@ -19,31 +19,30 @@ from gsjax.methods.parts.discovery import (
 )
 from gsjax.methods.parts.finish import begin_refinement, scene_and_trajectory
 from gsjax.methods.parts.pictures import (
-    FULL,
-    HALF,
     Problem,
+    any_picture,
+    coarse_frame,
     current_frame,
     draws_of,
-    full_picture,
-    half_frame,
     order_of_pictures,
     past_picture,
+    stored_frame,
 )
 from gsjax.methods.parts.refine import RefineBatch, RefineParams, parts_step
 from gsjax.methods.parts.result import PartsResult
 from gsjax.methods.parts.search import searched
+from gsjax.methods.parts.sizes import COARSE, FINE, coarse_factor
 from gsjax.methods.parts.stream import StreamBatch, posed
 from gsjax.methods.protocols import SequenceLike
 from gsjax.optim.method import Run
 from gsjax.optim.step import Step
 from gsjax.rasterize.plan import Plan
-from gsjax.scene.frame import one_camera
+from gsjax.scene.frame import one_camera, part_of
 from gsjax.scene.gaussians import Gaussians
 from gsjax.scene.render import plan_render
 
-_PLANS = {HALF: "half", FULL: "whole"}
 _LEAST_STEPS, _PASSES = 400, 2  # of the refinement, by default; passes over all pictures
-_REFINING = "refining"  # the plan of the refinement, which renders whole pictures
+_SMALLER = 0.5  # share of the refinement in which pictures are no larger than when they were followed
 
 
 @dataclass(frozen=True)
@@ -103,13 +102,12 @@ class Parts:
         last frame, removes parts that no picture needs and begins the refinement.
         Arguments as for `Method.between`; progress is not used."""
         run = self.brought_up_to_date(problem, run)
-        if not isinstance(run.params, RefineParams):
-            discovery: Discovery = run.kept
-            if discovery.is_between_frames:
-                order = order_of_frames(problem.sequence.num_frames, discovery.anchor)
-                run = self._opened(problem, run, order[discovery.count])
-            elif self._size(run) != self._size(run.having(step=run.step - 1)):
-                run = run.having(guard=None)  # losses of larger pictures are others
+        discovery: Discovery = run.kept
+        if not isinstance(run.params, RefineParams) and discovery.is_between_frames:
+            order = order_of_frames(problem.sequence.num_frames, discovery.anchor)
+            run = self._opened(problem, run, order[discovery.count])
+        elif self._size(problem, run) != self._size(problem, run.having(step=run.step - 1)):
+            run = run.having(guard=None)  # losses of larger pictures are others
         return run.having(plans=run.plans | self._missing_plans(problem, run))
 
     def brought_up_to_date(self, problem: Problem, run: Run) -> Run:
@@ -132,19 +130,19 @@ class Parts:
         if isinstance(run.params, RefineParams):
             return self._batch_of_all(problem, run)
         config, discovery = self.config.stream, run.kept
-        canonical, i, size = discovery.canonical, self._step_of_frame(run), self._size(run)
+        canonical, i, size = discovery.canonical, self._step_of_frame(run), self._size(problem, run)
         past = np.flatnonzero(discovery.found >= discovery.born[np.asarray(canonical.alive)].max())
         past = tuple(past.tolist()) or (int(discovery.found.argmax()),)
         cameras = problem.sequence.num_cameras
         drawn = draws_of(self.config.seed, discovery.frame, cameras, past, config.past, config.iterations)
         frame = one_camera(current_frame(problem, discovery, size, config.blend), drawn.cameras[i])
-        plan = run.plans[_PLANS[size]]
+        plan = run.plans[size]
         batch = StreamBatch(canonical, frame, i / config.iterations, plan, discovery.weights)
         if not drawn.past[i]:
-            return batch, (_PLANS[size],)
+            return batch, (size,)
         then = tuple(past_picture(problem, discovery, t, c, config.blend) for t, c in drawn.past[i])
-        batch = batch._replace(past=then, past_plan=run.plans[_PLANS[HALF]])
-        return batch, (_PLANS[size], _PLANS[HALF])
+        batch = batch._replace(past=then, past_plan=run.plans[COARSE])
+        return batch, (size, COARSE)
 
     def result(self, problem: Problem, run: Run) -> PartsResult:
         """The scene with the parts found so far, without an unfinished frame."""
@@ -169,34 +167,44 @@ class Parts:
         discovery: Discovery = run.kept
         if not self.config.stream.search:
             return run
-        anchor, now = (half_frame(problem, discovery, at) for at in (discovery.anchor, t))
+        anchor, now = (coarse_frame(problem, discovery, at) for at in (discovery.anchor, t))
         return with_prediction(run, searched(discovery, now, anchor, self.config.stream.blend))
 
     def _step_of_frame(self, run: Run) -> int:
         """Number of steps that a run has made in its frame."""
         return run.step - run.kept.count * self.config.stream.iterations
 
-    def _size(self, run: Run) -> int:
-        """The size of the current frame's pictures in the next step."""
+    def _size(self, problem: Problem, run: Run) -> str:
+        """The size of the pictures in the next step, by the name of its plan."""
+        if isinstance(run.params, RefineParams):
+            return f"refining 1/{self._shrink(problem, run)}"
         stream = self.config.stream
-        return HALF if self._step_of_frame(run) < stream.coarse * stream.iterations else FULL
+        return COARSE if self._step_of_frame(run) < stream.coarse * stream.iterations else FINE
 
     def _batch_of_all(self, problem: Problem, run: Run) -> tuple[RefineBatch, tuple[str, ...]]:
         """A picture of any frame, for the refinement."""
         discovery: Discovery = run.kept
         i = run.step - self.steps_of_frames(problem)
         t, camera = self._order_of_all(problem, discovery)[i]
+        plan = self._size(problem, run)
         batch = RefineBatch(
             discovery.canonical,
             discovery.weights,
-            full_picture(problem, discovery, t, camera),
+            any_picture(problem, discovery, t, camera, self._shrink(problem, run)),
             jnp.asarray(t),
             jnp.asarray(discovery.anchor),
             i / self.steps_of_refinement(problem),
-            run.plans[_REFINING],
+            run.plans[plan],
             problem.at_once,  # surfaces in space tell poses better than pictures do
         )
-        return batch, (_REFINING,)
+        return batch, (plan,)
+
+    def _shrink(self, problem: Problem, run: Run) -> int:
+        """The factor by which the pictures of the refinement's next step are smaller than in the data."""
+        done = run.step - self.steps_of_frames(problem)
+        if done >= _SMALLER * self.steps_of_refinement(problem):
+            return 1
+        return coarse_factor(stored_frame(problem, run.kept.anchor).cameras) // 2
 
     def _order_of_all(self, problem: Problem, discovery: Discovery) -> list[tuple[int, int]]:
         frames = tuple(np.flatnonzero(discovery.done).tolist())
@@ -207,17 +215,18 @@ class Parts:
         """Plans for what is rendered for the first time."""
         discovery: Discovery = run.kept
         if isinstance(run.params, RefineParams):
-            if _REFINING in run.plans or not self.steps_of_refinement(problem):
+            size = self._size(problem, run)
+            if size in run.plans or run.step >= self.total(problem):
                 return {}
-            t, _ = self._order_of_all(problem, discovery)[0]
-            scene, cameras = self._posed(discovery, t), problem.sequence.frame(t).cameras
-            return {_REFINING: plan_render(scene, cameras, headroom=self.config.headroom)}
+            anchor = part_of(stored_frame(problem, discovery.anchor), (), self._shrink(problem, run))
+            scene = self._posed(discovery, discovery.anchor)
+            return {size: plan_render(scene, anchor.cameras, headroom=self.config.headroom)}
         stream, plans = self.config.stream, {}
-        for size in {self._size(run), HALF} if stream.past else {self._size(run)}:
-            if _PLANS[size] not in run.plans:
+        for size in {self._size(problem, run), COARSE} if stream.past else {self._size(problem, run)}:
+            if size not in run.plans:
                 scene = self._posed(discovery, int(discovery.found.argmax()))
                 cameras = current_frame(problem, discovery, size, stream.blend).cameras
-                plans[_PLANS[size]] = plan_render(scene, cameras, headroom=self.config.headroom)
+                plans[size] = plan_render(scene, cameras, headroom=self.config.headroom)
         return plans
 
     def _posed(self, discovery: Discovery, t: int) -> Gaussians:

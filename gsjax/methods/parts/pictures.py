@@ -13,16 +13,16 @@ from jaxtyping import Array, Float
 
 from gsjax.methods.parts.discovery import Discovery
 from gsjax.methods.parts.exposure import corrected
+from gsjax.methods.parts.sizes import COARSE, COARSE_TILE, FINE, coarse_factor
 from gsjax.methods.parts.stream import Canonical, valid_pixels
 from gsjax.methods.parts.trajectory import BACKGROUND
 from gsjax.methods.protocols import SequenceLike
 from gsjax.scene.frame import Frame, one_camera, part_of
 from gsjax.scene.handles import Blend, HandlePose, skin
-from gsjax.scene.region import TILE, tiles_to_pixels, touched_tiles
+from gsjax.scene.region import tiles_to_pixels, touched_tiles
 
-FULL, HALF = 1, 2
-"""Sizes of pictures, as factors by which they are smaller than in the data."""
 _CAMERAS = 4  # used in a row before another frame is loaded
+_ROOM = 2**30  # bytes of stored frames
 
 
 @dataclass(frozen=True)
@@ -31,16 +31,18 @@ class Problem:
 
     Attributes:
         sequence: the recording of synchronised cameras.
-        past: past frames at half size, on the host, with colours in bytes.
+        past: past frames at the coarse size, on the host, with colours in bytes.
         now: the current frame by size, with the weights by which its pixels were selected.
         whole: the newest full frame, with the colours of the scene, by its index.
+        stored: full frames as in the data, on the host, with colours in bytes.
         at_once: whether the poses of all frames are known at the start.
     """
 
     sequence: SequenceLike
     past: dict[int, Frame] = field(default_factory=dict)
-    now: dict[int, tuple[Array, Frame]] = field(default_factory=dict)
+    now: dict[str, tuple[Array, Frame]] = field(default_factory=dict)
     whole: dict[int, Frame] = field(default_factory=dict)
+    stored: dict[int, Frame] = field(default_factory=dict)
     at_once: bool = False
 
 
@@ -100,24 +102,25 @@ def order_of_pictures(seed: int, frames: tuple[int, ...], cameras: int, steps: i
     return order[:steps]
 
 
-def current_frame(problem: Problem, discovery: Discovery, size: int, blend: Blend) -> Frame:
+def current_frame(problem: Problem, discovery: Discovery, size: str, blend: Blend) -> Frame:
     """The current frame of all cameras.
 
     Args:
         problem: caches it until the next frame.
         discovery: the frame, the weights before it, and the predicted poses.
-        size: `FULL` or `HALF`.
+        size: `FINE` or `COARSE`.
         blend: how rotations are blended.
     """
     weights, frame = problem.now.get(size, (None, None))
     if frame is None or weights is not discovery.weights:
-        t = discovery.frame
-        for other in (HALF, FULL):
-            smaller = part_of(_whole(problem, discovery, t), (), other)
-            if other == HALF:
+        t, whole = discovery.frame, _whole(problem, discovery, discovery.frame)
+        shrink = coarse_factor(whole.cameras)
+        for other, factor, tile in ((COARSE, shrink, COARSE_TILE), (FINE, shrink // 2, 2 * COARSE_TILE)):
+            smaller = part_of(whole, (), factor)
+            if other == COARSE:
                 problem.past[t] = _on_host(smaller)
             place = discovery.canonical, discovery.weights, discovery.predicted
-            seen = with_part_masks(smaller, *place, TILE // other, blend=blend)
+            seen = with_part_masks(smaller, *place, tile, blend=blend)
             problem.now[other] = discovery.weights, seen
         frame = problem.now[size][1]
     return frame
@@ -126,7 +129,7 @@ def current_frame(problem: Problem, discovery: Discovery, size: int, blend: Blen
 def past_picture(
     problem: Problem, discovery: Discovery, t: int, camera: int, blend: Blend
 ) -> tuple[Frame, HandlePose]:
-    """The picture of one camera in a past frame, at half size, and the poses of the handles.
+    """The picture of one camera in a past frame, at the coarse size, and the poses of the handles.
 
     Args:
         problem: caches the pictures.
@@ -135,20 +138,46 @@ def past_picture(
         camera: index of the camera.
         blend: how rotations are blended.
     """
-    frame = _in_floats(one_camera(_half_in_bytes(problem, discovery, t), camera))
+    frame = _in_floats(one_camera(_coarse_in_bytes(problem, discovery, t), camera))
     pose = discovery.pose(t)
-    seen = with_part_masks(frame, discovery.canonical, discovery.weights, pose, TILE // HALF, blend=blend)
+    seen = with_part_masks(frame, discovery.canonical, discovery.weights, pose, blend=blend)
     return seen, pose
 
 
-def half_frame(problem: Problem, discovery: Discovery, t: int) -> Frame:
-    """All cameras of frame t at half size, on the host, with the colours of the scene."""
-    return _in_floats(_half_in_bytes(problem, discovery, t))
+def coarse_frame(problem: Problem, discovery: Discovery, t: int) -> Frame:
+    """All cameras of frame t at the coarse size, on the host, with the colours of the scene."""
+    return _in_floats(_coarse_in_bytes(problem, discovery, t))
 
 
-def full_picture(problem: Problem, discovery: Discovery, t: int, camera: int) -> Frame:
-    """The picture of one camera in frame t, with all pixels that the data does not mask out."""
-    frame = one_camera(_whole(problem, discovery, t), camera)
+def stored_frame(problem: Problem, t: int) -> Frame:
+    """All cameras of frame t as in the data, on the host, with colours in bytes. If there is no room for all
+    frames, those that came first stay, and the newest.
+
+    Args:
+        problem: caches the frames.
+        t: index of the frame.
+    """
+    if t not in problem.stored:
+        frame = _on_host(problem.sequence.frame(t))
+        size = sum(array.nbytes for array in jax.tree.leaves(frame))
+        if problem.stored and (len(problem.stored) + 1) * size > _ROOM:
+            problem.stored.popitem()
+        problem.stored[t] = frame
+    return problem.stored[t]
+
+
+def any_picture(problem: Problem, discovery: Discovery, t: int, camera: int, shrink: int) -> Frame:
+    """The picture of one camera in a frame, with all pixels that the data does not mask out.
+
+    Args:
+        problem: caches the frames.
+        discovery: the exposures.
+        t: index of the frame.
+        camera: index of the camera.
+        shrink: factor by which the picture is smaller than in the data.
+    """
+    frame = _in_floats(one_camera(stored_frame(problem, t), camera))
+    frame = corrected(part_of(frame, (), shrink), discovery.exposures[camera : camera + 1])
     return Frame(frame.images, frame.depths, frame.cameras, valid_pixels(frame), frame.time)
 
 
@@ -158,7 +187,7 @@ def with_part_masks(
     canonical: Canonical,
     weights: Float[Array, "M P"],
     pose: HandlePose,
-    tile: int = TILE,
+    tile: int = COARSE_TILE,
     *,
     blend: Blend,
 ) -> Frame:
@@ -187,13 +216,14 @@ def _whole(problem: Problem, discovery: Discovery, t: int) -> Frame:
     """All cameras of frame t, with the colours of the scene."""
     if t not in problem.whole:
         problem.whole.clear()
-        problem.whole[t] = corrected(problem.sequence.frame(t), discovery.exposures)
+        problem.whole[t] = corrected(_in_floats(stored_frame(problem, t)), discovery.exposures)
     return problem.whole[t]
 
 
-def _half_in_bytes(problem: Problem, discovery: Discovery, t: int) -> Frame:
+def _coarse_in_bytes(problem: Problem, discovery: Discovery, t: int) -> Frame:
     if t not in problem.past:
-        problem.past[t] = _on_host(part_of(_whole(problem, discovery, t), (), HALF))
+        whole = _whole(problem, discovery, t)
+        problem.past[t] = _on_host(part_of(whole, (), coarse_factor(whole.cameras)))
     return problem.past[t]
 
 

@@ -33,7 +33,7 @@ from gsjax.scene.handles import HandlePose
 from gsjax.scene.render import render
 
 _RATES = {"quats": 1e-3, "log_scales": 5e-3, "logit_opacities": 2.5e-2, "sh0": 2.5e-3, "shN": 1.25e-4}
-_FINAL_RATE = 0.1
+_FINAL_RATE, _FINAL_POSE_RATE = 0.1, 0.01  # relative to the first; poses settle
 
 
 class RefineParams(NamedTuple):
@@ -116,17 +116,17 @@ def refine_step(config: PartsConfig, extra_losses: ExtraLosses = ()) -> Step:
 
         (value, info), slope = jax.value_and_grad(loss, (0, 1), has_aux=True)(both(params), pose)
         fall = _FINAL_RATE**batch.progress
-        length = config.refine.rate * fall * batch.canonical.pixel
+        pixel = batch.canonical.pixel
         gaussians, known = [], []
         for before, down, was in zip(both(params), slope[0], state[0], strict=True):
             moves, now = scene(params).update(down, was)
-            moves = eqx.tree_at(
-                lambda g: g.means, jax.tree.map(lambda a: fall * a, moves), length * moves.means
-            )
+            shifts = config.refine.rate * fall * pixel * moves.means
+            moves = eqx.tree_at(lambda g: g.means, jax.tree.map(lambda a: fall * a, moves), shifts)
             gaussians.append(optax.apply_updates(before, moves))
             known.append(now)
         moves, pose_state = poses.update(slope[1], pose_state)
-        far = jnp.where((batch.t == batch.anchor) | batch.held, 0.0, length)
+        settling = _FINAL_POSE_RATE**batch.progress
+        far = jnp.where((batch.t == batch.anchor) | batch.held, 0.0, config.refine.pose_rate * settling * pixel)
         pose = pose_after(pose, moves, batch.canonical, far, far)
         everywhere = jax.tree.map(
             lambda every, one: every.at[batch.t].set(one), (params.poses, state[1]), (pose, pose_state)

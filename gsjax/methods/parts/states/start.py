@@ -8,6 +8,7 @@ from gsjax.geometry.cameras import Camera, pixels_of
 from gsjax.methods.parts.anchor import Anchor
 from gsjax.methods.parts.config import PartsConfig
 from gsjax.methods.parts.discover import Start, start_from
+from gsjax.methods.parts.exposure import AS_GIVEN
 from gsjax.methods.parts.states.search import States, states_of
 from gsjax.methods.protocols import SequenceLike
 from gsjax.scene.gaussians import Gaussians
@@ -41,7 +42,7 @@ def begin_with_states(
         gaussians,
         _weights(states, np.asarray(gaussians.means), slots),
         frame.cameras,
-        np.tile(np.eye(3, 4, dtype=np.float32), (count, 1, 1)),  # a camera stands elsewhere in each state
+        np.tile(AS_GIVEN, (count, 1, 1)),  # a camera stands elsewhere in each state
         _masks(states, frame.cameras, count),
         config,
         key,
