@@ -57,7 +57,9 @@ def test_what_leaves_changes_and_what_is_covered_for_a_while_does_not(boxes, cha
 
 
 def test_pixels_show_what_may_move(boxes, plan, changes):
-    shown = changing_views(boxes.gaussians, boxes.cameras, plan, changes)
+    views = range(boxes.num_cameras)
+    drawn = [render(boxes.gaussians, one_camera(boxes.cameras, c), plan) for c in views]
+    shown = changing_views(boxes.gaussians, boxes.cameras, plan, changes, drawn)
     true = boxes.masks(boxes.bodies) > 0
     assert shown[true].mean() > 0.9
 

@@ -21,7 +21,7 @@ from gsjax.methods.parts import (
     moved_pixels,
     refine_step,
 )
-from gsjax.methods.parts.pictures import Problem, order_of_pictures
+from gsjax.methods.parts.pictures import Problem, order_of_pictures, stored_frame
 from gsjax.optim.method import Run
 from gsjax.scene.feature_grid import FeatureGridConfig
 from gsjax.scene.handles import HandlePose
@@ -85,6 +85,24 @@ def off_mm(boxes, astray, translations):
 
 
 @pytest.mark.slow
+def test_frames_are_loaded_once_while_there_is_room(boxes, monkeypatch):
+    loaded: list[int] = []
+    problem, order = Problem(boxes), [0, 2, 1, 2, 0, 1, 1, 2]
+    frames = [boxes.frame(t) for t in range(FRAMES)]
+    monkeypatch.setattr(MovingBoxes, "frame", lambda self, t: loaded.append(t) or frames[t])
+    for t in order:
+        pictures = np.round(255 * np.asarray(frames[t].images))
+        np.testing.assert_array_equal(stored_frame(problem, t).images, pictures)
+    assert loaded == [0, 2, 1]
+    one = sum(leaf.nbytes for leaf in jax.tree.leaves(stored_frame(problem, 0)))
+    monkeypatch.setattr("gsjax.methods.parts.pictures._ROOM", 2 * one)
+    problem.stored.clear()
+    loaded.clear()
+    for t in order:
+        stored_frame(problem, t)
+    assert loaded == [0, 2, 1, 2, 1, 2]  # the first stays, and the newest
+
+
 def test_colours_and_poses_come_back(boxes, astray):
     infos, after = refined(boxes, astray, CONFIG)
     losses = np.array([info["loss"] for info in infos])

@@ -5,20 +5,22 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from gsjax.geometry.cameras import Camera, intrinsics
 from gsjax.methods.parts.anchor import Anchor, choose_anchor, difference_image, moved_pixels
 from gsjax.methods.parts.config import DiscoverConfig, PartsConfig
 from gsjax.methods.parts.discover import begin
-from gsjax.methods.parts.sizes import pixel_width
-from gsjax.methods.parts.lift import label_votes, lift_masks
+from gsjax.methods.parts.lift import drawn_features, label_votes, lift_masks, pixel_votes
 from gsjax.methods.parts.masks import (
     masks_from_labels,
     moving_segments,
     propagate_masks,
     view_order,
 )
+from gsjax.methods.parts.sizes import coarse_factor, pixel_width
 from gsjax.methods.parts.stream import skinning_weights
 from gsjax.methods.parts.weights import fit_field_to_weights, new_field, weights_of
 from gsjax.scene.feature_grid import FeatureGridConfig
+from gsjax.scene.frame import one_camera
 from gsjax.scene.render import plan_render
 from tests.methods.moving_boxes import Box, MovingBoxes, linear
 
@@ -175,6 +177,39 @@ def test_votes_are_shares_of_pixels(boxes):
     assert (total >= 0).all()
     pixels = masks.size  # no pixel has more than itself to give
     assert 0.2 * pixels < total.sum() <= pixels * (1 + 1e-5)
+
+
+def test_many_labels_are_voted_for_and_drawn_like_few(boxes):
+    plan = plan_render(boxes.gaussians, boxes.cameras, headroom=1.3)
+    view, count = one_camera(boxes.cameras, 0), 70  # more than one program takes at once
+    labels = np.random.default_rng(0).integers(-1, count, boxes.masks(boxes.bodies).shape[1:])
+    votes = label_votes(boxes.gaussians, view, plan, labels[None], count)
+    for some in (np.arange(3), np.arange(60, 70)):
+        values = (labels[None, ..., None] == some).astype(np.float32)
+        np.testing.assert_allclose(
+            votes[:, some], pixel_votes(boxes.gaussians, view, plan, values), atol=1e-6
+        )
+    features = np.random.default_rng(1).random((boxes.gaussians.num, count), np.float32)
+    drawn = drawn_features(boxes.gaussians, view, plan, features)
+    values = np.random.default_rng(2).random(drawn.shape, np.float32)
+    there = (pixel_votes(boxes.gaussians, view, plan, values) * features).sum()
+    assert there == pytest.approx((drawn * values).sum(), rel=1e-4)  # one is the other's transpose
+    assert not label_votes(boxes.gaussians, view, plan, np.full_like(labels, -1)[None], 3).any()
+
+
+@pytest.mark.parametrize(
+    ("width", "height", "factor"),
+    [(64, 48, 2), (160, 120, 2), (320, 180, 2), (320, 240, 2), (640, 360, 4), (640, 480, 4), (1920, 1080, 8)],
+)
+def test_larger_pictures_are_followed_at_the_same_size(width, height, factor):
+    camera = Camera(np.eye(4)[None], intrinsics(60, width, height)[None], width, height)
+    assert coarse_factor(camera) == factor
+    if factor == 2:
+        return
+    small = Camera(camera.viewmat, camera.K.copy(), 2 * width // factor, 2 * height // factor)
+    small.K[:, :2] *= 2 / factor
+    points = np.array([[0.0, 0.0, 2.0]])
+    assert pixel_width(points, camera) == pytest.approx(pixel_width(points, small))
 
 
 @pytest.mark.parametrize("kind", ["grid", "table", "simplex"])

@@ -112,7 +112,7 @@ class RefineConfig:
     frame, as in the paper."""
     rate: float = 0.05
     """Learning rate of the scene: distance that Gaussians move in the first step, pixels."""
-    pose_rate: float = 0.05
+    pose_rate: float = 0.3
     """Learning rate of the poses: distance that parts, and their borders, move in the first step, pixels."""
 
     def __post_init__(self):

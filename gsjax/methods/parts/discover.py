@@ -12,7 +12,7 @@ from gsjax.geometry.cameras import Camera
 from gsjax.methods.parts.anchor import Anchor
 from gsjax.methods.parts.config import PartsConfig
 from gsjax.methods.parts.exposure import AS_GIVEN, exposures_of
-from gsjax.methods.parts.lift import label_votes, lift_masks
+from gsjax.methods.parts.lift import drawn_features, label_votes, lift_masks
 from gsjax.methods.parts.masks import propagate_masks, view_order
 from gsjax.methods.parts.motion import changes_of, changing_views, with_what_moves
 from gsjax.methods.parts.sizes import pixel_width
@@ -100,7 +100,7 @@ def begin(
         if config.discover.difference:
             changes = changes_of(gaussians, frame.cameras, plan, moved)
             moves = changes.usual >= config.discover.moving
-            shown = moved.any(1) & changing_views(gaussians, frame.cameras, plan, changes)
+            shown = moved.any(1) & changing_views(gaussians, frame.cameras, plan, changes, drawn)
         masks = _find_masks(sequence, gaussians, frame, drawn, plan, anchor, shown, config, segmenter)
     if not (masks > 0).any():
         raise ValueError(
@@ -202,11 +202,10 @@ def _find_masks(
         nonlocal total
         total += label_votes(gaussians, one_camera(frame.cameras, last), plan, mask[None], room)
         sums = total.sum(-1, keepdims=True)
-        shares = jnp.asarray(np.where(sums > 1e-2, total / np.maximum(sums, 1e-6), 0.0))
-        drawn = render(gaussians, one_camera(frame.cameras, c), plan, features=shares).features
-        assert drawn is not None
-        shown = np.asarray(drawn[0])
-        return np.where(shown.max(-1) > _LEAST_SHOWN, shown.argmax(-1), -1)
+        used = np.union1d([BACKGROUND], np.flatnonzero(total.any(0)))
+        shares = np.where(sums > 1e-2, total[:, used] / np.maximum(sums, 1e-6), 0.0)
+        shown = drawn_features(gaussians, one_camera(frame.cameras, c), plan, shares)[0]
+        return np.where(shown.max(-1) > _LEAST_SHOWN, used[shown.argmax(-1)], -1)
 
     return propagate_masks(
         pictures,

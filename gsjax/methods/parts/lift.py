@@ -17,6 +17,7 @@ from gsjax.scene.gaussians import Gaussians
 from gsjax.scene.render import render
 
 _OPTIMIZER = optax.adam(0.5)
+_CHANNELS = 32  # drawn, or voted for, at once, so that one program serves all
 _LEAST_ALPHA = 0.5  # pixels with a lower rendered alpha are ignored
 _SURE = 10.0  # initial logit of a label that all pixels agree on, above the others
 
@@ -28,8 +29,9 @@ def label_votes(
     label of the Gaussian's compositing weight, w_i = alpha_i T_i; the transpose of rendering features."""
     total = np.zeros((gaussians.num, count), np.float32)
     for c, mask in enumerate(masks):
-        labels = (mask[None, ..., None] == np.arange(count)).astype(np.float32)
-        total += pixel_votes(gaussians, one_camera(cameras, c), plan, labels)
+        present = np.intersect1d(mask, np.arange(count))
+        labels = (mask[None, ..., None] == present).astype(np.float32)
+        total[:, present] += pixel_votes(gaussians, one_camera(cameras, c), plan, labels)
     return total
 
 
@@ -38,8 +40,30 @@ def pixel_votes(
 ) -> Float[np.ndarray, "N K"]:
     """The sum over the pixels of one camera of their values, weighted by what each Gaussian contributes to
     them, w_i = alpha_i T_i."""
-    zeros = jax.device_put(np.zeros((gaussians.num, values.shape[-1]), gaussians.means.dtype))
-    return np.asarray(_votes(zeros, gaussians, camera, plan, values.astype(zeros.dtype)))
+    zeros = jax.device_put(np.zeros((gaussians.num, _CHANNELS), gaussians.means.dtype))
+    votes = [_votes(zeros, gaussians, camera, plan, part.astype(zeros.dtype)) for part in _parts_of(values)]
+    return np.concatenate(votes, axis=-1)[:, : values.shape[-1]]
+
+
+def drawn_features(
+    gaussians: Gaussians, camera: Camera, plan: Plan, features: Float[np.ndarray, "N K"]
+) -> Float[np.ndarray, "1 H W K"]:
+    """What one camera sees of the features of Gaussians, sum_i w_i f_i; the transpose of `pixel_votes`."""
+    drawn = [_drawn(part, gaussians, camera, plan) for part in _parts_of(features)]
+    return np.concatenate(drawn, axis=-1)[..., : features.shape[-1]]
+
+
+def _parts_of(values: Float[np.ndarray, "... K"]) -> list[Float[np.ndarray, "... channels"]]:
+    """The channels, as many at once as one program takes."""
+    count = max(1, -(-values.shape[-1] // _CHANNELS))
+    padded = np.zeros((*values.shape[:-1], count * _CHANNELS), values.dtype)
+    padded[..., : values.shape[-1]] = values
+    return np.split(padded, count, axis=-1)
+
+
+@partial(host_jit, static_argnames="plan")
+def _drawn(features, gaussians: Gaussians, cameras: Camera, plan: Plan):
+    return render(gaussians, cameras, plan, features=features).features
 
 
 @partial(host_jit, static_argnames="plan")

@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 import jax.numpy as jnp
 import numpy as np
 
+from gsjax.geometry.cameras import on_device
 from gsjax.losses.extra import ExtraLosses, named_losses
 from gsjax.methods.parts.config import PartsConfig
 from gsjax.methods.parts.discover import Start
@@ -220,7 +221,7 @@ class Parts:
                 return {}
             anchor = part_of(stored_frame(problem, discovery.anchor), (), self._shrink(problem, run))
             scene = self._posed(discovery, discovery.anchor)
-            return {size: plan_render(scene, anchor.cameras, headroom=self.config.headroom)}
+            return {size: plan_render(scene, on_device(anchor.cameras), headroom=self.config.headroom)}
         stream, plans = self.config.stream, {}
         for size in {self._size(problem, run), COARSE} if stream.past else {self._size(problem, run)}:
             if size not in run.plans:

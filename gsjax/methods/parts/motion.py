@@ -2,9 +2,9 @@
 where something else passes in front, but only for the few cameras that look along that line; what something
 comes to rest on changes for all of them, but only for a while."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.sparse import coo_array
@@ -12,12 +12,12 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from gsjax.geometry.cameras import Camera
-from gsjax.methods.parts.lift import pixel_votes
+from gsjax.methods.parts.lift import drawn_features, pixel_votes
 from gsjax.methods.parts.trajectory import BACKGROUND
 from gsjax.rasterize.plan import Plan
 from gsjax.scene.frame import one_camera
 from gsjax.scene.gaussians import Gaussians
-from gsjax.scene.render import render
+from gsjax.scene.render import Rendered
 
 _SMOOTH = 8  # Gaussians next to each other that are judged together
 _OFTEN = 8  # one in so many frames shows the change of what may move
@@ -64,7 +64,7 @@ def changes_of(
 
 
 def changing_views(
-    gaussians: Gaussians, cameras: Camera, plan: Plan, changes: Changes
+    gaussians: Gaussians, cameras: Camera, plan: Plan, changes: Changes, drawn: Sequence[Rendered]
 ) -> Bool[np.ndarray, "C H W"]:
     """The pixels of the anchor's pictures that show Gaussians in whose places much changes in some frames, or
     none at all.
@@ -74,12 +74,12 @@ def changing_views(
         cameras: C cameras.
         plan: for one camera.
         changes: from `changes_of`.
+        drawn: the scene, as each camera sees it.
     """
-    features, views = jnp.asarray(changes.most[:, None], gaussians.means.dtype), []
-    for c in range(cameras.viewmat.shape[0]):
-        drawn = render(gaussians, one_camera(cameras, c), plan, features=features)
-        assert drawn.features is not None
-        views.append(np.asarray(drawn.features[0, ..., 0] >= _LEAST_CHANGE * drawn.alphas[0]))
+    views = []
+    for c, view in enumerate(drawn):
+        most = drawn_features(gaussians, one_camera(cameras, c), plan, changes.most[:, None])
+        views.append(most[0, ..., 0] >= _LEAST_CHANGE * np.asarray(view.alphas[0]))
     return np.stack(views)
 
 

@@ -33,7 +33,7 @@ from gsjax.scene.handles import HandlePose
 from gsjax.scene.render import render
 
 _RATES = {"quats": 1e-3, "log_scales": 5e-3, "logit_opacities": 2.5e-2, "sh0": 2.5e-3, "shN": 1.25e-4}
-_FINAL_RATE, _FINAL_POSE_RATE = 0.1, 0.01  # relative to the first; poses settle
+_FINAL_RATE = 0.1
 
 
 class RefineParams(NamedTuple):
@@ -125,8 +125,8 @@ def refine_step(config: PartsConfig, extra_losses: ExtraLosses = ()) -> Step:
             gaussians.append(optax.apply_updates(before, moves))
             known.append(now)
         moves, pose_state = poses.update(slope[1], pose_state)
-        settling = _FINAL_POSE_RATE**batch.progress
-        far = jnp.where((batch.t == batch.anchor) | batch.held, 0.0, config.refine.pose_rate * settling * pixel)
+        stays = (batch.t == batch.anchor) | batch.held
+        far = jnp.where(stays, 0.0, config.refine.pose_rate * fall * pixel)
         pose = pose_after(pose, moves, batch.canonical, far, far)
         everywhere = jax.tree.map(
             lambda every, one: every.at[batch.t].set(one), (params.poses, state[1]), (pose, pose_state)
