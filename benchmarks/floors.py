@@ -1,4 +1,5 @@
-"""Lower bounds of any implementation: exp for every pair, and copying inputs and outputs once."""
+"""Lower bounds of any implementation: exp for every pair, copying inputs and outputs once, and for features
+a matrix product over pairs and channels."""
 
 import math
 from collections.abc import Sequence
@@ -18,6 +19,7 @@ TILE = 16  # of the rectangle pairs, independent of the rasterizer's tiles
 BLOCK = 2**20  # float32 values in 4 MB, which fit in the cache
 PASSES = 32
 COPY = 2**26  # float32 values in 256 MB, which do not fit
+SIDE = 1024  # of the matrices that are multiplied
 CALM = 1.25  # a floor that changed by more than this while a workload ran makes it noisy
 
 
@@ -26,6 +28,7 @@ class Floors(NamedTuple):
 
     exp_ns: float  # nanoseconds per exp of a float32
     copy_gb_s: float  # gigabytes read, and the same amount written, per second
+    product_gflop_s: float  # 1e9 multiplications and additions per second of float32 matrices
 
     def exp_ms(self, rectangle_pairs: int) -> float:
         """Time of exp alone over all pixels of the rectangle pairs."""
@@ -35,6 +38,10 @@ class Floors(NamedTuple):
         """Time to copy the given number of bytes."""
         return 1e-6 * num_bytes / self.copy_gb_s
 
+    def product_ms(self, pixel_pairs: int, channels: int, products: int) -> float:
+        """Time of matrix products alone, of the weights of pixel pairs and the channels of features."""
+        return 2e-6 * products * pixel_pairs * channels / self.product_gflop_s
+
 
 @cache
 def _programs():
@@ -43,16 +50,17 @@ def _programs():
         lambda x: jax.lax.fori_loop(0, PASSES, lambda _, y: jnp.exp(-y), x),
         compiler_options=host_options() or None,
     )
-    return exp, jax.jit(jnp.negative)
+    return exp, jax.jit(jnp.negative), jax.jit(jnp.matmul)
 
 
 def measure_floors(repeats: int = 9) -> Floors:
-    """Measure both floors now, on all cores."""
-    exp, copy = _programs()
-    block, large = jnp.linspace(0.0, 1.0, BLOCK), jnp.ones(COPY)
+    """Measure the floors now, on all cores."""
+    exp, copy, multiply = _programs()
+    block, large, square = jnp.linspace(0.0, 1.0, BLOCK), jnp.ones(COPY), jnp.ones((SIDE, SIDE))
     exp_s = float(np.median(sample(lambda _: exp(block), repeats)))
     copy_s = float(np.median(sample(lambda _: copy(large), 3)))
-    return Floors(1e9 * exp_s / (PASSES * BLOCK), 1e-9 * large.nbytes / copy_s)
+    product_s = float(np.median(sample(lambda _: multiply(square, square), repeats)))
+    return Floors(1e9 * exp_s / (PASSES * BLOCK), 1e-9 * large.nbytes / copy_s, 2e-9 * SIDE**3 / product_s)
 
 
 def between(before: Floors, after: Floors) -> Floors:

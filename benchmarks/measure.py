@@ -10,7 +10,7 @@ import jax.numpy as jnp
 
 from benchmarks.floors import TILE, Floors, between, is_calm, measure_floors, rectangle_pairs
 from benchmarks.metrics import Metric
-from benchmarks.programs import JVP, make_pool, make_programs, make_stages
+from benchmarks.programs import BACKWARD, FORWARD, JVP, make_pool, make_programs, make_stages
 from benchmarks.timing import Compiled, compile_program, median_and_p95, sample
 from benchmarks.workloads import Scene, Workload
 from gsjax.optim.compiler import host_options
@@ -19,6 +19,7 @@ from gsjax.rasterize.rasterization import plan as make_plan
 
 MAX_ATTEMPTS = 3  # for a noisy workload
 GIB = 2**30
+PRODUCTS = {FORWARD: 1, BACKWARD: 3}  # of the weights' and features' values; then of the slopes of both
 PLAIN, UNREAD = ", plain jit", ", no reads"
 
 
@@ -39,6 +40,7 @@ class Timed:
     exp_floors: float  # the median as a multiple of it
     copy_floor_ms: float
     copy_floors: float
+    product_floors: float | None  # of features: their matrix products; None for colours alone
     compile_s: float
     memory_gib: float
     pairs: int  # Gaussian-tile pairs drawn
@@ -163,6 +165,7 @@ def measure(
     for name, (seconds, pairs) in timed.items():
         median, p95 = median_and_p95(seconds)
         exp_ms, copy_ms = floor.exp_ms(boxes), floor.copy_ms(compiled[name].traffic)
+        product_ms = floor.product_ms(pairs * tile.tile_pixels, workload.channels, PRODUCTS.get(name, 0))
         rows.append(
             Timed(
                 workload=workload.name,
@@ -178,6 +181,7 @@ def measure(
                 exp_floors=median / max(exp_ms, 1e-9),
                 copy_floor_ms=copy_ms,
                 copy_floors=median / max(copy_ms, 1e-9),
+                product_floors=median / product_ms if product_ms and workload.channels > 3 else None,
                 compile_s=compiled[name].seconds,
                 memory_gib=compiled[name].memory / GIB,
                 pairs=pairs,

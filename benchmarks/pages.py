@@ -119,7 +119,11 @@ def bottom_line(record: dict[str, Any]) -> list[str]:
             f"the cheapest (goal {FLAT_GOAL}; {flat['dearest']} against {flat['cheapest']})."
         )
     wide = [r for r in rows if r["channels"] == 512 and r["program"] == BACKWARD]
-    lines += [f"512 channels, {BACKWARD}: {figure(r['memory_gib'])} GiB (goal {MEMORY_GOAL})." for r in wide]
+    lines += [
+        f"512 channels, {r['workload']}, {BACKWARD}: {figure(r['memory_gib'])} GiB (goal {MEMORY_GOAL}), "
+        f"{figure(r.get('product_floors'))} times its matrix products."
+        for r in wide
+    ]
     rates = ((r["name"].removeprefix("steps-"), figure(r["steps_per_s"])) for r in record["steps"])
     lines += [f"{name}: {rate} steps per second." for name, rate in rates]
     if not record["complete"]:

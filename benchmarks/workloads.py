@@ -154,6 +154,7 @@ SUITE = [
         variants=True,
     ),
     ball_workload(1_000_000, HD),
+    ball_workload(50_000, (320, 240), 512),
 ]
 QUICK = _sweep(
     counts=(1_000,),

@@ -21,7 +21,7 @@ from benchmarks.workloads import QUICK, SUITE, Workload, ball, ball_workload, ch
 from gsjax.cli import main
 from gsjax.rasterize.plan import Plan
 
-FLOORS = Floors(exp_ns=1.0, copy_gb_s=1.0)
+FLOORS = Floors(exp_ns=1.0, copy_gb_s=1.0, product_gflop_s=1.0)
 TINY = ball_workload(1_000, (48, 32))
 
 
@@ -141,9 +141,9 @@ def test_calls_are_warmed_up_and_cut_short_when_they_take_long():
 def test_floors():
     assert FLOORS.exp_ms(10) == pytest.approx(1e-6 * 10 * 256)
     assert FLOORS.copy_ms(10**6) == pytest.approx(1.0)
-    assert between(Floors(1.0, 1.0), Floors(4.0, 4.0)) == Floors(2.0, 2.0)
-    assert is_calm(Floors(1.0, 1.0), Floors(1.2, 9.0))
-    assert not is_calm(Floors(1.3, 1.0), Floors(1.0, 1.0))
+    assert between(Floors(1.0, 1.0, 1.0), Floors(4.0, 4.0, 4.0)) == Floors(2.0, 2.0, 2.0)
+    assert is_calm(Floors(1.0, 1.0, 1.0), Floors(1.2, 9.0, 9.0))
+    assert not is_calm(Floors(1.3, 1.0, 1.0), Floors(1.0, 1.0, 1.0))
 
 
 def test_names_are_told_apart():
@@ -169,7 +169,9 @@ def test_the_garden_follows_the_recipe(shared_data, monkeypatch):
 @pytest.fixture(scope="module")
 def measured():
     """A tiny workload on a machine that is calm only at the second attempt."""
-    sequence = iter([Floors(1.0, 1.0), Floors(2.0, 1.0), Floors(1.0, 1.0), Floors(1.1, 1.0)])
+    sequence = iter(
+        [Floors(1.0, 1.0, 1.0), Floors(2.0, 1.0, 1.0), Floors(1.0, 1.0, 1.0), Floors(1.1, 1.0, 1.0)]
+    )
     workload = ball_workload(1_000, (48, 32), channels=5)
     return measure(workload, 2, floors=lambda: next(sequence))
 
@@ -305,7 +307,7 @@ def test_the_real_thing_on_one_tiny_workload(monkeypatch, tmp_path, capfd):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", list(steps.STEPS))
 def test_every_step_has_a_rate(name):
-    row, _ = steps.measure_step(name, 2, Floors(1.0, 1.0))
+    row, _ = steps.measure_step(name, 2, Floors(1.0, 1.0, 1.0))
     assert row.updates == 2
     assert row.steps_per_s == pytest.approx(1e3 / row.median_ms)
 

@@ -15,7 +15,7 @@ from gsjax.engine.distill.file import FOLDER, NAME
 from gsjax.engine.distill.judge import judge
 from gsjax.engine.distill.results import summarize
 from gsjax.engine.distill.scene import FieldScene, SceneOptions, open_field_scene
-from gsjax.engine.drive import drive
+from gsjax.engine.drive import Tick, drive
 from gsjax.engine.ending import exit_code, finish
 from gsjax.engine.folder import RunFolder, plain
 from gsjax.engine.locks import releasing_locks
@@ -37,7 +37,7 @@ from gsjax.engine.teaching.cache import FeatureCache
 from gsjax.engine.teaching.choice import TeacherChoice
 from gsjax.engine.teaching.teaching import Teaching
 from gsjax.io.atomic import atomic_write
-from gsjax.methods.distill import PRESETS, Distill, DistillConfig
+from gsjax.methods.distill import PRESETS, Distill, DistillConfig, DistillResult
 
 _OF_TRAINING = (
     "encoding",
@@ -121,10 +121,17 @@ def run(options: Options) -> int:
             schedule = Schedule(
                 "distilling", total, lambda now, infos: losses(now, infos[-1:]), _words, of_pass
             )
-        watch(ticks, progress, schedule, folder, console, budget=budget)
+        solved = method.steps_of_solution(problem)
+
+        def first_answer(now: Tick) -> None:
+            """Writes the field of the solution, which can be queried while it is trained further."""
+            if now.step == solved < total:
+                _write(folder, now.result)
+                console.print(f"a first answer is there: gsjax query {out} TEXT", soft_wrap=True)
+
+        watch(ticks, progress, schedule, folder, console, budget=budget, evaluate=first_answer)
         steps, result = ticks.run.step, ticks.result
-        with atomic_write(folder.path / NAME) as temporary:
-            result.write(temporary)
+        _write(folder, result)
         with stage(console, "scoring views"):
             judged = judge(folder, scene, teaching, result, options.distill, notes, budget)
         note_if_cut_short(progress, schedule, steps, notes)
@@ -152,6 +159,11 @@ def run(options: Options) -> int:
         }
         finish(folder, found, summarize)
     return exit_code(progress.stopped)
+
+
+def _write(folder: RunFolder, result: DistillResult) -> None:
+    with atomic_write(folder.path / NAME) as temporary:
+        result.write(temporary)
 
 
 def with_paths(options: Options) -> Options:

@@ -10,6 +10,7 @@ import pytest
 import yaml
 
 from gsjax.cli import main
+from gsjax.engine.distill import run as distill_run
 from gsjax.engine.distill.scene import SceneOptions, open_field_scene
 from gsjax.io.scenes import read_gaussians, write_gaussians
 
@@ -99,6 +100,19 @@ def test_a_field_without_descent_takes_passes_over_the_views(gsjax, pristine, sc
     assert found["test"]["miou_3d"] > 0.6
     assert found["trained"] == found["num_gaussians"] * 6 + 512 * 6
     assert gsjax("query", out, "can")[0] == 0
+
+
+def test_the_solution_can_be_asked_while_it_is_trained(gsjax, pristine, scene, tmp_path, monkeypatch):
+    write, written = distill_run._write, []
+
+    def watched(folder, result):
+        write(folder, result)
+        written.append((type(result.field.encoding).__name__, gsjax("query", folder.path, "can")[0]))
+
+    monkeypatch.setattr(distill_run, "_write", watched)
+    out, told = tmp_path / "field", ("--preset", "field", "--distill.iterations", 3)
+    assert gsjax("distill", scene, "--out", out, *images(pristine), *told)[0] == 0
+    assert written == [("ArrayImpl", 0), ("FeatureGrid", 0)]
 
 
 def test_what_was_distilled_can_be_asked(gsjax, field, pristine):
