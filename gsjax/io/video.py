@@ -85,7 +85,9 @@ class _Encoder:
 
     def __init__(self, path: Path, *, size: str, rate: str, quality: str):
         source = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", size, "-r", rate, "-i", "-"]
-        target = ["-c:v", "libx264", "-pix_fmt", "yuv420p", "-crf", quality, "-movflags", "+faststart"]
+        # A quarter of the time of x264's default, and files no larger: runs film every camera.
+        target = ["-c:v", "libx264", "-preset", "veryfast", "-crf", quality]
+        target += ["-pix_fmt", "yuv420p", "-movflags", "+faststart"]
         # Its messages go to a file, because an unread pipe would fill up and block it.
         self._messages = tempfile.TemporaryFile()  # noqa: SIM115  (`finish` closes it)
         # imageio-ffmpeg's own writer forks with a `preexec_fn`, which may deadlock with JAX's threads.
