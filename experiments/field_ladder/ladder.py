@@ -153,7 +153,7 @@ def figure(rows: list[dict[str, Any]], path: Path) -> None:
                 continue
             means = np.array([np.mean(each) for each in values])
             spread = [means - [min(each) for each in values], [max(each) for each in values] - means]
-            axes.errorbar(seconds, means, spread, marker="o", ms=4, capsize=2, label=words)
+            axes.errorbar(seconds, means, np.maximum(spread, 0), marker="o", ms=4, capsize=2, label=words)
         for preset, x in zip(presets, seconds, strict=True):
             axes.axvline(x, color="0.9", lw=0.8, zorder=0)
             axes.annotate(preset, (x, 1.0), xycoords=("data", "axes fraction"), fontsize=8, rotation=45)

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from experiments.parts_basketball.basketball import HELD_OUT, NEAR, ball_scores
-from experiments.shared.discoveries import FIT, Options, discovered, steadiness, with_parts
+from experiments.shared.discoveries import FIT, Options, discovered, with_parts
 from experiments.shared.recordings import recorded
 from gsjax.engine.fit.run import Options as FitOptions
 from gsjax.engine.fit.run import run as run_fit
@@ -17,11 +17,9 @@ SCALE, FRAMES, ANCHOR, LAST = 0.5, "0:30:3", 9, "27:28"
 VARIANTS: dict[str, dict[str, Any]] = {
     "all on": {},
     "without exposures": {"top": {"exposures": False}},
-    "what moves by the masks alone": {"discover": {"moving": 1.0}},
     "without the search for jumps": {"stream": {"search": False}},
     "without refinement": {"refine": {"iterations": 0}},
     "poses refined slowly": {"refine": {"pose_rate": 0.05}},
-    "one pass of refinement": {"refine": {"iterations": 270}},
 }
 
 
@@ -39,7 +37,7 @@ def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
     )
     told = with_parts(told, **VARIANTS[options["variant"]])
     told = replace(with_parts(told, top={"seed": seed}), scene=_canonical(told, folder.parent / "canonical"))
-    return discovered(told) | steadiness(told.out) | ball_scores(told.out)
+    return discovered(told) | ball_scores(told.out)
 
 
 def _canonical(options: Options, path: Path) -> Path:

@@ -9,7 +9,7 @@ from gsjax.methods.parts import BACKGROUND, PartsConfig, begin, choose_anchor, m
 from gsjax.methods.parts.anchor import Anchor
 from gsjax.methods.parts.discovery import initial_run
 from gsjax.methods.parts.exposure import corrected, exposures_of
-from gsjax.methods.parts.motion import changes_of, changing_views, with_what_moves
+from gsjax.methods.parts.motion import changes_of, changing_views, divided_where_apart, with_what_moves
 from gsjax.methods.parts.search import groups_of, searched
 from gsjax.scene.feature_grid import FeatureGridConfig
 from gsjax.scene.frame import Frame, one_camera
@@ -54,6 +54,23 @@ def test_what_leaves_changes_and_what_is_covered_for_a_while_does_not(boxes, cha
     assert usual[boxes.bodies == 0].mean() < 0.12
     assert (changes.most >= 0.5)[boxes.bodies == 0].mean() > 0.3
     assert (changes.most >= changes.usual).all()
+
+
+def test_what_does_not_hang_together_is_not_one_part(boxes):
+    moving = (boxes.bodies > 0).astype(int)  # two boxes as one part, by mistake
+    weights = np.eye(4, dtype=np.float32)[moving] * 0.9 + 0.025
+    divided = divided_where_apart(weights, boxes.gaussians)
+    np.testing.assert_allclose(divided.sum(-1), 1, rtol=1e-6)
+    labels = divided.argmax(-1)
+    assert ((labels == BACKGROUND) == (boxes.bodies == 0)).all()
+    assert all(len(np.unique(labels[boxes.bodies == body])) == 1 for body in (1, 2))
+    assert len(np.unique(labels)) == 3
+    np.testing.assert_array_equal(divided_where_apart(divided, boxes.gaussians), divided)
+    full = weights[:, :2] / weights[:, :2].sum(-1, keepdims=True)
+    np.testing.assert_array_equal(divided_where_apart(full, boxes.gaussians), full)  # no slot is free
+    few = np.flatnonzero(boxes.bodies == 2)[15:]
+    weights[few] = np.eye(4)[BACKGROUND]
+    assert divided_where_apart(weights, boxes.gaussians)[boxes.bodies == 2].argmax(-1)[:15].max() == 1
 
 
 def test_pixels_show_what_may_move(boxes, plan, changes):

@@ -56,11 +56,11 @@ class Options(Common, Resuming, Timed, Seeded, TeacherChoice, SceneOptions):
 
     out: Path | None = None
     """Folder for the field. Default: `field` in the run's folder."""
-    preset: Literal["vote", "solve", "field", "paper"] = "solve"
+    preset: Literal["vote", "solve", "field", "paper"] = "field"
     """Default settings, the fastest first: vote (each Gaussian has the mean feature of the pixels that show
     it), solve (the features that the views show best, by least squares), field (a hash grid that begins as
     that solution), paper (the training of FD-3DGS, which takes tens of minutes)."""
-    distill: DistillConfig = dataclasses.field(default_factory=lambda: PRESETS["solve"])
+    distill: DistillConfig = dataclasses.field(default_factory=lambda: PRESETS["field"])
     """Settings of the field and its training."""
 
 

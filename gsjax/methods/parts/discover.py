@@ -14,7 +14,7 @@ from gsjax.methods.parts.config import PartsConfig
 from gsjax.methods.parts.exposure import AS_GIVEN, exposures_of
 from gsjax.methods.parts.lift import drawn_features, label_votes, lift_masks
 from gsjax.methods.parts.masks import propagate_masks, view_order
-from gsjax.methods.parts.motion import changes_of, changing_views, with_what_moves
+from gsjax.methods.parts.motion import changes_of, changing_views, divided_where_apart, with_what_moves
 from gsjax.methods.parts.sizes import pixel_width
 from gsjax.methods.parts.stream import Canonical
 from gsjax.methods.parts.trajectory import BACKGROUND
@@ -114,6 +114,7 @@ def begin(
     weights = softmax(np.asarray(logits), axis=-1)
     if moves is not None:
         weights = with_what_moves(weights, gaussians, moves)
+    weights = divided_where_apart(weights, gaussians)
     exposures = exposures_of(drawn, frame) if config.exposures else np.tile(AS_GIVEN, (len(drawn), 1, 1))
     return start_from(anchor, gaussians, weights, frame.cameras, exposures, masks, config, key, lifting)
 

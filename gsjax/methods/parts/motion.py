@@ -24,6 +24,7 @@ _OFTEN = 8  # one in so many frames shows the change of what may move
 _SEEN = 1e-3  # pixels of which a Gaussian shows less are no evidence
 _TOUCHING = 16  # neighbours that may touch a Gaussian
 _LEAST_WEIGHT = 0.1  # of all parts, below which the masks do not tell the part
+_LEAST_APART, _LEAST_SHARE = 16, 0.05  # Gaussians of a part of its own, and relative to what it comes from
 _LEAST_CHANGE = 0.35  # share below which what a Gaussian shows hardly changes in any frame
 
 
@@ -103,6 +104,29 @@ def with_what_moves(
     belongs = moves & (weights[:, BACKGROUND] < 1 - _LEAST_WEIGHT)
     weights[belongs, BACKGROUND] = 0
     return weights / weights.sum(-1, keepdims=True)
+
+
+def divided_where_apart(weights: Float[np.ndarray, "N P"], gaussians: Gaussians) -> Float[np.ndarray, "N P"]:
+    """The weights of parts, after what does not hang together has become parts of its own, the largest first,
+    as far as there are slots. Masks that views share by chance tie a ball to somebody else's head; no rigid
+    motion fits both.
+
+    Args:
+        weights: of the parts; rows sum to 1.
+        gaussians: the scene at the anchor frame.
+    """
+    labels, weights = weights.argmax(-1), weights.copy()
+    apart: list[Int[np.ndarray, "m"]] = []
+    for part in np.setdiff1d(labels, [BACKGROUND]):
+        largest, *others = _connected(gaussians, np.flatnonzero(labels == part))
+        least = max(_LEAST_APART, _LEAST_SHARE * len(largest))
+        apart += [group for group in others if len(group) >= least]
+    free = np.setdiff1d(np.arange(weights.shape[1]), [BACKGROUND, *labels])
+    for slot, group in zip(free, sorted(apart, key=len, reverse=True), strict=False):
+        part = labels[group[0]]
+        weights[group, slot] += weights[group, part]
+        weights[group, part] = 0
+    return weights
 
 
 def _connected(gaussians: Gaussians, chosen: Int[np.ndarray, "n"]) -> list[Int[np.ndarray, "m"]]:
