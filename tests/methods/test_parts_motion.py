@@ -180,6 +180,19 @@ def test_what_jumped_is_found(boxes, start, t):
     np.testing.assert_array_equal(found.translations[1], pose.translations[1])
 
 
+def test_what_lands_in_front_of_something_is_found_by_the_other_cameras(boxes, start):
+    t, shifts, rest = 2, boxes.boxes[1].shifts, at_rest(len(start.canonical.alive))
+    predicted = np.array([boxes.boxes[0].shifts[t], shifts[t - 1]], np.float32)
+    pose = HandlePose(rest.quats, rest.translations.at[1:3].set(predicted))
+    discovery = initial_run(start, FRAMES, PartsConfig()).kept._replace(predicted=pose)
+    now, before = boxes.frame(t), np.asarray(boxes.frame(0).images)
+    images = np.array(now.images)
+    images[0][np.abs(images[0] - before[0]).max(-1) > 0.05] = 0.5  # one of five sees something else there
+    hidden = Frame(jnp.asarray(images), now.depths, now.cameras)
+    found = searched(discovery, hidden, boxes.frame(0), "quaternion")
+    assert np.linalg.norm(found.translations[2] - shifts[t]) < 0.025  # of 0.125 m
+
+
 def test_what_is_where_it_should_be_stays_to_the_bit(boxes, start):
     discovery, here = initial_run(start, FRAMES, PartsConfig()).kept, boxes.frame(0)
     assert searched(discovery, here, here, "quaternion") is discovery.predicted

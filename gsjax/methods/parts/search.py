@@ -23,8 +23,7 @@ from gsjax.scene.handles import Blend, HandlePose, skin
 _POINTS = 64  # Gaussians by which a group of parts is recognised
 _MOST = 0.3  # difference of colours, 0 to 1, that counts as entirely wrong
 _ASTRAY = 1.25, 0.02  # a group is looked for if its difference is so much larger than at the anchor
-_BETTER = 0.75  # share of its difference at the predicted place that a better place may have
-_AS_USUAL = 1.1  # share of its difference at the anchor that a better place may have
+_LEFT = 0.3  # share of what it differs by beyond the anchor's difference that a better place may leave
 _GRIDS = (6.0, 1.0), (1.0, 0.5), (0.5, 0.25)  # reach and spacing of the places, in radii of the group
 _INSIDE = 0.5  # share of the points that a place must keep in the pictures
 
@@ -94,7 +93,7 @@ def searched(discovery: Discovery, now: Frame, anchor: Frame, blend: Blend) -> H
             places = best + np.float32(group.radius) * _grid(reach, spacing)
             at = costs(moved, now, places)
             best, there = places[at.argmin()][None], at.min()
-        if there <= min(_BETTER * here, _AS_USUAL * usual):
+        if there <= usual + _LEFT * (here - usual):  # what hides some of it is part of what is usual
             shifts |= dict.fromkeys(group.parts.tolist(), best[0])
     if not shifts:
         return predicted
