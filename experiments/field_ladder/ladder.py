@@ -142,7 +142,8 @@ def figure(rows: list[dict[str, Any]], path: Path) -> None:
     scores = {"miou_3d": "mIoU of views, 3D query", "miou_2d": "2D query", "gaussian_iou": "IoU of Gaussians"}
     scenes = list(dict.fromkeys(row["scene"] for row in rows))
     drawing = Figure(figsize=(4 * len(scenes), 4), dpi=110, layout="constrained")
-    for axes, scene in zip(np.atleast_1d(drawing.subplots(1, len(scenes))), scenes, strict=True):
+    panels = np.atleast_1d(drawing.subplots(1, len(scenes)))
+    for axes, scene in zip(panels, scenes, strict=True):
         mine = [row for row in rows if row["scene"] == scene]
         presets = list(dict.fromkeys(row["preset"] for row in mine))
         groups = [[row for row in mine if row["preset"] == preset] for preset in presets]
@@ -160,5 +161,5 @@ def figure(rows: list[dict[str, Any]], path: Path) -> None:
         axes.set(xscale="log", xlabel="seconds")
         axes.set_title(scene, fontsize=9, pad=28)
         axes.grid(alpha=0.3, axis="y")
-    axes.legend(fontsize=8)
+    panels[0].legend(fontsize=8)
     drawing.savefig(path, format=path.suffix.removeprefix(".") or "png")
