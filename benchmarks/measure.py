@@ -40,7 +40,7 @@ class Timed:
     exp_floors: float  # the median as a multiple of it
     copy_floor_ms: float
     copy_floors: float
-    product_floors: float | None  # of features: their matrix products; None for colours alone
+    product_floors: float | None  # of the features' matrix products, forward and backward; else None
     compile_s: float
     memory_gib: float
     pairs: int  # Gaussian-tile pairs drawn
@@ -165,7 +165,8 @@ def measure(
     for name, (seconds, pairs) in timed.items():
         median, p95 = median_and_p95(seconds)
         exp_ms, copy_ms = floor.exp_ms(boxes), floor.copy_ms(compiled[name].traffic)
-        product_ms = floor.product_ms(pairs * tile.tile_pixels, workload.channels, PRODUCTS.get(name, 0))
+        pixel_pairs = pairs * tile.tile_pixels
+        product_ms = floor.product_ms(pixel_pairs, workload.channels, PRODUCTS.get(name, 0))
         rows.append(
             Timed(
                 workload=workload.name,
@@ -185,7 +186,7 @@ def measure(
                 compile_s=compiled[name].seconds,
                 memory_gib=compiled[name].memory / GIB,
                 pairs=pairs,
-                pixel_pairs=pairs * tile.tile_pixels,
+                pixel_pairs=pixel_pairs,
                 rectangle_pairs=boxes,
                 ns_per_rectangle_pixel=1e6 * median / max(boxes * TILE * TILE, 1),
                 noisy=not is_calm(before, after),

@@ -129,7 +129,7 @@ def distill(
             outlines of masks, "auto" (classes where there are masks, else closed), a folder of feature files,
             a `TeacherChoice` with weights of CLIP or SAM, or a custom `Teacher` of the same photographs.
             Outputs of encoders and segmenters are cached in the user's cache folder.
-        config: settings (default: `PRESETS["field"]` of `gsjax.methods.distill`, which takes under a minute;
+        config: settings (default: `PRESETS["field"]` of `gsjax.methods.distill`, which takes a minute or two;
             `DistillConfig()` has the paper's).
         rasterize_mode: "antialiased" for a scene that was fitted with it.
         after: a tick of an earlier distillation of the same scene and photographs, to continue from.

@@ -141,6 +141,7 @@ def test_calls_are_warmed_up_and_cut_short_when_they_take_long():
 def test_floors():
     assert FLOORS.exp_ms(10) == pytest.approx(1e-6 * 10 * 256)
     assert FLOORS.copy_ms(10**6) == pytest.approx(1.0)
+    assert FLOORS.product_ms(10**6, 5, 1) == pytest.approx(10.0)
     assert between(Floors(1.0, 1.0, 1.0), Floors(4.0, 4.0, 4.0)) == Floors(2.0, 2.0, 2.0)
     assert is_calm(Floors(1.0, 1.0, 1.0), Floors(1.2, 9.0, 9.0))
     assert not is_calm(Floors(1.3, 1.0, 1.0), Floors(1.0, 1.0, 1.0))
@@ -184,6 +185,10 @@ def test_a_noisy_workload_is_measured_again(measured):
 
 def test_every_program_is_measured(measured):
     rows = {row.program: row for row in measured.rows}
+    forward, backward = (rows[name] for name in ("forward", "forward+backward"))
+    ratio = backward.product_floors / forward.product_floors * forward.median_ms / backward.median_ms
+    assert ratio == pytest.approx(1 / 3)  # of the slopes of weights and of features too
+    assert rows["jvp"].product_floors is None
     assert list(rows) == ["forward", "forward+backward", "jvp"]
     for row in rows.values():
         assert row.calls == 2

@@ -26,6 +26,7 @@ from gsjax.methods.parts import (
 )
 from gsjax.methods.parts.discovery import close_frame, join_parts, weights_of_run
 from gsjax.methods.parts.finish import cut_weights, moved_weights, touched_parts
+from gsjax.methods.parts.pictures import Problem
 from gsjax.methods.parts.timeline import apply, parse_script
 from gsjax.scene.feature_grid import FeatureGridConfig
 from gsjax.scene.handles import skin
@@ -189,7 +190,7 @@ def test_what_no_picture_needs_is_given_up(boxes, halves):
     alive = np.asarray(parts.canonical.alive).copy()
     alive[free] = True
     canonical = parts.canonical._replace(alive=jnp.asarray(alive))
-    after = prune_parts(boxes, parts._replace(canonical=canonical), weights, CONFIG)
+    after = prune_parts(Problem(boxes), parts._replace(canonical=canonical), weights, CONFIG)
     assert (free, BACKGROUND) in after.joined
     kept = set(np.unique(np.asarray(after.weights).argmax(-1)).tolist())
     assert kept == set(np.unique(halves.weights.argmax(-1)).tolist())

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gsjax.methods.parts import BACKGROUND, PartsConfig, begin, choose_anchor, moved_pixels
+from gsjax.methods.parts import BACKGROUND, DiscoverConfig, PartsConfig, begin, choose_anchor, moved_pixels
 from gsjax.methods.parts.anchor import Anchor
 from gsjax.methods.parts.discovery import initial_run
 from gsjax.methods.parts.exposure import corrected, exposures_of
@@ -221,3 +221,16 @@ def test_the_exposure_of_each_camera_is_found_whatever_stands_before_it(boxes, p
         assert np.median(off[shown]) < 0.01
     without = np.abs(np.clip(exposed, 0, 1) - np.clip(colors, 0, 1)).max(-1)
     assert np.median(without[shown]) > 0.03
+
+
+def test_exposures_may_be_left_as_they_are(boxes, moved):
+    config = PartsConfig(discover=DiscoverConfig(lift_iterations=1), exposures=False)
+    anchor = choose_anchor(boxes.image, FRAMES, boxes.num_cameras, 0)
+    masks = boxes.masks(boxes.bodies)
+    key = jax.random.key(0)
+    start = begin(boxes, boxes.gaussians, anchor, moved, config, None, key, masks)
+    assert (start.exposures == np.eye(3, 4)).all()
+    assert (
+        begin(boxes, boxes.gaussians, anchor, moved, PartsConfig(), None, key, masks).exposures
+        != start.exposures
+    ).any()

@@ -37,14 +37,13 @@ class DiscoverConfig:
 
 @dataclass(frozen=True)
 class StreamConfig:
-    """Settings of the optimisation of each frame's pose. Pixels are those of pictures of about 320x240, as
-    which larger ones are seen."""
+    """Settings of the optimisation of each frame's pose."""
 
     iterations: int = 60
     """Steps per frame."""
     coarse: float = 0.7
-    """Share of the steps that use coarse pictures, of about 160x120; the others use twice that. The
-    refinement sees whole ones."""
+    """Share of the steps that use coarse pictures, of about 160x120 (half the size of smaller recordings);
+    the others use pictures twice as large."""
     l1_weight: float = 0.8
     """Weight of L1 in the loss (lambda); the remainder is the weight of 1 - SSIM."""
     depth_weight: float = 0.1
@@ -122,7 +121,8 @@ class RefineConfig:
 
 @dataclass(frozen=True)
 class PartsConfig:
-    """Settings of parts."""
+    """Settings of parts. Distances in pixels are in those of pictures of about 320x240, or of the recording
+    if it is smaller."""
 
     discover: DiscoverConfig = field(default_factory=DiscoverConfig)
     stream: StreamConfig = field(default_factory=StreamConfig)

@@ -8,22 +8,20 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from gsjax.geometry.cameras import on_device
 from gsjax.geometry.rotations import quats_to_matrices
 from gsjax.methods.parts.config import PartsConfig, StreamConfig
 from gsjax.methods.parts.discover import centers_of
 from gsjax.methods.parts.discovery import Discovery, join_parts, weights_of_run
-from gsjax.methods.parts.exposure import corrected
-from gsjax.methods.parts.pictures import with_part_masks
+from gsjax.methods.parts.pictures import Problem, coarse_frame, with_part_masks
 from gsjax.methods.parts.refine import RefineParams, refine_step
-from gsjax.methods.parts.sizes import coarse_factor
 from gsjax.methods.parts.stream import Canonical, picture_loss, posed
 from gsjax.methods.parts.trajectory import BACKGROUND, PartScene, Trajectory, trajectory_of
-from gsjax.methods.protocols import SequenceLike
 from gsjax.optim.compiler import host_options
 from gsjax.optim.method import Run
 from gsjax.optim.step import copied
 from gsjax.rasterize.plan import with_room
-from gsjax.scene.frame import Frame, one_camera, part_of
+from gsjax.scene.frame import Frame, one_camera
 from gsjax.scene.handles import HandlePose
 from gsjax.scene.render import plan_render, render
 
@@ -32,15 +30,15 @@ _LEAST_CONTACT = 0.05  # share of a part's neighbours that another part must hav
 _LEAST_WEIGHT = 0.02
 
 
-def begin_refinement(sequence: SequenceLike, run: Run, config: PartsConfig) -> Run:
+def begin_refinement(problem: Problem, run: Run, config: PartsConfig) -> Run:
     """The run before the first step of the refinement, without unneeded parts and with fixed weights.
 
     Args:
-        sequence: the recording.
+        problem: the recording.
         run: a run that has found all frames.
         config: settings.
     """
-    discovery = prune_parts(sequence, run.kept, np.asarray(weights_of_run(run)), config)
+    discovery = prune_parts(problem, run.kept, np.asarray(weights_of_run(run)), config)
     poses = HandlePose(*jax.device_put((discovery.quats, discovery.translations)))
     canonical = discovery.canonical
     params = copied(RefineParams(canonical.movable, canonical.fixed, poses))
@@ -48,7 +46,7 @@ def begin_refinement(sequence: SequenceLike, run: Run, config: PartsConfig) -> R
 
 
 def prune_parts(
-    sequence: SequenceLike, discovery: Discovery, weights: Float[np.ndarray, "M P"], config: PartsConfig
+    problem: Problem, discovery: Discovery, weights: Float[np.ndarray, "M P"], config: PartsConfig
 ) -> Discovery:
     """Removes the parts that no picture needs: from the smallest on, each part joins a part that it touches,
     or the background, whichever raises the loss least, if it rises by less than `unify.least_gain`.
@@ -60,12 +58,12 @@ def prune_parts(
     small weight everywhere, so that moving one part would move all others slightly.
 
     Args:
-        sequence: the recording.
+        problem: the recording.
         discovery: the discovery of all frames.
         weights: weights of the movable Gaussians.
         config: settings.
     """
-    mean_loss = _MeanLoss(sequence, discovery, weights, config)
+    mean_loss = _MeanLoss(problem, discovery, weights, config)
     found, into = weights, np.arange(len(discovery.canonical.alive))
     here, before = mean_loss(weights), None
     while before is None or (into != before).any():
@@ -122,14 +120,14 @@ class _MeanLoss:
 
     def __init__(
         self,
-        sequence: SequenceLike,
+        problem: Problem,
         discovery: Discovery,
         weights: Float[np.ndarray, "M P"],
         config: PartsConfig,
     ):
         self._loss = _compiled_loss(config.stream)
         self._canonical, self._headroom = discovery.canonical, 2 * config.headroom
-        done, count = np.flatnonzero(discovery.done), sequence.num_cameras
+        done, count = np.flatnonzero(discovery.done), problem.sequence.num_cameras
         most = min(_PICTURES // _CAMERAS, len(done))
         frames, cameras_of_one = (
             done[np.linspace(0, len(done) - 1, most).round().astype(int)],
@@ -137,14 +135,13 @@ class _MeanLoss:
         )
         self._pictures: list[tuple[HandlePose, Frame]] = []
         for i, t in enumerate(frames.tolist()):
-            frame = corrected(sequence.frame(t), discovery.exposures)
-            frame = part_of(frame, (), coarse_factor(frame.cameras))
+            frame = coarse_frame(problem, discovery, t)
             cameras = {(i + k * count // cameras_of_one) % count for k in range(cameras_of_one)}
             place = self._canonical, jnp.asarray(weights), discovery.pose(t)
             seen = with_part_masks(frame, *place, blend=config.stream.blend)
             self._pictures += [(discovery.pose(t), one_camera(seen, c)) for c in sorted(cameras)]
         scene = posed(self._canonical, jnp.asarray(weights), discovery.pose(int(done[0])))
-        self._plan = plan_render(scene, frame.cameras, headroom=self._headroom)
+        self._plan = plan_render(scene, on_device(frame.cameras), headroom=self._headroom)
 
     def __call__(self, weights: Float[np.ndarray, "M P"]) -> float:
         losses = []

@@ -41,7 +41,8 @@ def pixel_votes(
     """The sum over the pixels of one camera of their values, weighted by what each Gaussian contributes to
     them, w_i = alpha_i T_i."""
     zeros = jax.device_put(np.zeros((gaussians.num, _CHANNELS), gaussians.means.dtype))
-    votes = [_votes(zeros, gaussians, camera, plan, part.astype(zeros.dtype)) for part in _parts_of(values)]
+    groups = _groups_of_channels(values.astype(zeros.dtype))
+    votes = [_votes(zeros, gaussians, camera, plan, group) for group in groups]
     return np.concatenate(votes, axis=-1)[:, : values.shape[-1]]
 
 
@@ -49,11 +50,11 @@ def drawn_features(
     gaussians: Gaussians, camera: Camera, plan: Plan, features: Float[np.ndarray, "N K"]
 ) -> Float[np.ndarray, "1 H W K"]:
     """What one camera sees of the features of Gaussians, sum_i w_i f_i; the transpose of `pixel_votes`."""
-    drawn = [_drawn(part, gaussians, camera, plan) for part in _parts_of(features)]
+    drawn = [_drawn(group, gaussians, camera, plan) for group in _groups_of_channels(features)]
     return np.concatenate(drawn, axis=-1)[..., : features.shape[-1]]
 
 
-def _parts_of(values: Float[np.ndarray, "... K"]) -> list[Float[np.ndarray, "... channels"]]:
+def _groups_of_channels(values: Float[np.ndarray, "... K"]) -> list[Float[np.ndarray, "... channels"]]:
     """The channels, as many at once as one program takes."""
     count = max(1, -(-values.shape[-1] // _CHANNELS))
     padded = np.zeros((*values.shape[:-1], count * _CHANNELS), values.dtype)

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 import jax.numpy as jnp
 import numpy as np
 
-from gsjax.geometry.cameras import on_device
+from gsjax.geometry.cameras import on_device, resized
 from gsjax.losses.extra import ExtraLosses, named_losses
 from gsjax.methods.parts.config import PartsConfig
 from gsjax.methods.parts.discover import Start
@@ -32,18 +32,18 @@ from gsjax.methods.parts.pictures import (
 from gsjax.methods.parts.refine import RefineBatch, RefineParams, parts_step
 from gsjax.methods.parts.result import PartsResult
 from gsjax.methods.parts.search import searched
-from gsjax.methods.parts.sizes import COARSE, FINE, coarse_factor
+from gsjax.methods.parts.sizes import COARSE, FINE
 from gsjax.methods.parts.stream import StreamBatch, posed
 from gsjax.methods.protocols import SequenceLike
 from gsjax.optim.method import Run
 from gsjax.optim.step import Step
 from gsjax.rasterize.plan import Plan
-from gsjax.scene.frame import one_camera, part_of
+from gsjax.scene.frame import one_camera
 from gsjax.scene.gaussians import Gaussians
 from gsjax.scene.render import plan_render
 
 _LEAST_STEPS, _PASSES = 400, 2  # of the refinement, by default; passes over all pictures
-_SMALLER = 0.5  # share of the refinement in which pictures are no larger than when they were followed
+_SHARE_OF_SMALLER = 0.5  # of the refinement, with pictures no larger than those by which frames were followed
 
 
 @dataclass(frozen=True)
@@ -120,7 +120,7 @@ class Parts:
         if not discovery.is_between_frames and self._step_of_frame(run) == self.config.stream.iterations:
             run = close_frame(run, self.config)
         if run.kept.done.all():
-            run = begin_refinement(problem.sequence, run, self.config)
+            run = begin_refinement(problem, run, self.config)
         return run
 
     def batch(
@@ -203,9 +203,9 @@ class Parts:
     def _shrink(self, problem: Problem, run: Run) -> int:
         """The factor by which the pictures of the refinement's next step are smaller than in the data."""
         done = run.step - self.steps_of_frames(problem)
-        if done >= _SMALLER * self.steps_of_refinement(problem):
+        if done >= _SHARE_OF_SMALLER * self.steps_of_refinement(problem):
             return 1
-        return coarse_factor(stored_frame(problem, run.kept.anchor).cameras) // 2
+        return problem.coarse_factor // 2
 
     def _order_of_all(self, problem: Problem, discovery: Discovery) -> list[tuple[int, int]]:
         frames = tuple(np.flatnonzero(discovery.done).tolist())
@@ -219,9 +219,10 @@ class Parts:
             size = self._size(problem, run)
             if size in run.plans or run.step >= self.total(problem):
                 return {}
-            anchor = part_of(stored_frame(problem, discovery.anchor), (), self._shrink(problem, run))
+            cameras, shrink = stored_frame(problem, discovery.anchor).cameras, self._shrink(problem, run)
+            cameras = resized(cameras, 1 / shrink, cameras.width // shrink, cameras.height // shrink)
             scene = self._posed(discovery, discovery.anchor)
-            return {size: plan_render(scene, on_device(anchor.cameras), headroom=self.config.headroom)}
+            return {size: plan_render(scene, on_device(cameras), headroom=self.config.headroom)}
         stream, plans = self.config.stream, {}
         for size in {self._size(problem, run), COARSE} if stream.past else {self._size(problem, run)}:
             if size not in run.plans:

@@ -2,7 +2,7 @@
 loaded on demand, and cached on the host or on the device while they are needed."""
 
 from dataclasses import dataclass, field
-from functools import lru_cache, partial
+from functools import cached_property, lru_cache, partial
 from typing import NamedTuple
 
 import equinox as eqx
@@ -44,6 +44,12 @@ class Problem:
     whole: dict[int, Frame] = field(default_factory=dict)
     stored: dict[int, Frame] = field(default_factory=dict)
     at_once: bool = False
+
+    @cached_property
+    def coarse_factor(self) -> int:
+        """The factor by which coarse pictures are smaller than those of the data."""
+        height, width = self.sequence.image(0, 0).shape[:2]
+        return coarse_factor(width, height)
 
 
 class Draws(NamedTuple):
@@ -114,7 +120,7 @@ def current_frame(problem: Problem, discovery: Discovery, size: str, blend: Blen
     weights, frame = problem.now.get(size, (None, None))
     if frame is None or weights is not discovery.weights:
         t, whole = discovery.frame, _whole(problem, discovery, discovery.frame)
-        shrink = coarse_factor(whole.cameras)
+        shrink = problem.coarse_factor
         for other, factor, tile in ((COARSE, shrink, COARSE_TILE), (FINE, shrink // 2, 2 * COARSE_TILE)):
             smaller = part_of(whole, (), factor)
             if other == COARSE:
@@ -174,7 +180,7 @@ def any_picture(problem: Problem, discovery: Discovery, t: int, camera: int, shr
         discovery: the exposures.
         t: index of the frame.
         camera: index of the camera.
-        shrink: factor by which the picture is smaller than in the data.
+        shrink: the factor by which the picture is smaller than in the data.
     """
     frame = _in_floats(one_camera(stored_frame(problem, t), camera))
     frame = corrected(part_of(frame, (), shrink), discovery.exposures[camera : camera + 1])
@@ -222,8 +228,7 @@ def _whole(problem: Problem, discovery: Discovery, t: int) -> Frame:
 
 def _coarse_in_bytes(problem: Problem, discovery: Discovery, t: int) -> Frame:
     if t not in problem.past:
-        whole = _whole(problem, discovery, t)
-        problem.past[t] = _on_host(part_of(whole, (), coarse_factor(whole.cameras)))
+        problem.past[t] = _on_host(part_of(_whole(problem, discovery, t), (), problem.coarse_factor))
     return problem.past[t]
 
 
@@ -232,6 +237,6 @@ def _in_floats(frame: Frame) -> Frame:
 
 
 def _on_host(frame: Frame) -> Frame:
-    images = np.round(255 * np.asarray(frame.images)).astype(np.uint8)
+    images = np.round(255 * np.clip(np.asarray(frame.images), 0, 1)).astype(np.uint8)
     rest = jax.tree.map(np.asarray, frame)
     return eqx.tree_at(lambda f: f.images, rest, images)

@@ -27,7 +27,8 @@ class PartsResult(NamedTuple):
         trajectory: poses of the parts at T frames; at rest in frames that were not found yet.
         done: the frames that were found.
         anchor: the canonical frame.
-        pixel: width of a pixel at the moving parts, metres; the error of the poses.
+        pixel: width of a pixel of the pictures by which parts were followed, at the moving parts, metres; the
+            error of the poses.
         blend: how rotations are blended for a Gaussian that follows several parts.
     """
 

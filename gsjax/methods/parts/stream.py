@@ -41,7 +41,7 @@ class Canonical(NamedTuple):
         located: locations of the movable Gaussians in the grid; None if weights are a table.
         centers: positions of the handles, metres.
         radii: radii of the parts around their handles, metres.
-        pixel: width of a pixel at the moving parts, metres.
+        pixel: width of a pixel of fine pictures (`gsjax.methods.parts.sizes`) at the moving parts, metres.
         alive: the slots, of P, that hold a handle; the background's is one of them.
         neighbors: neighbours of each movable Gaussian, as indices into all Gaussians, movable ones first.
     """
