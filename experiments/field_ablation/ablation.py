@@ -93,18 +93,7 @@ PANELS = (
 
 
 def figure(rows: list[dict[str, Any]], path: Path) -> None:
-    """A panel for each score, a bar for each variant: the mean over seeds, each of which is a dot."""
-    from matplotlib.figure import Figure
+    """A panel for each score, a bar for each variant."""
+    from experiments.shared.plots import draw_ablation
 
-    from experiments.shared.plots import draw_variants
-
-    names = list(dict.fromkeys(row["variant"] for row in rows))
-    drawing = Figure(figsize=(14, 1.0 + 0.4 * len(names)), dpi=100, layout="constrained")
-    panels = drawing.subplots(1, len(PANELS), sharey=True)
-    for axes, (key, title) in zip(panels, PANELS, strict=True):
-        each = [[row[key] for row in rows if row["variant"] == name] for name in names]
-        draw_variants(axes, names, [float(np.mean(values)) for values in each], title)
-        for place, values in enumerate(each):
-            axes.plot(values, [place] * len(values), "k.", ms=4)
-    panels[0].invert_yaxis()
-    drawing.savefig(path, format=path.suffix.removeprefix(".") or "png")
+    draw_ablation(rows, PANELS, path)

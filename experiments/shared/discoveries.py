@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,7 @@ from gsjax.engine.parts.run import run as run_parts
 from gsjax.engine.parts.saved import open_parts_run
 from gsjax.engine.parts.start import FIT as FIT  # for settings that differ from it in one thing
 from gsjax.engine.parts.views import part_views
+from gsjax.engine.recording import parse_frames
 from gsjax.methods.parts import PartsConfig, Start, begin, choose_anchor
 from gsjax.metrics.temporal import temporal_scores
 from gsjax.metrics.tracking import relative_motion
@@ -37,17 +39,20 @@ def canonical_of(options: Options, folder: Path) -> Path:
         options: of `gsjax parts`, with an anchor.
         folder: of a cell.
     """
-    assert (options.anchor is not None, options.frames, options.scale) == (True, ":", 1.0)
-    wanted = f"{options.dataset} {options.cameras} {options.eval_cameras} {options.anchor} {options.fit}"
+    assert options.anchor is not None
+    frame = range(sys.maxsize)[parse_frames(options.frames)][options.anchor]  # of the data
+    wanted = f"{options.dataset} {options.cameras} {options.eval_cameras} {frame} {options.fit}"
+    wanted += f" {options.scale} {options.read}"
     path = folder.parent / f"canonical-{hashlib.sha256(wanted.encode()).hexdigest()[:8]}"
     if not (path / "report.html").is_file():
         run_fit(
             FitOptions(
                 options.dataset,
                 path,
-                frames=f"{options.anchor}:{options.anchor + 1}",
+                frames=f"{frame}:{frame + 1}",
                 cameras=options.cameras,
                 eval_cameras=options.eval_cameras,
+                scale=options.scale,
                 overwrite=True,
                 read=options.read,
                 fit=options.fit,

@@ -181,6 +181,21 @@ def draw_variants(axes: Axes, names: list[str], lengths: list[float], title: str
         axes.axvline(lengths[names.index("all on")], color="#444444", linewidth=1, linestyle=":")
 
 
+def draw_ablation(rows: list[dict[str, Any]], panels: Sequence[tuple[str, str]], path: Path) -> None:
+    """A panel for each score, by key and title, a bar for each variant: the mean over seeds, each of which is
+    a dot."""
+    names = list(dict.fromkeys(row["variant"] for row in rows))
+    drawing = Figure(figsize=(14, 1.0 + 0.4 * len(names)), dpi=100, layout="constrained")
+    places = drawing.subplots(1, len(panels), sharey=True)
+    for axes, (key, title) in zip(places, panels, strict=True):
+        each = [[row[key] or 0.0 for row in rows if row["variant"] == name] for name in names]
+        draw_variants(axes, names, [float(np.mean(values)) for values in each], title)
+        for place, values in enumerate(each):
+            axes.plot(values, [place] * len(values), "k.", ms=4)
+    places[0].invert_yaxis()
+    drawing.savefig(path, format=path.suffix.removeprefix(".") or "png")
+
+
 def _bars(
     axes: Axes, at: Sequence[float], found: list[list[float]], color: str, label: str | None, width: float
 ) -> None:
