@@ -5,6 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
+from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 KINDS = ("prismatic", "revolute")
@@ -78,12 +79,10 @@ def fit_joint(
     tolerance: float = 0.03,
     least_turn_rad: float = 0.05,
 ) -> FittedJoint:
-    """The simplest joint that explains a rigid motion, in closed form.
+    """The simplest joint that explains a rigid motion.
 
-    A prismatic joint is fitted as a line to the path of the points' centroid. A revolute joint takes its axis
-    from the first principal direction of the rotation vectors, each angle from the nearest rotation about
-    that axis, and its point as the one that these rotations keep in place, in the least-squares sense. Both
-    are judged by where they move the part's own points.
+    A prismatic joint is fitted as a line to the path of the points' centroid, a revolute joint to where the
+    points go, in the least-squares sense. Both are judged by where they move the part's own points.
 
     Args:
         motions: rigid motions that take the part from its canonical pose to its pose at each frame, in the
@@ -99,7 +98,7 @@ def fit_joint(
     moved = np.einsum("tij,nj->tni", motions[:, :3, :3], points) + motions[:, None, :3, 3]
     found = {
         "prismatic": _slide(moved - points, points.mean(0)),
-        "revolute": _turn(motions[:, :3, :3], moved.mean(1), points.mean(0)),
+        "revolute": _turn(motions, points),
     }
     errors = {"fixed": _rms(moved - points)}
     for kind, joint in found.items():
@@ -123,18 +122,47 @@ def _slide(shifts: Float[np.ndarray, "frames points 3"], middle: Float[np.ndarra
     return Joint("prismatic", axis, middle, way @ axis)
 
 
-def _turn(
-    rotations: Float[np.ndarray, "frames 3 3"],
-    middles: Float[np.ndarray, "frames 3"],
-    middle: Float[np.ndarray, "3"],
-) -> Joint:
-    axis = _principal(Rotation.from_matrix(rotations).as_rotvec())
-    skew = np.stack([rotations[:, i, j] - rotations[:, j, i] for i, j in ((2, 1), (0, 2), (1, 0))], axis=1)
-    along = np.einsum("i,tij,j->t", axis, rotations, axis)
-    angles = np.unwrap(np.arctan2(skew @ axis, np.trace(rotations, axis1=1, axis2=2) - along))
-    about = Rotation.from_rotvec(angles[:, None] * axis).as_matrix()
+def _turn(motions: Float[np.ndarray, "frames 4 4"], points: Float[np.ndarray, "points 3"]) -> Joint:
+    """The hinge that takes the points nearest to where these motions take them.
+
+    Rotations tell the axis of a wide part well; that of a short handle is told better by the path of its
+    middle. How much each is worth, the errors of a first answer tell. For an axis and a point on it the best
+    angles are known, so four numbers are sought: the axis and the point may go two ways each.
+    """
+    rotations, middle = motions[:, :3, :3], points.mean(0)
+    middles = rotations @ middle + motions[:, :3, 3]
+    spread = np.linalg.cholesky(np.cov(points.T, bias=True) + 1e-12 * np.eye(3))
+    first = _principal(Rotation.from_matrix(rotations).as_rotvec())
+    across = np.linalg.svd(first[None])[2][1:]
+
+    def hinge(found, weight):
+        """Axis, a point on it less the middle, and angles; `weight`: of the middle's path."""
+        axis, offset = first + found[:2] @ across, found[2:] @ across
+        axis /= np.linalg.norm(axis)
+        arms = np.einsum("ti,j->tij", middles - middle - offset, -offset)
+        products = rotations @ spread @ spread.T + weight**2 * arms
+        skew = np.stack([products[:, i, j] - products[:, j, i] for i, j in ((2, 1), (0, 2), (1, 0))], axis=1)
+        along = np.einsum("i,tij,j->t", axis, products, axis)
+        return axis, offset, np.unwrap(np.arctan2(skew @ axis, np.trace(products, 0, 1, 2) - along))
+
+    def errors(found, weight):
+        """By how much the middle is off in each frame, times `weight`, and the points about it."""
+        axis, offset, angles = hinge(found, weight)
+        about = Rotation.from_rotvec(angles[:, None] * axis).as_matrix()
+        return weight * (middles - middle - offset + about @ offset), (rotations - about) @ spread
+
+    def best(found, weight):
+        return least_squares(
+            lambda x: np.concatenate([e.ravel() for e in errors(x, weight)]), found, x_scale="jac"
+        ).x
+
+    about = Rotation.from_rotvec(hinge(np.zeros(4), 0.0)[2][:, None] * first).as_matrix()
     # (I - R)(p - middle) = middle_t - middle; of all p along the axis, the one nearest to the middle.
     offset = np.linalg.lstsq((np.eye(3) - about).reshape(-1, 3), (middles - middle).ravel(), rcond=1e-6)[0]
+    equal = best(np.append(np.zeros(2), across @ offset), 1.0)
+    path, turn = (np.linalg.norm(e) + 1e-7 for e in errors(equal, 1.0))
+    weight = np.clip(turn / path, 0.1, 10.0)
+    axis, offset, angles = hinge(best(equal, weight), weight)
     return Joint("revolute", axis, middle + offset, angles)
 
 
