@@ -4,7 +4,7 @@ there is a field (`gsjax distill`); or Gaussians over time in a deforming scene 
 from dataclasses import dataclass, fields
 from pathlib import Path
 from time import perf_counter
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import tyro
 from rich.console import Console
@@ -60,6 +60,9 @@ class FieldOptions:
     """A picture of the thing to find; with an alpha channel, only its opaque part."""
     top: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
     """Select the N Gaussians with the best scores, instead of those above a threshold."""
+    level: Literal["small", "medium", "large"] | None = None
+    """Level to look on, in a field that was distilled with --level each: small for parts, large for things.
+    Default: the level that the query fits best; for --point, small."""
     within: Annotated[str | None, tyro.conf.arg(metavar="TEXT")] = None
     """Find only what is part of what this text finds: `handle --within drawer`."""
     scene: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
@@ -228,6 +231,7 @@ def _query_deformation(options: Options, console: Console) -> None:
 def _print(question: Question, unit: str, seen_in: str, info: dict[str, Any], seconds: float) -> None:
     """What was found, in a few lines."""
     meant = f", {info['meant']!r}" if info["meant"] and info["meant"] != info["text"] else ""
+    meant += f", on level {info['level']}" if info["level"] else ""
     against = f", against {', '.join(info['against'][:_LISTED])}" if info["against"] else ""
     unit = f" {unit}" if unit else ""
     least = "above" if question.top is None else "at least"
@@ -260,6 +264,7 @@ def _question(options: Options) -> Question:
         camera=options.camera,
         frame=deform.frame,
         frames=deform.frames,
+        level=options.field.level,
         within=options.field.within,
         threshold=gaussians.threshold,
         top=options.field.top,

@@ -50,6 +50,7 @@ class Question:
         frame: frame number, in the recording, of point and box; its Gaussians are written (default: the
             first).
         frames: frames to draw, as a Python slice (default: the held-out ones).
+        level: of a field's features (default: the one that the query fits best; for a point, the smallest).
         within: a text; only what that finds can be found: "handle" within "drawer".
         threshold: score above which a Gaussian is selected (default: by a rule).
         top: number of Gaussians to select, those with the best scores, instead of a threshold.
@@ -69,6 +70,7 @@ class Question:
     camera: str | None = None
     frame: int | None = None
     frames: str | None = None
+    level: str | None = None
     within: str | None = None
     threshold: float | None = None
     top: int | None = None
@@ -150,6 +152,7 @@ class Queryable(ABC):
         origin: what places are relative to, where the scene lies far from 0.
         antialiased: whether the scene is drawn antialiased.
         frame_ids: numbers of the frames; None of a scene that stands still.
+        levels: levels of its features; none where there is one alone.
     """
 
     path: Path
@@ -161,6 +164,7 @@ class Queryable(ABC):
     origin: Float[np.ndarray, "3"] | None = None
     antialiased: bool = False
     frame_ids: tuple[int, ...] | None = None
+    levels: tuple[str, ...] = ()
 
     @abstractmethod
     def frame_of(self, question: Question) -> int:
@@ -184,8 +188,8 @@ class Queryable(ABC):
         """
 
     @abstractmethod
-    def like(self, row: int, frame: int) -> Prompt:
-        """The prompt for what is similar to a Gaussian, by its row."""
+    def like(self, row: int, frame: int, level: str | None) -> Prompt:
+        """The prompt for what is similar to a Gaussian, by its row, on a level (default: the smallest)."""
 
     @abstractmethod
     def scorer(self, prompt: Prompt, frame: int) -> Callable[[], Float[Array, "n"]]:
@@ -292,6 +296,7 @@ def answer(
             "top": question.top,
             "features": run.kind,
             **run.about(question, frame),
+            "level": found.prompt.level,
             "meant": found.prompt.name,
             "against": found.prompt.negatives,
             "threshold": found.threshold.value,
@@ -315,16 +320,17 @@ def asking_of(run: Queryable) -> Asking:
 
     def answered(words: str, question: Question, frame: int, prompt: Prompt) -> Answer:
         found = select(run, question, frame, prompt)
-        return Answer(words, found.scores, *found.threshold, found.seconds)
+        on = "" if prompt.level is None else f" on level {prompt.level}"
+        return Answer(words + on, found.scores, *found.threshold, found.seconds)
 
-    def ask(text: str, frame: int) -> Answer:
-        question = Question(text=text)
+    def ask(text: str, frame: int, level: str | None = None) -> Answer:
+        question = Question(text=text, level=level)
         with one_by_one:  # several pages may query before the encoder is loaded
             prompt = run.prompt(question, frame)
         return answered(text, question, frame, prompt)
 
-    def like(row: int, frame: int) -> Answer:
-        prompt = run.like(row, frame)
+    def like(row: int, frame: int, level: str | None = None) -> Answer:
+        prompt = run.like(row, frame, level)
         meant = "" if prompt.name is None else f" ({prompt.name})"
         return answered(f"like Gaussian {row}{meant}", Question(), frame, prompt)
 
@@ -337,7 +343,7 @@ def asking_of(run: Queryable) -> Asking:
         gaussians = run.at(frame)
         return write_new(files, lambda path: _write_part(path, run, gaussians, selected))
 
-    return Asking(run.hint, ask, like, save)
+    return Asking(run.hint, ask, like, save, run.levels)
 
 
 def write_mask(folder: Path, name: str, mask: Bool[np.ndarray, "h w"]) -> int:

@@ -34,6 +34,7 @@ class Prompt(NamedTuple):
         name: its own or its nearest name; None for a text that an encoder reads.
         min_score: the encoder's own threshold of a cosine; None if it has none.
         rule: name of the rule by which the threshold is 1/2.
+        level: level of the features that they are compared with; None where there are none.
     """
 
     vectors: Float[np.ndarray, "q c"]
@@ -41,6 +42,7 @@ class Prompt(NamedTuple):
     name: str | None = None
     min_score: float | None = None
     rule: str = "better than each negative"
+    level: str | None = None
 
     def scores(self, features: Float[Array, "*n c"]) -> Float[Array, "*n"]:
         """Scores of Gaussians or pixels, higher for a better match; see `relevancy`.

@@ -24,9 +24,12 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy.lib import format as npy
 
+from gsjax.perception.levels import LEVELS, joined_levels
 from gsjax.perception.torch_arrays import read_torch_array
 
-LANGSPLAT_LEVELS = ("default", "small", "medium", "large")
+LANGSPLAT_LEVELS = ("default", *LEVELS)
+EACH = "each"
+"""The level that stands for small, medium and large together."""
 _LAYOUTS = (
     "NAME_s.npy with NAME_f.npy (LangSplat), NAME_fmap_CxHxW.npy or .pt (Feature-3DGS), level_0.npy or "
     "one .npy of all images (LERF), NAME.npy, or NAME.npz with features, or with ids and codebook"
@@ -69,7 +72,8 @@ def read_feature_folder(
         folder: the folder of the files.
         names: names of all images. Suffixes are ignored, and leading folders too where that is unambiguous.
         which: indices of the images to read; with one file per image, only these have to exist. Default: all.
-        level: size of objects to read from LangSplat's files: default, small, medium or large.
+        level: size of objects to read from LangSplat's files: default, small, medium or large; each for the
+            last three, with codebooks as from `joined_levels`.
 
     Raises:
         FileNotFoundError: the folder does not exist, or has no features for an image.
@@ -79,11 +83,16 @@ def read_feature_folder(
     if not folder.is_dir():
         found = "a file" if folder.exists() else "nothing"
         raise FileNotFoundError(f"{folder}: expected a folder of features ({_LAYOUTS}), found {found}")
-    if level not in LANGSPLAT_LEVELS:
-        raise ValueError(f"level: expected one of {', '.join(LANGSPLAT_LEVELS)}, found {level!r}")
+    if level not in (*LANGSPLAT_LEVELS, EACH):
+        raise ValueError(f"level: expected one of {', '.join(LANGSPLAT_LEVELS)} and {EACH}, found {level!r}")
     read: list[PictureFeatures] = []
     for features in _pictures(folder, names, range(len(names)) if which is None else which, level):
         _check(features)
+        if level == EACH and not features.path.name.endswith("_s.npy"):
+            raise ValueError(
+                f"{features.path}: expected LangSplat's NAME_s.npy and NAME_f.npy, which have levels, found "
+                "features on one level; leave out --level"
+            )
         read.append(features)
         if features.dimension != read[0].dimension:
             raise ValueError(
@@ -153,10 +162,13 @@ def _langsplat(rows: Path, level: str) -> PictureFeatures:
     ids, codebook = _load(rows), _load(table)
     _expect(rows, ids, 3, "[4,H,W]")
     _expect(table, codebook, 2, "[n,C]")
-    place = LANGSPLAT_LEVELS.index(level)
-    if len(ids) <= place:
+    places = [LANGSPLAT_LEVELS.index(one) for one in (LEVELS if level == EACH else (level,))]
+    if len(ids) <= max(places):
         raise ValueError(f"{rows}: expected {len(LANGSPLAT_LEVELS)} levels, found {len(ids)}")
-    return PictureFeatures(rows, _rows(rows, ids[place], len(codebook)), codebook.astype(np.float32))
+    wanted, codebook = _rows(rows, ids[places], len(codebook)), codebook.astype(np.float32)
+    if level == EACH:
+        return PictureFeatures(rows, *joined_levels(list(wanted), [codebook] * len(wanted)))
+    return PictureFeatures(rows, wanted[0], codebook)
 
 
 def _channels_first(path: Path) -> PictureFeatures:
@@ -252,7 +264,7 @@ def _expect(path: Path, array: np.ndarray, axes: int, shape: str) -> None:
         )
 
 
-def _rows(path: Path, ids: np.ndarray, count: int) -> Int[np.ndarray, "H W"]:
+def _rows(path: Path, ids: np.ndarray, count: int) -> Int[np.ndarray, "*levels H W"]:
     """Rows of a codebook of `count` rows, checked before the cast to int32, which would wrap large ones."""
     if not np.array_equal(ids, np.rint(ids)):
         raise ValueError(f"{path}: expected rows of the codebook as whole numbers, found fractions")

@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float, Int, Num, UInt8
 from PIL import Image
 
 from gsjax.perception import weights
+from gsjax.perception.levels import labels_on_levels
 from gsjax.perception.masks import Detections, labels_of_masks, name_by_size
 from gsjax.perception.pictures import to_bytes
 
@@ -80,6 +81,16 @@ class SamSegmenter:
             return self._clicked(to_bytes(image))
         found = self.find(image)
         return name_by_size(labels_of_masks(found.masks, found.scores, self.max_fraction), self.min_pixels)
+
+    def levels(self, image: Num[np.ndarray, "H W 3"]) -> Int[np.ndarray, "levels H W"]:
+        """Labels on the levels of `gsjax.perception.levels`, each as without clicks: things, their parts, and
+        the parts of these.
+
+        Args:
+            image: RGB, uint8 or floats 0 to 1.
+        """
+        found = labels_on_levels(self.find(image).masks, self.max_fraction)
+        return np.stack([name_by_size(level, self.min_pixels) for level in found])
 
     def find(self, image: Num[np.ndarray, "H W 3"]) -> Detections:
         """Masks of everything with their boxes, in descending order of score."""

@@ -191,6 +191,11 @@ def test_each_layout_is_recognised_by_its_files(tmp_path):
         np.testing.assert_array_equal(found.codebook, book)
     (large,) = read_feature_folder(tmp_path / "langsplat", ["frame_1.png"], level="large")
     np.testing.assert_array_equal(large.ids, 3)
+    (each,) = read_feature_folder(tmp_path / "langsplat", ["frame_1.png"], level="each")
+    np.testing.assert_array_equal(each.ids, 0)
+    np.testing.assert_array_equal(each.codebook, book[1:].reshape(1, -1))
+    with pytest.raises(ValueError, match=r"frame_1\.npy: .* features on one level"):
+        read_feature_folder(tmp_path / "plain", ["frame_1.png"], level="each")
 
 
 def test_names_in_folders_are_found_too(tmp_path):

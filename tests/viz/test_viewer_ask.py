@@ -25,20 +25,20 @@ class Answers:
     queries are refused."""
 
     def __init__(self):
-        self.asked, self.saved = [], []
+        self.asked, self.saved, self.levels = [], [], ()
 
     def asking(self):
-        return Asking("One of: green", self.ask, self.like, self.save)
+        return Asking("One of: green", self.ask, self.like, self.save, self.levels)
 
-    def ask(self, text, frame):
-        self.asked.append(text)
+    def ask(self, text, frame, level):
+        self.asked.append(text if level is None else (text, level))
         if text != "green":
             raise ValueError(f"no class <{text}>")
         scores = np.repeat([0.1, 0.9] if frame < 2 else [0.9, 0.1], 150)
         return Answer(text, scores, 0.5, "better than each negative", 0.02)
 
-    def like(self, row, frame):
-        self.asked.append(row)
+    def like(self, row, frame, level):
+        self.asked.append(row if level is None else (row, level))
         return Answer(
             f"like {row}", np.repeat([0.9, 0.1] if row < 150 else [0.1, 0.9], 150), 0.5, "Otsu", 0.01
         )
@@ -112,10 +112,10 @@ def test_an_answer_that_comes_late_does_not_replace_a_newer_one(scene, answers):
     begun, go_on = threading.Event(), threading.Event()
     ask = answers.ask
 
-    def slow(text, frame=0):
+    def slow(text, frame=0, level=None):
         begun.set()
         assert go_on.wait(30)
-        return ask(text, frame)
+        return ask(text, frame, level)
 
     answers.ask = slow
     scene = replace(scene, asking=answers.asking())
@@ -160,6 +160,22 @@ def test_the_pick_is_queried_by_its_row_in_the_whole_scene(scene, answers):
         folder._picked = lambda: 7
         folder._ask_similar()
         assert answers.asked[-1] == 157
+
+
+def test_another_level_asks_the_latest_query_again(scene, answers):
+    answers.levels = ("small", "large")
+    scene = replace(scene, asking=answers.asking())
+    with open_viewer(scene, port=0) as viewer, browser(viewer, scene) as (page, _):
+        folder = page._questions
+        folder._text.value = "green"
+        until(lambda: "150 of 300" in folder._count.content)
+        folder._level.value = "large"
+        until(lambda: answers.asked == ["green", ("green", "large")])
+        folder._picked = lambda: 7
+        folder._ask_similar()
+        folder._picked = lambda: 8  # the pick that was asked about counts
+        folder._level.value = "small"
+        until(lambda: answers.asked[2:] == [(7, "large"), (7, "small")])
 
 
 def test_a_moving_scene_can_be_queried(scene, answers):

@@ -149,7 +149,7 @@ class QueryableScene(Queryable):
             raise ValueError(f"{option}: {error} (frame {self.result.timeline.frame_ids[frame]})") from None
         return feature_prompt(self.meaning, feature.astype(np.float64))
 
-    def like(self, row: int, frame: int) -> Prompt:
+    def like(self, row: int, frame: int, level: str | None) -> Prompt:
         return feature_prompt(self.meaning, np.asarray(self._features(frame)[row], np.float64))
 
     def scorer(self, prompt: Prompt, frame: int) -> Callable[[], Float[Array, "n"]]:

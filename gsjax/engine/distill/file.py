@@ -43,6 +43,11 @@ def read_field(path: Path) -> DistillResult:
         raise ValueError(
             f"{path}: about: expected what `gsjax distill` writes, found {brief(error)}; {_AGAIN}"
         ) from error
+    if len(arrays["lift"]) % max(1, len(source.levels)):
+        raise ValueError(
+            f"{path}: lift: expected as many rows for each of the levels {', '.join(source.levels)}, found "
+            f"{len(arrays['lift'])} in all; {_AGAIN}"
+        )
     if config is None:
         _check(path, arrays, {"lift": ("d", "c"), "vectors": ("n", "c")})
         return DistillResult(_field(arrays["vectors"], arrays["lift"]), None, source, scene)

@@ -52,9 +52,13 @@ class QueryableField(Queryable):
             run.labels,
             run.origin,
             run.rasterize_mode == "antialiased",
+            levels=run.stored.levels,
         )
 
     def frame_of(self, question: Question) -> int:
+        if question.level not in (None, *self.levels):
+            there = ", ".join(self.levels) or "none, as this field has one level (gsjax distill --level each)"
+            raise ValueError(f"--level: expected {there}, found {question.level}")
         if question.camera is not None:
             if self.run.photographs is None:
                 raise ValueError(
@@ -68,6 +72,14 @@ class QueryableField(Queryable):
         return self.run.gaussians
 
     def prompt(self, question: Question, frame: int) -> Prompt:
+        prompt = self._prompt(question)
+        level = question.level
+        if level is None and question.point is not None:  # by itself it cannot say how much is meant
+            level = next(iter(self.levels), None)
+        return prompt._replace(level=level or self.run.stored.best_level(prompt.vectors))
+
+    def _prompt(self, question: Question) -> Prompt:
+        """The prompt of a question, for any level."""
         run, source, negatives = self.run, self._source, question.negatives
         if question.text is not None:
             return self._read(question.text, negatives)
@@ -88,11 +100,12 @@ class QueryableField(Queryable):
         against = negatives or ()
         return Prompt(np.stack([vector, *(run.encoder.embed_text(text) for text in against)]), against)
 
-    def like(self, row: int, frame: int) -> Prompt:
-        return Prompt(np.asarray(self.run.stored.direction(row))[None])
+    def like(self, row: int, frame: int, level: str | None) -> Prompt:
+        level = level or next(iter(self.levels), None)
+        return Prompt(np.asarray(self.run.stored.direction(row, level))[None], level=level)
 
     def scorer(self, prompt: Prompt, frame: int) -> Callable[[], Float[Array, "n"]]:
-        return partial(self.run.stored.scores, prompt.vectors)
+        return partial(self.run.stored.scores, prompt.vectors, prompt.level)
 
     def about(self, question: Question, frame: int) -> dict[str, Any]:
         image = None if question.image is None else str(question.image)
@@ -173,7 +186,7 @@ class QueryableField(Queryable):
         return np.asarray(self.run.encoder.embed_objects(image, labels, label))[-1]
 
     def _at_point(self, question: Question) -> np.ndarray:
-        """The field's feature at a pixel, in the teacher's channels."""
+        """The field's feature at a pixel, in the teacher's channels of a level."""
         run, photographs = self.run, self.run.photographs
         assert question.point is not None
         assert question.camera is not None
@@ -196,7 +209,7 @@ class QueryableField(Queryable):
                 f"--point {x:g},{y:g}: expected a pixel that shows the scene, found an empty one; choose "
                 "another"
             )
-        return np.asarray(features[0])
+        return np.asarray(features[0])[run.stored.channels(question.level or next(iter(self.levels), None))]
 
 
 def _index(photographs: Photographs, camera: str) -> int:

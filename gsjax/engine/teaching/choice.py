@@ -7,10 +7,13 @@ from typing import Any, Literal
 from gsjax.engine.options import ClipWeights, SamWeights
 from gsjax.engine.recording import located
 from gsjax.engine.teaching.source import KINDS
+from gsjax.perception.feature_files import EACH
+from gsjax.perception.levels import LEVELS
 
 Masks = Literal["auto", "files", "segment"]
 Second = Literal["none", "maskclip"]
 Level = Literal["default", "small", "medium", "large"]
+Levels = Literal["default", "small", "medium", "large", "each"]
 NO_TEACHER = "none"
 """The value of `features` by which nothing teaches, where a method can do without."""
 OF_CLIP = ("clip", "maskclip")
@@ -30,19 +33,29 @@ class TeacherOptions(SamWeights, ClipWeights):
     """Source of the masks: the recording's own files, or a segmenter without weights. auto: the
     files, or the segmenter if there are none."""
     level: Level = "default"
-    """Size of objects in LangSplat's files."""
+    """Size of objects, in LangSplat's files or of SAM's masks: of those that cover a pixel the largest, the
+    smallest, or one between (medium). default: as the files have it; of SAM's masks, small."""
 
 
 @dataclass(frozen=True)
 class TeacherChoice(TeacherOptions):
     """Which masks and features teach, with what `gsjax distill` alone offers."""
 
+    level: Levels = "default"
+    """Size of objects, in LangSplat's files or of SAM's masks: of those that cover a pixel the largest, the
+    smallest, or one between (medium); each: all three at once, and a query says on which it found what it
+    found. default: as the files have it; of SAM's masks, small."""
     second: Second = "none"
     """Second teacher beside --features clip, which gives one vector per mask: maskclip gives CLIP's vector of
     each patch, from the same --weights. The weight of its loss is --distill.weights.map."""
     snap: int = 0
     """Snap the outlines of masks to edges in the picture up to this many pixels away, for masks with inexact
     outlines, such as those of many segmenters."""
+
+    @property
+    def levels(self) -> tuple[str, ...]:
+        """The levels of the features, one after another in their channels; none where there is one alone."""
+        return LEVELS if self.level == EACH else ()
 
     @property
     def of_files(self) -> bool:
@@ -89,11 +102,14 @@ class TeacherChoice(TeacherOptions):
             )
         if self.snap < 0:
             raise ValueError(f"--snap: expected 0 or more pixels, found {self.snap}")
-        if self.level != "default" and not self.of_files:
+        if self.level != "default" and not self.of_files and self.sam is None:
             raise ValueError(
-                f"--level {self.level}: expected --features FOLDER, with LangSplat's files, found "
+                f"--level {self.level}: expected --features FOLDER, with LangSplat's files, or --sam, found "
                 f"{self.features}"
             )
+        if self.levels and (optional or self.second != "none"):
+            other = "a field (gsjax distill)" if optional else "no --second, whose maps have one level"
+            raise ValueError(f"--level {self.level}: expected {other}; leave it out")
         if self.second != "none" and self.features != "clip":
             raise ValueError(
                 f"--second {self.second}: expected --features clip, which it complements, found "

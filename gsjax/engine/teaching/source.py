@@ -30,11 +30,13 @@ class Source:
         kind: the encoder; "files" for features of an unknown one.
         names: names of the labels, where the features depend on them.
         weights: folder of the encoder's weights, or of the feature files.
+        levels: levels of the features, whose channels follow one another; none where there is one alone.
     """
 
     kind: Kind
     names: Mapping[int, str] = field(default_factory=dict)
     weights: str | None = None
+    levels: tuple[str, ...] = ()
 
     @staticmethod
     def of(stored: Mapping[str, Any]) -> "Source":
@@ -46,7 +48,7 @@ class Source:
         names = {int(label): str(name) for label, name in stored["names"].items()}
         if stored["kind"] not in ABOUT:
             raise ValueError(f"kind: expected one of {', '.join(ABOUT)}, found {stored['kind']!r}")
-        return Source(stored["kind"], names, stored["weights"])
+        return Source(stored["kind"], names, stored["weights"], tuple(map(str, stored.get("levels", ()))))
 
     def plain(self) -> dict[str, Any]:
         """The source as JSON has it."""

@@ -1,7 +1,7 @@
 """The teacher of photographs, which frames of one camera are too: their masks, and features of these."""
 
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -18,8 +18,9 @@ from gsjax.engine.teaching.choice import TeacherChoice
 from gsjax.engine.teaching.source import ABOUT, Source
 from gsjax.methods.distill import Teacher, teacher_of_maps, teacher_of_objects, with_maps
 from gsjax.methods.distill.teacher import UNKNOWN_ID
-from gsjax.methods.protocols import LanguageEncoder, Segmenter
+from gsjax.methods.protocols import LanguageEncoder
 from gsjax.perception.feature_files import PictureFeatures, read_feature_folder
+from gsjax.perception.levels import LEVELS, joined_levels
 from gsjax.perception.outlines import snap_outlines
 from gsjax.perception.segmenters import PieceSegmenter, PlaneOrRegionSegmenter
 
@@ -30,7 +31,7 @@ _VERSION = 2  # of cached outputs; those of other versions are computed again
 
 
 class _View(NamedTuple):
-    """Masks of a photograph.
+    """Masks of a photograph, on one level.
 
     Attributes:
         ids: index in `labels` of each pixel's label; -1 where unknown.
@@ -89,12 +90,13 @@ class Teaching:
         self._segmenter, self._segmenter_key = _segmenter(choice, self.masks)
         views, names = self._views(indices, console), {}
         if views is not None and self.masks == "files" and kind in _OF_OBJECTS:
-            names = _names(views, photographs.label_names)
+            names = _names([view for (view,) in views], photographs.label_names)
         where = Path(choice.features) if kind == "files" else choice.weights
         self.source = Source(
             kind,
             {label + 1: name for label, name in names.items()},
             None if where is None else str(where.resolve()),
+            choice.levels,
         )
         self.about = ABOUT[kind] + (", and its vectors of patches" if choice.second == "maskclip" else "")
         # For an encoder labels are 1 to n, whatever their values; CLIP needs no names.
@@ -129,7 +131,7 @@ class Teaching:
         arrays |= {name: getattr(photographs, name)[self._indices] for name in ("sizes", "Ks", "viewmats")}
         return content_digest("lesson", arrays)
 
-    def _taught(self, views: list[_View] | None, console: Console) -> Teacher:
+    def _taught(self, views: list[list[_View]] | None, console: Console) -> Teacher:
         """The teacher of the training photographs."""
         found = self._features(self._indices, views, console)
         if isinstance(found, Teacher):
@@ -150,7 +152,7 @@ class Teaching:
         return teacher
 
     def _features(
-        self, indices: Sequence[int], views: list[_View] | None, console: Console
+        self, indices: Sequence[int], views: list[list[_View]] | None, console: Console
     ) -> Teacher | _Objects:
         """Features of photographs: a teacher with maps, or vectors of objects."""
         if self.source.kind == "maskclip":
@@ -169,17 +171,21 @@ class Teaching:
             return ids, [one.codebook for one in found]
         assert views is not None
         shown = track(indices, "features", console=console, transient=True)
-        rows = [self._embedded(i, view) for i, view in zip(shown, views, strict=True)]
-        return [view.ids for view in views], rows
+        objects = []
+        for i, levels in zip(shown, views, strict=True):
+            ids, rows = [view.ids for view in levels], [self._embedded(i, view) for view in levels]
+            objects.append((ids[0], rows[0]) if len(levels) == 1 else joined_levels(ids, rows))
+        return [ids for ids, _ in objects], [rows for _, rows in objects]
 
-    def _views(self, indices: Sequence[int], console: Console) -> list[_View] | None:
-        """Masks of photographs; None where features have no need of them."""
+    def _views(self, indices: Sequence[int], console: Console) -> list[list[_View]] | None:
+        """Masks of photographs on each level; None where features have no need of them."""
         if self.masks in ("none", _IN_FILES):
             return None
-        return [self._view(i) for i in track(indices, "masks", console=console, transient=True)]
+        return [self._levels(i) for i in track(indices, "masks", console=console, transient=True)]
 
-    def _view(self, i: int) -> _View:
-        """Masks of a photograph: those of its file, or a segmenter's."""
+    def _levels(self, i: int) -> list[_View]:
+        """Masks of a photograph: those of its file, or a segmenter's, of which SAM's may be on several
+        levels."""
         photographs = self._photographs
         file = photographs.labels(i) if self.masks == "files" else None
         labels = np.full(photographs.sizes[i][::-1], UNKNOWN_ID) if file is None else file.astype(np.int64)
@@ -190,9 +196,13 @@ class Teaching:
             labels = found["labels"].astype(np.int64)
             if self.masks == "sam" or depth is None:  # no background here: 0 is what lies in no mask
                 labels = np.where(labels == 0, UNKNOWN_ID, labels)
+        return [self._view(i, level) for level in labels.reshape(-1, *labels.shape[-2:])]
+
+    def _view(self, i: int, labels: Int[np.ndarray, "h w"]) -> _View:
+        """The masks of labels, of pixels that count."""
         if self._choice.snap:
-            labels = snap_outlines(labels, photographs.image(i), self._choice.snap)
-        if (counted := photographs.mask(i)) is not None:
+            labels = snap_outlines(labels, self._photographs.image(i), self._choice.snap)
+        if (counted := self._photographs.mask(i)) is not None:
             labels = np.where(counted, labels, UNKNOWN_ID)
         there, place = np.unique(np.maximum(labels, UNKNOWN_ID), return_inverse=True)
         unknown = int((there < 0).sum())
@@ -211,7 +221,9 @@ class Teaching:
 
         return self._cache(self._encoder_key, {"image": image, **view._asdict()}, embed)["rows"]
 
-    def _of_patches(self, indices: Sequence[int], views: list[_View] | None, console: Console) -> Teacher:
+    def _of_patches(
+        self, indices: Sequence[int], views: list[list[_View]] | None, console: Console
+    ) -> Teacher:
         """MaskCLIP's maps; masks, if any, define which pixels form one object."""
         from gsjax.perception.maskclip import MaskClipEncoder
 
@@ -289,8 +301,9 @@ def _clip(weights: Path) -> tuple[LanguageEncoder, str]:
         raise ValueError(f"--weights: {error}") from error
 
 
-def _segmenter(choice: TeacherChoice, masks: str) -> tuple[Segmenter | None, str]:
-    """The segmenter, where one is needed, and what identifies it in the cache."""
+def _segmenter(choice: TeacherChoice, masks: str) -> tuple[Callable[..., np.ndarray] | None, str]:
+    """The segmenter, where one is needed, and what identifies it in the cache. Its labels are [H,W], or on
+    each level."""
     if masks in ("files", "none"):
         return None, ""
     if choice.sam is None:
@@ -299,9 +312,13 @@ def _segmenter(choice: TeacherChoice, masks: str) -> tuple[Segmenter | None, str
     from gsjax.perception.sam import load_sam
 
     try:
-        return load_sam(choice.sam), f"sam {folder_digest(choice.sam)}"
+        sam, key = load_sam(choice.sam), f"sam {folder_digest(choice.sam)}"
     except OSError as error:
         raise ValueError(f"--sam: {error}") from error
+    if choice.level == "default":
+        return sam, key
+    which = slice(None) if choice.levels else LEVELS.index(choice.level)
+    return (lambda image, depth, K: sam.levels(image)[which]), f"{key} {choice.level}"
 
 
 def _names(views: list[_View], known: Mapping[int, str]) -> dict[int, str]:
@@ -312,8 +329,8 @@ def _names(views: list[_View], known: Mapping[int, str]) -> dict[int, str]:
     return {0: "background"} | {label: known.get(label, f"object {label}") for label in there}
 
 
-def _ids(views: list[_View] | None) -> list[np.ndarray] | None:
-    return None if views is None else [view.ids for view in views]
+def _ids(views: list[list[_View]] | None) -> list[np.ndarray] | None:
+    return None if views is None else [levels[0].ids for levels in views]
 
 
 def _expect_shape(one: PictureFeatures, photographs: Photographs, i: int) -> None:

@@ -22,6 +22,7 @@ from gsjax.scene.feature_grid import FeatureGrid, Located, locate
 
 FORMAT = 1
 """Format of field.npz."""
+_BEST = 32  # Gaussians by which the level of a query is told
 _UNKNOWN = {"kind": "files", "names": {}, "weights": None}  # an unknown source
 
 
@@ -37,6 +38,10 @@ class DistillResult:
         scene: the scene of the field, as far as it is known: `file`, `sha256`, `num_gaussians`,
             `rasterize_mode` and the options that selected its `photographs`.
         means: centres of the Gaussians to score, metres; None before the scene is loaded.
+
+    A teacher may have features on several levels (`source.levels`: things, their parts, the parts of these),
+    whose channels follow one another. A query is then of one level, `level`; by default, of the one that it
+    fits best.
     """
 
     field: FeatureField
@@ -86,32 +91,76 @@ class DistillResult:
         """The field's feature of each Gaussian; `field.lift` maps it to the teacher's channels."""
         return features_of(*self.placed)
 
-    def direction(self, row: int) -> Float[Array, "d"]:
-        """The feature of a Gaussian in the teacher's channels, of length 1, or 0 where it has none."""
-        directions, lifted = self._directions
+    @property
+    def levels(self) -> tuple[str, ...]:
+        """The levels of the features; none where there is one alone."""
+        return () if self.source is None else tuple(self.source.levels)
+
+    def channels(self, level: str | None) -> slice:
+        """The teacher's channels that are of a level; all of them where there are no levels.
+
+        Args:
+            level: name of the level; None where there are none.
+
+        Raises:
+            ValueError: there is no such level.
+        """
+        if level not in (self.levels or (None,)):
+            there = ", ".join(self.levels) or "none, as these features have no levels"
+            raise ValueError(f"level: expected {there}, found {level}")
+        each = self.field.dimension // max(1, len(self.levels))
+        first = 0 if level is None else each * self.levels.index(level)
+        return slice(first, first + each)
+
+    def direction(self, row: int, level: str | None = None) -> Float[Array, "d"]:
+        """The feature of a Gaussian in the teacher's channels, of length 1, or 0 where it has none.
+
+        Args:
+            row: of the Gaussian.
+            level: of the feature (default: the smallest).
+        """
+        directions, lifted = self._directions(level or next(iter(self.levels), None))
         return jnp.matmul(lifted, directions[row], precision="highest")
 
-    def cosines(self, vectors: Float[ArrayLike, "q d"]) -> Float[Array, "n q"]:
+    def cosines(self, vectors: Float[ArrayLike, "q d"], level: str | None = None) -> Float[Array, "n q"]:
         """Cosines of the features of Gaussians and vectors in the teacher's channels.
 
         Args:
             vectors: vectors, such as the embeddings of texts.
+            level: of the features (default: as `best_level` finds it).
 
         Raises:
-            ValueError: the vectors' number of channels is not the teacher's.
+            ValueError: the vectors' number of channels is not the teacher's, or there is no such level.
         """
-        return cosines_of(*self._directions, self._queries(vectors))
+        queries = self._queries(vectors)
+        return cosines_of(*self._directions(level or self.best_level(queries)), queries)
 
-    def scores(self, vectors: Float[ArrayLike, "q d"]) -> Float[Array, "n"]:
+    def scores(self, vectors: Float[ArrayLike, "q d"], level: str | None = None) -> Float[Array, "n"]:
         """Score of each Gaussian for the first vector, against the others (`relevancy`).
+
+        Args:
+            vectors: the query, then negatives, in the teacher's channels.
+            level: of the features (default: as `best_level` finds it).
+
+        Raises:
+            ValueError: as for `cosines`.
+        """
+        queries = self._queries(vectors)
+        return _scores(*self._directions(level or self.best_level(queries)), queries)
+
+    def best_level(self, vectors: Float[ArrayLike, "q d"]) -> str | None:
+        """The level whose best Gaussians score highest for a query, as in LangSplat (Qin et al. 2024,
+        section 3.4); None where there are no levels.
 
         Args:
             vectors: the query, then negatives, in the teacher's channels.
 
         Raises:
-            ValueError: as for `cosines`.
+            ValueError: the vectors' number of channels is not the teacher's.
         """
-        return _scores(*self._directions, self._queries(vectors))
+        queries = self._queries(vectors)
+        best = {level: float(_best_score(*self._directions(level), queries)) for level in self.levels}
+        return max(best, key=best.__getitem__, default=None)
 
     def query(
         self,
@@ -119,6 +168,7 @@ class DistillResult:
         *,
         negatives: tuple[str, ...] | None = None,
         encoder: LanguageEncoder | None = None,
+        level: str | None = None,
     ) -> Float[Array, "n"]:
         """Score of each Gaussian for a text: the cosine, or the smallest share against one of the negatives,
         which is above 1/2 where the text matches better than each of them.
@@ -127,13 +177,14 @@ class DistillResult:
             text: the text, such as "red can".
             negatives: texts to compare with (default: those of the source; none if it is unknown).
             encoder: encoder of texts in the space of the teacher's features (default: that of the source).
+            level: of the features (default: as `best_level` finds it).
 
         Raises:
             ValueError: the encoder is unknown, does not read the text, or has another dimension.
             FileNotFoundError: the encoder's weights are missing.
         """
         loaded = None if encoder is None else lambda: encoder
-        return self.scores(encoded_prompt(self.source, text, negatives, loaded).vectors)
+        return self.scores(encoded_prompt(self.source, text, negatives, loaded).vectors, level)
 
     def write(self, path: str | os.PathLike) -> None:
         """Write field.npz, which `gsjax query` and `gsjax view` read beside the scene."""
@@ -158,15 +209,23 @@ class DistillResult:
             np.savez_compressed(stream, **arrays, about=np.array(json.dumps(about)))
 
     @cached_property
-    def _directions(self) -> tuple[Float[Array, "n r"], Float[Array, "d r"]]:
-        """All that scores need, made by the first query."""
-        return directions_of(*self.placed)
+    def _known(self) -> dict[str | None, tuple[Float[Array, "n r"], Float[Array, "d r"]]]:
+        return {}
+
+    def _directions(self, level: str | None) -> tuple[Float[Array, "n r"], Float[Array, "d r"]]:
+        """All that scores on a level need, made by the first query."""
+        if level not in self._known:
+            field, located = self.placed
+            of_level = eqx.tree_at(lambda f: f.lift, field, field.lift[self.channels(level)])
+            self._known[level] = directions_of(of_level, located)
+        return self._known[level]
 
     def _queries(self, vectors: Float[ArrayLike, "q d"]) -> Float[Array, "q d"]:
         queries = jnp.asarray(vectors, self.field.lift.dtype)
-        if queries.shape[1] != self.field.dimension:
+        wanted = self.field.dimension // max(1, len(self.levels))
+        if queries.shape[1] != wanted:
             raise ValueError(
-                f"expected a query of {self.field.dimension} numbers, as in this field's features, found "
+                f"expected a query of {wanted} numbers, as in this field's features, found "
                 f"{queries.shape[1]}; use the encoder that the field was distilled from (--weights)"
             )
         return queries
@@ -175,3 +234,10 @@ class DistillResult:
 @jax.jit
 def _scores(directions, lifted, queries):
     return relevancy(cosines_of(directions, lifted, queries))
+
+
+@jax.jit
+def _best_score(directions, lifted, queries):
+    """The mean score of the best Gaussians, as one alone may be by chance."""
+    scores = jnp.nan_to_num(_scores(directions, lifted, queries), nan=-1.0)
+    return jax.lax.top_k(scores, min(_BEST, len(scores)))[0].mean()

@@ -3,6 +3,7 @@
 import math
 import threading
 from collections.abc import Callable
+from functools import partial
 from typing import Any, get_args
 
 import numpy as np
@@ -22,6 +23,7 @@ _SHADE = 0.35  # brightness of Gaussians below the threshold
 _HEAT, _ONLY, _WITHOUT, _SCENE = get_args(Showing)
 _PICK_FIRST = "pick something first: click on it in the view"
 _ASK_FIRST = "enter a query first"
+_BEST_LEVEL = "the best fit"
 
 
 class AskFolder:
@@ -57,6 +59,11 @@ class AskFolder:
             like = gui.add_button(
                 "Find similar to the pick", color="gray", hint="Click on something in the view first"
             )
+            self._level = None
+            if asking.levels:
+                self._level = gui.add_dropdown(
+                    "Level", (_BEST_LEVEL, *asking.levels), hint="Parts of things, or things as a whole"
+                )
             self._status = gui.add_html(markup.as_lines(asking.hint))
             self._threshold = gui.add_slider("Threshold", 0.0, 1.0, 0.01, 0.5)
             self._showing = gui.add_dropdown("Shows", get_args(Showing))
@@ -66,8 +73,11 @@ class AskFolder:
             self._save_status = gui.add_html("")
         self._display_worker = Debouncer(self._update_view, _SETTLE_S, _PATIENCE_S)
         self._query_worker = Debouncer(self._ask, _TYPED_S, math.inf)
+        self._latest: Callable[[], None] = self._query_worker.request  # asks the latest query again
         self._text.on_update(lambda _: self._query_worker.request())
         like.on_click(lambda _: self._ask_similar())
+        if self._level is not None:
+            self._level.on_update(lambda _: self._latest())
         self._threshold.on_update(lambda _: self._display_worker.request())
         self._showing.on_update(lambda _: self._display_worker.request())
         keep.on_click(lambda _: self._save_part("object"))
@@ -79,14 +89,22 @@ class AskFolder:
         self._display_worker.close()
 
     def _ask(self) -> None:
-        text = self._text.value.strip()
-        self._answer((lambda: self._asking.ask(text, self._frame())) if text else None, self._asking.hint)
+        text, self._latest = self._text.value.strip(), self._query_worker.request
+        ask = (lambda: self._asking.ask(text, self._frame(), self._on_level)) if text else None
+        self._answer(ask, self._asking.hint)
 
     def _ask_similar(self) -> None:
         shown = self._picked()
         row = shown if shown is None or self._rows is None else int(self._rows[shown])
-        like = None if row is None else (lambda: self._asking.like(row, self._frame()))
+        like = None if row is None else (lambda: self._asking.like(row, self._frame(), self._on_level))
+        if like is not None:
+            self._latest = partial(self._answer, like, _PICK_FIRST)
         self._answer(like, _PICK_FIRST)
+
+    @property
+    def _on_level(self) -> str | None:
+        """The level to ask on; None for the best."""
+        return None if self._level is None or self._level.value == _BEST_LEVEL else self._level.value
 
     def _answer(self, ask: Callable[[], Answer] | None, otherwise: str) -> None:
         """Ask and show the heat of the answer, unless a newer query arrived meanwhile; runs in its own thread

@@ -146,16 +146,19 @@ class Asking:
 
     Attributes:
         hint: what can be asked for.
-        ask: (text, frame) -> the answer. The frame matters only for features that change over time.
-        like: (row of a Gaussian, frame) -> the answer to "what is similar to it".
+        ask: (text, frame, level) -> the answer. The frame matters only for features that change over time;
+            the level is None for the one that the text fits best.
+        like: (row of a Gaussian, frame, level) -> the answer to "what is similar to it".
         save: (selected Gaussians [N], name, frame) -> the path of a PLY file with the Gaussians as they are
             in that frame; nothing is overwritten.
+        levels: levels of the features, the smallest first; none where there is one alone.
     """
 
     hint: str
-    ask: Callable[[str, int], Answer]
-    like: Callable[[int, int], Answer]
+    ask: Callable[[str, int, str | None], Answer]
+    like: Callable[[int, int, str | None], Answer]
     save: Callable[[Bool[np.ndarray, "n"], str, int], Path]
+    levels: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)

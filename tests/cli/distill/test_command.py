@@ -48,6 +48,7 @@ def test_a_field_never_replaces_its_scene(gsjax, pristine, scene, tmp_path, plac
         (("--scale", 0.01), ("--scale 0.01", "80x60", "1x1")),
         (("--second", "maskclip"), ("--second maskclip", "--features clip", "found auto")),
         (("--level", "small"), ("--level small", "--features FOLDER")),
+        (("--level", "each"), ("--level each", "--features FOLDER", "or --sam")),
     ],
 )
 def test_what_cannot_be_done_is_refused_before_anything_is(

@@ -23,6 +23,15 @@ def encoders(request, monkeypatch):
         "second": ("--features", "clip", "--second", "maskclip", *clip),
         "maskclip": ("--features", "maskclip", *clip),
         "sam": ("--features", "closed", "--sam", request.getfixturevalue("sam_folders")[1]),
+        "levels": (
+            "--features",
+            "clip",
+            *clip,
+            "--sam",
+            request.getfixturevalue("sam_folders")[1],
+            "--level",
+            "each",
+        ),
     }
 
 
@@ -34,6 +43,7 @@ def encoders(request, monkeypatch):
         ("second", "clip", "files", 12),
         ("maskclip", "maskclip", "none", 12),
         ("sam", "closed", "sam", 17),
+        ("levels", "clip", "sam", 36),
     ],
 )
 def test_foundation_models_teach(gsjax, pristine, scene, tmp_path, encoders, name, kind, masks, dimension):
@@ -50,3 +60,4 @@ def test_foundation_models_teach(gsjax, pristine, scene, tmp_path, encoders, nam
     if kind == "clip":
         code, said = gsjax("query", tmp_path / name, "red can", "--threshold", -1)
         assert code == 0, said
+        assert (", on level " in said) == (name == "levels")

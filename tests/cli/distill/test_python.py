@@ -8,6 +8,7 @@ import pytest
 from gsjax.data import open_sequence, photographs_of
 from gsjax.engine.checkpoint import load, save
 from gsjax.engine.distill.file import read_field
+from gsjax.engine.teaching.choice import TeacherChoice
 from gsjax.engine.verbs import distill
 from gsjax.methods.distill import DistillConfig, Teacher, teacher_of_objects
 from gsjax.scene.feature_grid import FeatureGridConfig
@@ -45,6 +46,42 @@ def test_a_scene_and_photographs_make_a_field_that_answers_and_goes_on(shown, tm
     assert (read.source, dict(read.scene)) == (now.result.source, now.result.scene)
     for one, other in zip(read.at(scene.means), now.result.placed, strict=True):
         jax.tree.map(np.testing.assert_array_equal, one, other)
+
+
+def test_features_on_three_levels_are_learned_together(shown, pristine, tmp_path):
+    """Files in LangSplat's layout: objects one by one, can and carton together, and all of them."""
+    scene, photographs = shown
+    codes = np.linalg.qr(np.random.default_rng(0).normal(size=(20, 20)))[0].astype(np.float32)
+    groups = [list(range(8)), [0, 1, 2, 2, 3, 4, 5, 6], [0, 1, 1, 1, 1, 1, 1, 1]]
+    starts = np.cumsum([0, *(max(group) + 1 for group in groups)])
+    for i, name in enumerate(photographs.names):
+        labels = photographs.labels(i).astype(int)
+        rows = [np.array(group)[labels] + start for group, start in zip(groups, starts, strict=False)]
+        file = tmp_path / name
+        file.parent.mkdir(parents=True, exist_ok=True)
+        np.save(file.with_name(f"{file.stem}_s.npy"), np.stack([rows[0], *rows]))
+        np.save(file.with_name(f"{file.stem}_f.npy"), codes[: starts[-1]])
+    teacher = TeacherChoice(str(tmp_path), level="each")
+    config = DistillConfig(start="solve", iterations=0)
+    *_, now = distill(scene, photographs, teacher, config)
+    result = now.result
+    assert result.levels == ("small", "medium", "large")
+    labels = first_picture(pristine)[1]
+    for group, start, level in zip(groups, starts, result.levels, strict=False):
+        for label in (2, 3):
+            wanted = np.array(group)[labels] == group[label]
+            others = [code for code in range(start, start + max(group) + 1) if code != start + group[label]]
+            vectors = codes[[start + group[label], *others]]
+            assert result.best_level(vectors) == level
+            found = np.asarray(result.scores(vectors) > 0.5)
+            assert (found & wanted).sum() / (found | wanted).sum() > 0.7
+            np.testing.assert_array_equal(result.scores(vectors), result.scores(vectors, level))
+    result.write(tmp_path / "field.npz")
+    assert read_field(tmp_path / "field.npz").levels == result.levels
+    with pytest.raises(ValueError, match="level: expected small, medium, large, found huge"):
+        result.scores(codes[:1], "huge")
+    with pytest.raises(ValueError, match=r"expected a query of 20 numbers, .* found 60"):
+        result.scores(np.ones((1, 60)))
 
 
 def test_a_teacher_of_ones_own_needs_an_encoder_for_texts_alone(shown):

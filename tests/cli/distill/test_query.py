@@ -74,6 +74,41 @@ def test_a_text_within_another_finds_what_both_mean(gsjax, field, closed, scene,
     assert "'ball' within 'can' matches nothing in this scene" in said
 
 
+def test_a_query_is_of_the_level_that_it_fits_best_or_of_a_given_one(gsjax, pristine, scene, tmp_path):
+    """On the smallest level a can is a can; on the largest all things are one, but for the background."""
+    book = ClassCodebook(NAMES | {9: "everything"})
+    small = np.stack([book.embed_text(name) for name in LABELS.values()])
+    large = np.stack([book.embed_text("everything" if label else LABELS[label]) for label in LABELS])
+    vectors = np.concatenate([small, (2 * small + large) / 3, large], axis=1)
+    source = Source("classes", NAMES | {9: "everything"}, None, ("small", "medium", "large"))
+    levels = write_made_field(tmp_path / "levels", scene[0], pristine, source, scene[1], vectors)
+    labels = scene[1]
+    for options, level, wanted in (
+        (("can",), "small", labels == CAN),
+        (("everything",), "large", labels > 0),
+        (("can", "--level", "medium"), "medium", labels == CAN),
+        (("can", "--level", "large", "--threshold", 0), "large", labels >= 0),
+    ):
+        code, said = gsjax("query", levels, *options)
+        assert code == 0, said
+        assert f"on level {level}: " in said
+        assert told_of(levels)["level"] == level
+        np.testing.assert_array_equal(found_of(levels)["indices"], np.flatnonzero(wanted))
+    picture = cv2.imread(str(pristine / "seg" / "0" / "000000.png"), cv2.IMREAD_UNCHANGED)
+    y, x = np.argwhere(cv2.erode((picture == CAN).astype(np.uint8), np.ones((5, 5))))[0]
+    at = ("--point", f"{x},{y}", "--camera", 0)
+    for options, level, name in (((), "small", "can"), (("--level", "large"), "large", "everything")):
+        code, said = gsjax("query", levels, *at, *options)
+        assert code == 0, said
+        assert f"'{name}', on level {level}: " in said
+
+
+def test_a_level_that_a_field_has_not(gsjax, field):
+    code, said = gsjax("query", field, "can", "--level", "small")
+    assert code == 2
+    assert "--level: expected none, as this field has one level (gsjax distill --level each)" in said
+
+
 def test_the_best_few_are_found_whatever_their_scores(gsjax, closed, tmp_path):
     closed = shutil.copytree(closed, tmp_path / "closed")
     code, said = gsjax("query", closed, "red", "--top", 7)

@@ -13,6 +13,8 @@ from gsjax.engine.teaching import teaching as field_teacher
 from gsjax.engine.teaching.cache import FeatureCache
 from gsjax.engine.teaching.choice import TeacherChoice
 from gsjax.engine.teaching.teaching import Teaching
+from gsjax.perception.masks import Detections
+from gsjax.perception.sam import SamSegmenter
 
 QUIET = Console(quiet=True)
 
@@ -109,6 +111,49 @@ def test_weights_are_read_once_however_many_pictures_there_are(tmp_path, monkeyp
     monkeypatch.setattr(field_teacher, "folder_digest", lambda path: digested.append(path) or "digest")
     said = taught(photographs([None] * 3), [0, 1, 2], TeacherChoice("closed", sam=weights), tmp_path)
     assert (said.masks, digested) == ("sam", [weights])
+
+
+def test_masks_of_sam_teach_on_all_levels_or_on_one(tmp_path, monkeypatch):
+    """A thing whose left half is a part of it: on the smallest level the right half is the thing alone."""
+    weights = tmp_path / "sam"
+    weights.mkdir()
+    monkeypatch.setattr(field_teacher, "folder_digest", lambda path: "digest")
+    masks = np.zeros((2, 12, 16), bool)
+    masks[0, 2:10, 2:14], masks[1, 4:8, 4:8] = True, True
+
+    class Found(SamSegmenter):
+        def find(self, image):
+            return Detections(np.zeros((2, 4)), np.ones(2), masks)
+
+    monkeypatch.setattr("gsjax.perception.sam.load_sam", lambda path: Found(None, None, None, min_pixels=1))
+    shown = photographs([None] * 2)
+    taught_by = {
+        level: taught(shown, [0, 1], TeacherChoice("closed", sam=weights, level=level), tmp_path)
+        for level in ("default", "small", "medium", "large", "each")
+    }
+    ids = {level: said.teacher.ids[0] for level, said in taught_by.items()}
+    for level, parts in {"default": 2, "small": 2, "medium": 1, "large": 1, "each": 2}.items():
+        np.testing.assert_array_equal(ids[level] >= 0, masks[0])
+        assert len(np.unique(ids[level][masks[0]])) == parts, level
+    assert taught_by["each"].source.levels == ("small", "medium", "large")
+    assert taught_by["small"].source.levels == ()
+    each, one = (taught_by[level].teacher for level in ("each", "small"))
+    assert each.dimension == 3 * one.dimension
+    part, rest = (each.codebook[ids["each"][y, 5]].reshape(3, -1) for y in (5, 9))
+    assert not np.allclose(part[0], part[1])
+    np.testing.assert_allclose(part[1:], rest[1:])
+    assert taught_by["each"].of(1).dimension == each.dimension
+    for options, words in (
+        (
+            {"features": "clip", "weights": weights, "sam": weights, "second": "maskclip"},
+            "expected no --second",
+        ),
+        ({"features": "closed"}, "expected --features FOLDER, with LangSplat's files, or --sam"),
+    ):
+        with pytest.raises(ValueError, match=f"--level each: {words}"):
+            TeacherChoice(**options, level="each").check()
+    with pytest.raises(ValueError, match=r"--level each: expected a field \(gsjax distill\)"):
+        TeacherChoice("closed", sam=weights, level="each").check(optional=True)
 
 
 def test_features_of_files_are_found_by_all_photographs(tmp_path):
