@@ -9,11 +9,7 @@ from typing import Annotated, Any, Literal
 import tyro
 from rich.console import Console
 
-from gsjax.engine.deform.file import NAME as DEFORMATION
-from gsjax.engine.deform.file import read_beside, read_deformation, warn_of_partial
-from gsjax.engine.deform.query import QueryableScene, label_everything
 from gsjax.engine.distill.file import FOLDER
-from gsjax.engine.distill.query import QueryableField
 from gsjax.engine.distill.saved import Whereabouts, field_of, open_field_run
 from gsjax.engine.folder import expect_folder, is_run
 from gsjax.engine.messages import Notes, describe, stage
@@ -21,7 +17,6 @@ from gsjax.engine.options import Common, ObjectText
 from gsjax.engine.program import USER_ERRORS
 from gsjax.engine.query import Question, answer
 from gsjax.engine.records import kind_of
-from gsjax.engine.track.query import ObjectQuery, ask_for_object
 
 HELP = (
     ' In a run of `gsjax track` a text means an object, as in `gsjax query RUN "red can"`; where there is a '
@@ -29,6 +24,7 @@ HELP = (
     "names Gaussians over time, as in `gsjax query RUN tool`, and without a text it labels everything. "
     "Where a tracked run has a field too, RUN/field queries the field."
 )
+DEFORMATION = "deformation.npz"
 _LISTED = 6  # photographs, at most
 
 
@@ -135,7 +131,7 @@ def run(options: Options) -> int:
             return 0
         if field is None and not tracked:
             _expect_track(options.run)
-        ask_for_object(_object_query(options), console)
+        _query_objects(options, console)
     except USER_ERRORS as error:
         folder = options.run / "query"
         if not (folder / "query.json").is_file():
@@ -175,6 +171,10 @@ def _expect_track(path: Path) -> None:
 
 def _query_field(options: Options, path: Path, console: Console) -> None:
     """Query a field."""
+    from gsjax.engine.distill.query import (
+        QueryableField,
+    )  # each kind of run alone, as they are slow to import
+
     begun, folder = perf_counter(), options.run / "query"
     question = _question(options)
     ways = sum(way is not None for way in (question.text, question.image, question.point))
@@ -198,6 +198,9 @@ def _query_field(options: Options, path: Path, console: Console) -> None:
 
 def _query_deformation(options: Options, console: Console) -> None:
     """Query a scene that deforms, or label all of it."""
+    from gsjax.engine.deform.file import read_beside, read_deformation, warn_of_partial
+    from gsjax.engine.deform.query import QueryableScene, label_everything
+
     begun, folder = perf_counter(), options.run / "query"
     reason = "a run of `gsjax deform` has no use for it; leave it out"
     _expect_none_of(reason, options.field, options.track)
@@ -291,8 +294,10 @@ def _numbers(option: str, text: str | None, wanted: str) -> Any:
     return found
 
 
-def _object_query(options: Options) -> ObjectQuery:
-    """The query of a tracked run for an object, checked."""
+def _query_objects(options: Options, console: Console) -> None:
+    """Query a tracked run for an object."""
+    from gsjax.engine.track.query import ObjectQuery, ask_for_object
+
     _expect_none_of(
         f"{options.run} has no field that could be queried so; gsjax distill {options.run} makes one",
         options.gaussians,
@@ -305,7 +310,7 @@ def _object_query(options: Options) -> ObjectQuery:
     camera = options.camera
     if camera is not None and not camera.lstrip("-").isdigit():
         raise ValueError(f"--camera: expected the id of a camera, a number, found {camera!r}")
-    return ObjectQuery(
+    query = ObjectQuery(
         run=options.run,
         text=options.text,
         camera=None if camera is None else int(camera),
@@ -313,3 +318,4 @@ def _object_query(options: Options) -> ObjectQuery:
         debug=options.debug,
         **vars(options.track),
     )
+    ask_for_object(query, console)

@@ -21,7 +21,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
-from scipy.optimize import linear_sum_assignment
 
 from gsjax.data.bop_files import MM, by_number, read_models
 from gsjax.data.errors import COMPLETE, DataError, DataWarning
@@ -308,6 +307,8 @@ def _extend(tracks: list[dict[int, int]], t: int, places: list[int], worlds: lis
     those were last; new tracks take the rest."""
     last = np.array([worlds[u := max(track)][track[u]][:3, 3] for track in tracks]).reshape(-1, 3)
     now = np.array([worlds[t][i][:3, 3] for i in places])
+    from scipy.optimize import linear_sum_assignment  # slow to import
+
     rows, columns = linear_sum_assignment(np.square(last[:, None] - now).sum(-1))
     for row, column in zip(rows, columns, strict=True):
         tracks[row][t] = places[column]

@@ -5,7 +5,6 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
-from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 KINDS = ("prismatic", "revolute")
@@ -155,6 +154,8 @@ def _turn(motions: Float[np.ndarray, "frames 4 4"], points: Float[np.ndarray, "p
         return least_squares(
             lambda x: np.concatenate([e.ravel() for e in errors(x, weight)]), found, x_scale="jac"
         ).x
+
+    from scipy.optimize import least_squares  # slow to import
 
     about = Rotation.from_rotvec(hinge(np.zeros(4), 0.0)[2][:, None] * first).as_matrix()
     # (I - R)(p - middle) = middle_t - middle; of all p along the axis, the one nearest to the middle.

@@ -115,7 +115,7 @@ class Distill:
         expect_finite(gaussians.means)
         config, solved, located, rows, untrained = self.config, None, None, None, None
         if config.start != "random":
-            solved = unsolved(teacher, gaussians.num, config)
+            solved = unsolved(teacher, jnp.asarray(gaussians.means), config)
             config = replace(config, channels=solved.channels)
         if config.iterations:
             untrained, located = init_field(

@@ -150,17 +150,17 @@ def passes(config: DistillConfig) -> int:
     return {"random": 0, "vote": 1, "solve": 2 + config.solve.iterations}[config.start]
 
 
-def unsolved(teacher: Teacher, num: int, config: DistillConfig) -> FeatureField:
+def unsolved(teacher: Teacher, means: Float[Array, "n 3"], config: DistillConfig) -> FeatureField:
     """The field before its first step: vectors of zeros, in the channels of a basis in which the teacher's
     features have `solve.energy` of their squared length.
 
     Args:
         teacher: the teacher's features.
-        num: number of Gaussians.
+        means: centres of the Gaussians, whose precision the field has.
         config: the energy, and the most channels.
     """
-    basis = basis_of(teacher, config)
-    return FeatureField(jnp.zeros((num, basis.shape[1]), basis.dtype), jnp.asarray(basis))
+    basis = jnp.asarray(basis_of(teacher, config), means.dtype)
+    return FeatureField(jnp.zeros((len(means), basis.shape[1]), basis.dtype), basis)
 
 
 def basis_of(teacher: Teacher, config: DistillConfig) -> Float[np.ndarray, "d r"]:
@@ -180,7 +180,7 @@ def basis_of(teacher: Teacher, config: DistillConfig) -> Float[np.ndarray, "d r"
     values, vectors = np.maximum(values[::-1], 0.0), vectors[:, ::-1]
     kept = np.cumsum(values) / max(values.sum(), _LEAST)
     rank = int(np.searchsorted(kept, config.solve.energy)) + 1
-    return vectors[:, : min(rank, config.channels, teacher.dimension)].astype(np.float32)
+    return np.ascontiguousarray(vectors[:, : min(rank, config.channels, teacher.dimension)])
 
 
 def graph_of(means: Float[Array, "n 3"], config: DistillConfig) -> Int[Array, "n k"]:
