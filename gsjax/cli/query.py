@@ -190,10 +190,17 @@ def _query_field(options: Options, path: Path, console: Console) -> None:
         with stage(console, "reading the field"):
             now = Whereabouts(options.field.scene, options.field.images, options.weights)
             found = open_field_run(path, notes, now)
-        info = answer(QueryableField(found), question, folder, notes, console)
+        over_time = None
+        if found.file.with_name("trajectory.npz").is_file():
+            from gsjax.engine.distill.over_time import over_time_of
+
+            over_time = over_time_of(found, notes)
+        info = answer(QueryableField(found, over_time), question, folder, notes, console)
     _print(question, found.unit, "photographs", info, perf_counter() - begun)
     print(f"scene     {found.file}")
-    print(f"query     {folder}: selection.npz, object.ply{', overview.png' if info['pixels'] else ''}")
+    drawn = ", overview.png" if info["pixels"] else ""
+    drawn += ", over_time.npz, video.mp4" if drawn and over_time is not None else ""
+    print(f"query     {folder}: selection.npz, object.ply{drawn}")
 
 
 def _query_deformation(options: Options, console: Console) -> None:

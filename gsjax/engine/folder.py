@@ -34,7 +34,7 @@ _VALUABLE = (
 """Results that make an unfinished run worth keeping."""
 _RESUMED = ("resume/*", "canonical/resume/*", "canonical/scene.ply")
 """What a run resumes from; `gsjax parts` contains a fit, which may be all that is there."""
-OF_QUERY = ("query.json", "selection.npz", "masks", "frames", "video.mp4", "overview.png")
+OF_QUERY = ("query.json", "selection.npz", "over_time.npz", "masks", "frames", "video.mp4", "overview.png")
 OF_QUERY += ("object.ply", "without.ply", "recolored.ply", "moved.ply", f"*{ENDING}")
 """The files that `gsjax query` writes."""
 SCRIPT = "edit.yaml"  # the edits of a film of `gsjax edit`, whose folder it marks

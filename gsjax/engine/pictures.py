@@ -4,8 +4,9 @@ import contextlib
 from collections.abc import Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
 
+import cv2
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Num, UInt8
 from rich.console import Console
 
 from gsjax.engine.folder import RunFolder
@@ -14,7 +15,7 @@ from gsjax.engine.scores import Scores
 from gsjax.engine.views import View
 from gsjax.io.pictures import write_png
 from gsjax.io.video import VideoWriter
-from gsjax.viz.colors import side_by_side, to_uint8
+from gsjax.viz.colors import highlight, side_by_side, to_uint8
 
 PANELS = ("photograph", "rendered", "difference")
 """Captions of the panels of a view, from left to right."""
@@ -22,12 +23,33 @@ RENDERS = 5
 """Number of rendered pictures kept per camera, from the first frame to the last."""
 MAX_VIDEO_HZ = 60.0
 MIN_VIDEO_HZ = 1.0
+_VIDEO_HEIGHT = 480  # smaller pictures are enlarged
 
 
 def frame_rate(times: Float[np.ndarray, "t"]) -> float:
     """Frames per second of a video, near the recording's own."""
     steps = np.diff(np.unique(times))  # photographs may share a time
     return float(np.clip(1 / np.median(steps), MIN_VIDEO_HZ, MAX_VIDEO_HZ)) if len(steps) else MIN_VIDEO_HZ
+
+
+def lit(
+    image: Num[np.ndarray, "h w 3"], mask: Bool[np.ndarray, "h w"], color: tuple[int, int, int]
+) -> UInt8[np.ndarray, "H W 3"]:
+    """The image of a camera with what was found in its colours and the rest dimmed; small pictures are
+    enlarged.
+
+    Args:
+        image: uint8, or floats 0 to 1.
+        mask: where it is.
+        color: of its outline, RGB.
+    """
+    height, width = mask.shape
+    factor = max(1, -(-_VIDEO_HEIGHT // height))
+    size = (width * factor, height * factor)
+    image = cv2.resize(to_uint8(image), size, interpolation=cv2.INTER_CUBIC)
+    # Smooth outlines: a mask's share of each pixel is interpolated, not the mask.
+    soft = cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_CUBIC)
+    return highlight(image, soft > 0.5, color)
 
 
 class Film:

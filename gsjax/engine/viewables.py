@@ -15,6 +15,7 @@ from gsjax.engine.deform.file import NAME as DEFORMATION
 from gsjax.engine.deform.file import read_beside, read_deformation
 from gsjax.engine.deform.query import QueryableScene, probabilities_of
 from gsjax.engine.distill.file import NAME
+from gsjax.engine.distill.over_time import over_time_of
 from gsjax.engine.distill.query import QueryableField
 from gsjax.engine.distill.saved import AS_IT_WAS, FieldRun, Whereabouts, field_of, open_field_run
 from gsjax.engine.files import read_drawable, read_frames, reopen
@@ -97,14 +98,13 @@ def open_viewable(
             f"{path}: expected a run with scene.ply, found none; finish the run with --resume, unless its "
             "command keeps no scene"
         )
-    for file, of_run in (("parts.npz", _of_parts), ("trajectory.npz", _of_track)):
-        if (path / file).is_file():
-            _expect_only((), now, f"{path} is a run that moves")
-            if (field := field_of(path)) is not None:
-                notes.warn(
-                    f"a moving scene cannot be queried; gsjax view {field} shows the scene of its field"
-                )
-            return of_run(path, notes), path
+    if (path / "parts.npz").is_file():
+        _expect_only((), now, f"{path} is a run of `gsjax parts`")
+        if (field := field_of(path)) is not None:
+            notes.warn(f"parts cannot be queried; gsjax view {field} shows the scene of its field")
+        return _of_parts(path, notes), path
+    if (path / "trajectory.npz").is_file():
+        return _of_track(path, notes, now), path
     return _of_fit(path, notes, now, photographs), path
 
 
@@ -150,13 +150,13 @@ def _of_field(path: Path, notes: Notes, now: Whereabouts) -> Viewable:
     )
 
 
-def _field_of_fit(path: Path, notes: Notes, now: Whereabouts) -> FieldRun | None:
-    """The field of a fit's scene, if it has one that can be queried."""
+def _field_of_run(path: Path, notes: Notes, now: Whereabouts, used: tuple[str, ...] = ()) -> FieldRun | None:
+    """The field of a run's scene, if it has one that can be queried; `used` are paths that the run uses."""
     folder = field_of(path)
     if folder is None:
-        _expect_only(("images",), now, f"{path} has no field")
+        _expect_only(used, now, f"{path} has no field")
         return None
-    _expect_only(("images", "weights"), now, f"{path} is a run with its scene")
+    _expect_only((*used, "weights"), now, f"{path} is a run with its scene")
     try:
         run = open_field_run(folder, notes, now, photographs=False)
     except (ValueError, OSError) as error:
@@ -170,7 +170,7 @@ def _field_of_fit(path: Path, notes: Notes, now: Whereabouts) -> FieldRun | None
 
 def _of_fit(path: Path, notes: Notes, now: Whereabouts, shown: bool) -> Viewable:
     """The scene of a run of `gsjax fit`, with its field, and its photographs if they are still there."""
-    field, config = _field_of_fit(path, notes, now), path / "config.yml"
+    field, config = _field_of_run(path, notes, now, used=("images",)), path / "config.yml"
     if field is None:
         gaussians, report = read_drawable(path / "scene.ply")
         labels, origin = report.labels, report.origin
@@ -232,8 +232,10 @@ def _of_deformation(path: Path, notes: Notes, weights: Path | None, shown: bool)
     )
 
 
-def _of_track(path: Path, notes: Notes) -> Viewable:
-    """The scene of a run of `gsjax track` over time, with its cameras if the recording is still there."""
+def _of_track(path: Path, notes: Notes, now: Whereabouts) -> Viewable:
+    """The scene of a run of `gsjax track` over time, with its cameras if the recording is still there; it can
+    be queried if it has a field."""
+    field, asking = _field_of_run(path, notes, now), None
     names: dict[int, str] = {}
     shots, times = None, None
     try:
@@ -246,6 +248,9 @@ def _of_track(path: Path, notes: Notes) -> Viewable:
         recording = saved.recording.judged
         origin = recording.origin
         shots, times = _shots_of_recording(saved.recording), recording.times[: tracking.num_frames]
+        over_time = None if field is None else over_time_of(field, notes)
+        if field is not None and over_time is not None:
+            asking = asking_of(QueryableField(field, over_time))
     count = tracking.scene.num_moving
     return Viewable(
         path.absolute().name,
@@ -257,6 +262,7 @@ def _of_track(path: Path, notes: Notes) -> Viewable:
         shots=shots,
         unit="m",
         origin=origin,
+        asking=asking,
     )
 
 

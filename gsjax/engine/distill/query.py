@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import equinox as eqx
@@ -31,18 +31,31 @@ from gsjax.scene.selection import hidden
 from gsjax.viz.colors import enlarged, heat, highlight, in_rows, to_uint8, with_heat_scale
 from gsjax.viz.viewer.drawing import Drawer, recolored
 
+if TYPE_CHECKING:
+    from gsjax.engine.distill.over_time import OverTime
+else:
+    OverTime = Any  # slow to import, as all that tracks is
+
+MARK = (255, 70, 160)
+"""Colour of the outlines of what was found, RGB."""
+MOST = 0.5
+"""Share of a pixel's light above which it shows what was found."""
 _LEAST_ALPHA = 0.5  # share of a pixel's light that the scene must send
-_MARK = (255, 70, 160)
 _PANEL_HEIGHT = 240  # pixels, at least
-_MOST = 0.5  # share of a pixel's light above which it shows the object
 
 
 class QueryableField(Queryable):
-    """A field and its scene, which stands still: there is one frame, 0."""
+    """A field and its scene: it stands still in one frame, 0, unless the run that tracked it is given.
 
-    def __init__(self, run: FieldRun):
+    Args:
+        run: the field and its scene.
+        over_time: the run that tracked the scene.
+    """
+
+    def __init__(self, run: FieldRun, over_time: OverTime | None = None):
         source = run.stored.source
-        self.run, self._source = run, source
+        self.run, self._source, self._over_time = run, source, over_time
+        self._motion = None if over_time is None else over_time.motion(run.gaussians)
         super().__init__(
             run.path,
             source.kind,
@@ -52,6 +65,7 @@ class QueryableField(Queryable):
             run.labels,
             run.origin,
             run.rasterize_mode == "antialiased",
+            frame_ids=None if over_time is None else over_time.frame_ids,
             levels=run.stored.levels,
         )
 
@@ -69,7 +83,7 @@ class QueryableField(Queryable):
         return 0
 
     def at(self, frame: int) -> Gaussians:
-        return self.run.gaussians
+        return self.run.gaussians if self._motion is None else self._motion.at(frame)
 
     def prompt(self, question: Question, frame: int) -> Prompt:
         prompt = self._prompt(question)
@@ -114,7 +128,8 @@ class QueryableField(Queryable):
     def draw(self, folder: Path, found: Selection, notes: Notes, console: Console) -> dict[str, int]:
         """Writes masks/CAMERA.png, 255 where more than half of a pixel's light comes from the selected
         Gaussians, and overview.png, for the photograph that shows most of them: the photograph, a heat map of
-        the scores, and the scenes with the selected Gaussians removed, alone, recoloured and moved.
+        the scores, and the scenes with the selected Gaussians removed, alone, recoloured and moved. Of a
+        scene that was tracked also what `OverTime.write` writes.
 
         All are drawn by one program for each size of picture, with one colour per Gaussian, because compiling
         takes longer than drawing. Gaussians that should not be seen are made invisible rather than removed,
@@ -135,7 +150,7 @@ class QueryableField(Queryable):
         best: tuple[float, int, np.ndarray] | None = None
         for v in track(which, "drawing", console=console, transient=True):
             drawn = drawer(values, _one(photographs.camera(v))).colors
-            mask = drawn[..., 0] > _MOST
+            mask = drawn[..., 0] > MOST
             pixels[names[v]] = write_mask(folder, names[v], mask)
             if best is None or mask.mean() > best[0]:
                 best = (float(mask.mean()), v, drawn)
@@ -156,7 +171,7 @@ class QueryableField(Queryable):
         threshold = found.threshold.value
         scale = enlarged(heat(drawn[..., 1]), _PANEL_HEIGHT)
         panels = {
-            f"found in view {names[v]}": highlight(behind, drawn[..., 0] > _MOST, _MARK),
+            f"found in view {names[v]}": highlight(behind, drawn[..., 0] > MOST, MARK),
             f"scores; found above {threshold:.2f}": with_heat_scale(scale, low, high, threshold),
         }
         for words, scene in shown.items():
@@ -164,6 +179,9 @@ class QueryableField(Queryable):
         if len(panels) % 2:  # two rows, and no place in them is empty
             panels = {behind_is: behind, **panels}
         write_png(folder / "overview.png", in_rows(panels, len(panels) // 2, _PANEL_HEIGHT))
+        if self._over_time is not None:
+            number = None if question.camera is None else int(question.camera)
+            self._over_time.write(folder, values, selected, number, drawer, console)
         return pixels
 
     def _read(self, text: str, negatives: tuple[str, ...] | None) -> Prompt:

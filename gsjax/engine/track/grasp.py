@@ -18,9 +18,9 @@ from rich.progress import track
 from gsjax.engine.folder import replaced_folder
 from gsjax.engine.messages import Notes
 from gsjax.engine.options import Seeded, checked
-from gsjax.engine.pictures import frame_rate
+from gsjax.engine.pictures import frame_rate, lit
 from gsjax.engine.recording import Recording
-from gsjax.engine.track.query import Answer, ObjectQuery, ask, progress, show
+from gsjax.engine.track.query import Answer, ObjectQuery, ask, progress
 from gsjax.engine.track.saved import SavedRun
 from gsjax.engine.track.views import views
 from gsjax.geometry.cameras import project
@@ -31,7 +31,7 @@ from gsjax.io.video import VideoWriter
 from gsjax.methods.grasping import Grasp, Gripper, best_grasp
 from gsjax.optim.compiler import host_options
 from gsjax.scene.origin import in_world
-from gsjax.viz.colors import captioned
+from gsjax.viz.colors import captioned, label_color
 
 _WRITTEN = ("grasps.npz", "video.mp4", "frame_*.png")
 NOT_THERE = 3  # exit code: no frame has a feasible grasp
@@ -97,7 +97,7 @@ def _write(
     middle = saved.tracking.num_frames // 2
     with VideoWriter(folder / "video.mp4", frame_rate(times)) as video:
         for view in progress(views(saved.tracking, recording), saved, console):
-            picture = show(view, view.groups == answer.group, answer.group)
+            picture = lit(view.image, view.groups == answer.group, label_color(answer.group))
             camera = recording.tracked.viewmats[view.t, 0], recording.tracked.Ks[view.t, 0]
             now = jax.tree.map(lambda a, t=view.t: a[t], grasps)
             zoom = picture.shape[1] / view.groups.shape[1]

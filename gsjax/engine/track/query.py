@@ -5,11 +5,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, NamedTuple
 
-import cv2
 import jax.numpy as jnp
 import numpy as np
 import tyro
-from jaxtyping import Bool, Int
+from jaxtyping import Int
 from rich.console import Console
 from rich.progress import track
 from rich.table import Table
@@ -17,7 +16,7 @@ from rich.table import Table
 from gsjax.engine.folder import OF_QUERY, replaced_folder
 from gsjax.engine.messages import Notes
 from gsjax.engine.options import ClipWeights, Common, ObjectText
-from gsjax.engine.pictures import frame_rate
+from gsjax.engine.pictures import frame_rate, lit
 from gsjax.engine.query import write_mask
 from gsjax.engine.track.saved import SavedRun, open_run
 from gsjax.engine.track.views import views
@@ -28,10 +27,9 @@ from gsjax.methods.protocols import LanguageEncoder
 from gsjax.methods.track import find_object
 from gsjax.perception.closed_vocabulary import ClosedVocabulary
 from gsjax.scene.origin import in_world
-from gsjax.viz.colors import highlight, label_color, to_uint8
+from gsjax.viz.colors import label_color, to_uint8
 
 _CLOSE = 0.02  # a smaller margin is called a close call
-_VIDEO_HEIGHT = 480  # smaller pictures are enlarged
 
 
 @dataclass(frozen=True)
@@ -94,7 +92,7 @@ def ask_for_object(options: ObjectQuery, console: Console) -> None:
                     mask = view.groups == answer.group
                     frame_id = recording.tracked.frame_ids[view.t]
                     pixels.append(write_mask(new, f"{frame_id:06d}", mask))
-                    video.write(show(view, mask, answer.group))
+                    video.write(lit(view.image, mask, label_color(answer.group)))
             found = answer._asdict() | {"label": saved.tracking.scene.label_ids[answer.group]}
             found |= {"text": options.text, "encoder": options.encoder, "camera": camera}
             del found["rows"]  # in selection.npz
@@ -141,23 +139,6 @@ def ask(options: ObjectQuery, console: Console, notes: Notes) -> tuple[SavedRun,
     _print_scores(scores, saved.names[group])
     rows = np.flatnonzero(np.asarray(saved.tracking.scene.labels) == group)
     return saved, Answer(group, saved.names[group], scores, margin, float(min_score), rows)
-
-
-def show(view: View, mask: Bool[np.ndarray, "h w"], group: int) -> np.ndarray:
-    """The image of a camera with the object in its colours and the rest dimmed; small pictures are enlarged.
-
-    Args:
-        view: of one camera.
-        mask: where the object is.
-        group: that of the object, for its colour.
-    """
-    height, width = mask.shape
-    factor = max(1, -(-_VIDEO_HEIGHT // height))
-    size = (width * factor, height * factor)
-    image = cv2.resize(to_uint8(view.image), size, interpolation=cv2.INTER_CUBIC)
-    # Smooth outlines: a mask's share of each pixel is interpolated, not the mask.
-    soft = cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_CUBIC)
-    return highlight(image, soft > 0.5, label_color(group))
 
 
 def progress(frames: Iterator[list[View]], saved: SavedRun, console: Console) -> Iterator[View]:

@@ -8,10 +8,14 @@ import cv2
 import numpy as np
 import pytest
 import yaml
+from rich.console import Console
 
 from gsjax.cli import main
+from gsjax.engine.messages import Notes
 from gsjax.engine.teaching.source import Source
 from gsjax.engine.track.grasp import draw_grasp
+from gsjax.engine.viewables import open_viewable
+from gsjax.io.ply import read_ply
 from gsjax.io.video import read_video_frames
 from gsjax.methods.grasping import Grasp, Gripper
 from gsjax.perception.codebook import ClassCodebook
@@ -72,7 +76,27 @@ def test_a_tracked_run_answers_what_only_its_field_can(gsjax, run, pristine):
     assert code == 0, said
     told = json.loads((run / "query" / "query.json").read_text())
     assert (told["features"], told["threshold"], told["gaussians"]) == ("classes", 0.6, (labels == 3).sum())
-    assert not (run / "query" / "video.mp4").exists()
+    # It is found in all frames, by the Gaussians that carry the field along.
+    with np.load(run / "query" / "over_time.npz") as found, np.load(run / "trajectory.npz") as whole:
+        np.testing.assert_allclose(found["means"], whole["means"][:, labels == 3], atol=1e-6)
+        assert found["frames"].tolist() == [0, 1, 2, 3]
+        masks = [
+            cv2.imread(str(pristine / "seg" / "0" / f"{t:06d}.png"), cv2.IMREAD_UNCHANGED) for t in range(4)
+        ]
+        true = np.array([(mask == 3).sum() for mask in masks])
+        np.testing.assert_allclose(found["pixels"], true, atol=0.5 * true.max())
+    assert read_video_frames(run / "query" / "video.mp4").shape == (4, 480, 640, 3)
+    # The viewer asks it in any frame, and saves what was found as it is there.
+    with Notes(Console(quiet=True)) as notes:
+        scene = open_viewable(run, notes)[0]
+    assert notes.all == []
+    answer = scene.asking.ask("can", 2)
+    np.testing.assert_array_equal(answer.scores > answer.threshold, labels == 3)
+    saved = scene.asking.save(labels == 3, "can", 2)
+    assert saved.name == "can_frame_2.ply"
+    np.testing.assert_allclose(
+        read_ply(saved)[0].means, np.asarray(scene.motion.at(2).means)[labels == 3], atol=1e-6
+    )
 
 
 @pytest.mark.parametrize(("option", "value"), [("--threshold", 0.5), ("--negatives", "x"), ("--scene", "x")])

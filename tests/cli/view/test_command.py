@@ -203,10 +203,10 @@ def test_files_without_gaussians(view, tmp_path):
 
 @pytest.mark.parametrize("option", ["--scene", "--images", "--weights"])
 def test_what_nobody_looks_for_is_refused(view, ply, tracked, option):
-    for path in (ply, tracked):
+    for path, why in ((ply, "is a file"), (tracked, "has no field")):
         code, said = view(path, option, "x")
         assert code == 2
-        assert f"{option}: {path} is" in said
+        assert f"{option}: {path} {why}, to which it does not apply" in said
 
 
 def test_without_viser_it_says_what_to_install(view, ply, monkeypatch):

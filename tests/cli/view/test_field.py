@@ -128,11 +128,27 @@ def test_a_field_of_another_scene_is_not_asked(fitted, asked, tmp_path, notes):
     assert any("its field cannot be queried" in note for note in notes.all)
 
 
-def test_what_moves_says_where_its_field_is_asked(tracked, notes):
+def test_what_was_tracked_is_asked_in_any_frame(tracked, notes):
     source = Source("classes", NAMES)
     labels = np.arange(30) % 2
     field = write_made_field(tracked / "field", tracked / "scene.ply", None, source, labels, CODES)
     scene, _ = open_viewable(tracked, notes)
-    assert scene.asking is None
-    assert any(f"gsjax view {field} shows the scene of its field" in note for note in notes.all)
+    assert scene.motion is not None
+    answers = [scene.asking.ask("can", frame) for frame in range(2)]
+    np.testing.assert_array_equal(answers[0].scores, answers[1].scores)
     assert open_viewable(field, notes)[0].asking is not None
+    told = dict(np.load(field / "field.npz"))
+    np.savez(field / "field.npz", **{**told, "vectors": told["vectors"][:7]})
+    scene, _ = open_viewable(tracked, notes)
+    assert scene.asking is None
+    assert any("its field cannot be queried" in note for note in notes.all)
+
+
+def test_parts_say_where_their_field_is_asked(tracked, notes):
+    field = tracked / "field"
+    field.mkdir()
+    (field / "field.npz").touch()
+    (tracked / "parts.npz").touch()
+    with pytest.raises(ValueError, match=r"parts\.npz"):  # an empty file: what is said before counts here
+        open_viewable(tracked, notes)
+    assert any(f"gsjax view {field} shows the scene of its field" in note for note in notes.all)
