@@ -13,6 +13,8 @@ from jaxtyping import Float, Int, Num
 from gsjax.perception import weights
 from gsjax.perception.pictures import square_crop, to_bytes
 
+_BATCH = 32  # images; SAM finds hundreds of masks in a photograph
+
 
 @dataclass(frozen=True)
 class ClipEncoder:
@@ -34,11 +36,16 @@ class ClipEncoder:
     min_score: float = 0.2
 
     def embed_images(self, images: list[np.ndarray]) -> Float[np.ndarray, "n D"]:
-        """Unit vectors of RGB images [h,w,3], uint8 or floats 0 to 1."""
-        pixels = self.processor([to_bytes(image) for image in images], return_tensors="pt")["pixel_values"]
-        with self.torch.inference_mode():
-            seen = self.model.vision_model(pixel_values=pixels.to(self.device)).pooler_output
-            return _unit(self.model.visual_projection(seen).float().cpu().numpy())
+        """Unit vectors of RGB images [h,w,3], uint8 or floats 0 to 1; a few images at a time are in the
+        model's memory."""
+        vectors = []
+        for first in range(0, len(images), _BATCH):
+            some = [to_bytes(image) for image in images[first : first + _BATCH]]
+            pixels = self.processor(some, return_tensors="pt")["pixel_values"]
+            with self.torch.inference_mode():
+                seen = self.model.vision_model(pixel_values=pixels.to(self.device)).pooler_output
+                vectors.append(self.model.visual_projection(seen).float().cpu().numpy())
+        return _unit(np.concatenate(vectors))
 
     def embed_text(self, text: str) -> Float[np.ndarray, "D"]:
         """The unit vector of a text.

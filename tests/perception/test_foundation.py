@@ -10,7 +10,7 @@ import pytest
 
 from gsjax.extras import MissingExtra
 from gsjax.methods.protocols import DenseEncoder, LanguageEncoder, Segmenter
-from gsjax.perception.clip import load_clip
+from gsjax.perception.clip import ClipEncoder, load_clip
 from gsjax.perception.dinov2 import load_dinov2
 from gsjax.perception.grounded_sam import load_grounded_sam
 from gsjax.perception.maskclip import load_maskclip
@@ -34,6 +34,37 @@ def save_bert_tokenizer(folder):
     words = ["[PAD]", "[UNK]", "[CLS]", "[SEP]", "[MASK]", ".", "?", "object", "can", "red"]
     (folder / "vocab.txt").write_text("\n".join(words))
     BertTokenizer(str(folder / "vocab.txt")).save_pretrained(folder)
+
+
+class Tensor(np.ndarray):
+    """Numbers with what CLIP's adapter asks of a tensor."""
+
+    def to(self, device):
+        return self
+
+    def float(self):
+        return self
+
+    cpu = numpy = float
+
+
+def test_crops_are_encoded_a_few_at_a_time_in_their_order():
+    """With a stand-in for the model, whose vector of an image is its mean colour."""
+    sizes = []
+
+    def mean_color(pixel_values):
+        sizes.append(len(pixel_values))
+        return MagicMock(pooler_output=pixel_values.mean(axis=(1, 2)))
+
+    def processor(images, return_tensors):
+        return {"pixel_values": np.stack(images).astype(np.float32).view(Tensor)}
+
+    model = MagicMock(vision_model=mean_color, visual_projection=lambda seen: seen)
+    images = list(np.random.default_rng(0).integers(0, 256, (70, 5, 6, 3), dtype=np.uint8))
+    found = ClipEncoder(model, processor, None, MagicMock()).embed_images(images)
+    wanted = np.stack(images).mean(axis=(1, 2))
+    np.testing.assert_allclose(found, wanted / np.linalg.norm(wanted, axis=1, keepdims=True), rtol=1e-5)
+    assert sizes == [32, 32, 6]
 
 
 @pytest.fixture(scope="module")
