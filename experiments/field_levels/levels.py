@@ -18,6 +18,7 @@ from gsjax.perception.codebook import ClassCodebook
 from gsjax.perception.levels import LEVELS
 
 BACKGROUND = "background"
+BASES = dict(enumerate(("drawer_base", "laptop_base", "faucet_base", "cabinet_base"), 7))  # in its meta.json
 THINGS = {
     "drawers": ("drawer", "drawer_base"),
     "laptop": ("laptop_lid", "laptop_base"),
@@ -85,7 +86,9 @@ def write_features(scene: FieldScene, folder: Path, seed: int) -> dict[int, str]
     photographs = scene.photographs
     masks = [labels_of(photographs, i) for i in scene.taught]
     count = max(int(mask.max()) for mask in masks) + 1
-    names = {k: photographs.label_names.get(k, f"object {k}") for k in range(count)} | {0: BACKGROUND}
+    names = {0: BACKGROUND, **photographs.label_names, **BASES}
+    assert sorted(names) == list(range(count))
+    names = dict(sorted(names.items()))
     book = ClassCodebook(dict(enumerate(words_of(names), 1)))
     code = {word: np.asarray(book.embed_text(word)) for word in words_of(names)}
     wholes = {part: word for word, parts in (*THINGS.items(), *PAIRS.items()) for part in parts}  # pairs last

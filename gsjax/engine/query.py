@@ -178,6 +178,10 @@ class Queryable(ABC):
     def at(self, frame: int) -> Gaussians:
         """The scene in a frame."""
 
+    def refresh(self) -> None:  # noqa: B027
+        """Read the features again if they have become better meanwhile, as while a field is trained. Others
+        never do."""
+
     @abstractmethod
     def prompt(self, question: Question, frame: int) -> Prompt:
         """The prompt of a question.
@@ -326,10 +330,13 @@ def asking_of(run: Queryable) -> Asking:
     def ask(text: str, frame: int, level: str | None = None) -> Answer:
         question = Question(text=text, level=level)
         with one_by_one:  # several pages may query before the encoder is loaded
+            run.refresh()
             prompt = run.prompt(question, frame)
         return answered(text, question, frame, prompt)
 
     def like(row: int, frame: int, level: str | None = None) -> Answer:
+        with one_by_one:
+            run.refresh()
         prompt = run.like(row, frame, level)
         meant = "" if prompt.name is None else f" ({prompt.name})"
         return answered(f"like Gaussian {row}{meant}", Question(), frame, prompt)

@@ -1,6 +1,7 @@
 """Queries of a field: the Gaussians that match a text, a picture or a point, and pictures of them."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,6 +16,7 @@ from rich.console import Console
 from rich.progress import track
 
 from gsjax.data.photographs import Photographs
+from gsjax.engine.distill.file import NAME, read_field
 from gsjax.engine.distill.saved import FieldRun, short_names
 from gsjax.engine.messages import Notes, describe
 from gsjax.engine.query import SCENE_CAPTIONS, Queryable, Question, Selection, write_mask
@@ -56,6 +58,7 @@ class QueryableField(Queryable):
         source = run.stored.source
         self.run, self._source, self._over_time = run, source, over_time
         self._motion = None if over_time is None else over_time.motion(run.gaussians)
+        self._read_at = _changed_at(run.path / NAME)
         super().__init__(
             run.path,
             source.kind,
@@ -84,6 +87,14 @@ class QueryableField(Queryable):
 
     def at(self, frame: int) -> Gaussians:
         return self.run.gaussians if self._motion is None else self._motion.at(frame)
+
+    def refresh(self) -> None:
+        file = self.run.path / NAME
+        if (changed_at := _changed_at(file)) in (None, self._read_at):
+            return
+        stored = replace(read_field(file), means=self.run.gaussians.means)
+        if stored.scene.get("sha256") == self.run.stored.scene.get("sha256"):
+            self.run, self._read_at = replace(self.run, stored=stored), changed_at
 
     def prompt(self, question: Question, frame: int) -> Prompt:
         prompt = self._prompt(question)
@@ -228,6 +239,11 @@ class QueryableField(Queryable):
                 "another"
             )
         return np.asarray(features[0])[run.stored.channels(question.level or next(iter(self.levels), None))]
+
+
+def _changed_at(file: Path) -> int | None:
+    """When a file was written last; None where it is not."""
+    return file.stat().st_mtime_ns if file.is_file() else None
 
 
 def _index(photographs: Photographs, camera: str) -> int:

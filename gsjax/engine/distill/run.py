@@ -127,7 +127,8 @@ def run(options: Options) -> int:
             """Writes the field of the solution, which can be queried while it is trained further."""
             if now.step == solved < total:
                 _write(folder, now.result)
-                console.print(f"a first answer is there: gsjax query {out} TEXT", soft_wrap=True)
+                words = f"a first answer is there: gsjax query {out} TEXT, or gsjax view {out}"
+                console.print(words, soft_wrap=True)
 
         watch(ticks, progress, schedule, folder, console, budget=budget, evaluate=first_answer)
         steps, result = ticks.run.step, ticks.result

@@ -144,6 +144,18 @@ def test_what_was_tracked_is_asked_in_any_frame(tracked, notes):
     assert any("its field cannot be queried" in note for note in notes.all)
 
 
+def test_a_better_field_that_comes_meanwhile_answers(fitted, asked, notes):
+    """As that of the descent after the solution, while one looks."""
+    asking = open_viewable(fitted, notes)[0].asking
+    before = asking.ask("can", 0).scores
+    told = dict(np.load(asked / "field.npz"))
+    np.savez(asked / "better.npz", **{**told, "vectors": 1 - told["vectors"]})
+    (asked / "better.npz").replace(asked / "field.npz")
+    after = asking.ask("can", 0).scores
+    assert ((before > 0.5) != (after > 0.5)).all()
+    np.testing.assert_array_equal(asking.like(4, 0).scores, asking.like(4, 0).scores)
+
+
 def test_parts_say_where_their_field_is_asked(tracked, notes):
     field = tracked / "field"
     field.mkdir()
