@@ -75,8 +75,8 @@ def asked_of(names: dict[int, str]) -> list[tuple[str, tuple[str, tuple[str, ...
 
 
 def levels_of(level: str, word: str) -> tuple[str, ...]:
-    """The levels on which a word is found: a thing without a pair has no mask on the middle one, which then is
-    as the largest."""
+    """The levels on which a word is found: a thing without a pair has no mask on the middle one, which then
+    is as the largest."""
     alone = level == "large" and not any(part in THINGS[word] for pair in PAIRS.values() for part in pair)
     return ("medium", "large") if alone else (level,)
 
