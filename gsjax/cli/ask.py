@@ -9,7 +9,8 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
-from gsjax.engine.deform.file import NAME, read_deformation, warn_of_partial
+from gsjax.engine.deform.file import read_deformation, warn_of_partial
+from gsjax.engine.folder import DEFORMATION
 from gsjax.engine.messages import Notes, stage
 from gsjax.engine.options import Common
 from gsjax.methods.deform import (
@@ -47,7 +48,7 @@ def run(options: Options) -> int:
     Raises:
         ValueError, OSError: there is no such run, it has no meaning, or the question cannot be answered.
     """
-    path = options.run / NAME
+    path = options.run / DEFORMATION
     result = read_deformation(path)
     if result.meaning is None:
         raise ValueError(

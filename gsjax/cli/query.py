@@ -4,19 +4,20 @@ there is a field (`gsjax distill`); or Gaussians over time in a deforming scene 
 from dataclasses import dataclass, fields
 from pathlib import Path
 from time import perf_counter
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import tyro
 from rich.console import Console
 
 from gsjax.engine.distill.file import FOLDER
 from gsjax.engine.distill.saved import Whereabouts, field_of, open_field_run
-from gsjax.engine.folder import expect_folder, is_run
+from gsjax.engine.folder import DEFORMATION, expect_folder, is_run
 from gsjax.engine.messages import Notes, describe, stage
 from gsjax.engine.options import Common, ObjectText
 from gsjax.engine.program import USER_ERRORS
 from gsjax.engine.query import Question, answer
 from gsjax.engine.records import kind_of
+from gsjax.perception.levels import Level
 
 HELP = (
     ' In a run of `gsjax track` a text means an object, as in `gsjax query RUN "red can"`; where there is a '
@@ -24,7 +25,6 @@ HELP = (
     "names Gaussians over time, as in `gsjax query RUN tool`, and without a text it labels everything. "
     "Where a tracked run has a field too, RUN/field queries the field."
 )
-DEFORMATION = "deformation.npz"
 _LISTED = 6  # photographs, at most
 
 
@@ -56,11 +56,14 @@ class FieldOptions:
     """A picture of the thing to find; with an alpha channel, only its opaque part."""
     top: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
     """Select the N Gaussians with the best scores, instead of those above a threshold."""
-    level: Literal["small", "medium", "large"] | None = None
+    level: Level | None = None
     """Level to look on, in a field that was distilled with --level each: small for parts, large for things.
     Default: the level that the query fits best; for --point, small."""
     within: Annotated[str | None, tyro.conf.arg(metavar="TEXT")] = None
-    """Find only what is part of what this text finds: `handle --within drawer`."""
+    """Find only what is part of what this text finds, on the level that it fits best: `handle --within
+    drawer`."""
+    film: bool = True
+    """Film what was found in the scene of a run of `gsjax track`."""
     scene: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """Present path of the scene's file, if it was moved (default: its first path, or next to the field)."""
     images: Annotated[str | None, tyro.conf.arg(metavar="FOLDER")] = None
@@ -191,7 +194,8 @@ def _query_field(options: Options, path: Path, console: Console) -> None:
             now = Whereabouts(options.field.scene, options.field.images, options.weights)
             found = open_field_run(path, notes, now)
         over_time = None
-        if found.file.with_name("trajectory.npz").is_file():
+        wanted = options.field.film and found.photographs is not None
+        if wanted and found.file.with_name("trajectory.npz").is_file():
             from gsjax.engine.distill.over_time import over_time_of
 
             over_time = over_time_of(found, notes)

@@ -23,6 +23,10 @@ RENDERS = 5
 """Number of rendered pictures kept per camera, from the first frame to the last."""
 MAX_VIDEO_HZ = 60.0
 MIN_VIDEO_HZ = 1.0
+MARK = (255, 70, 160)
+"""Colour of the outline of what was found, RGB."""
+MOST = 0.5
+"""Share of a pixel's light above which it shows what was found."""
 _VIDEO_HEIGHT = 480  # smaller pictures are enlarged
 
 

@@ -127,6 +127,7 @@ class Selection:
         threshold: score above which they are selected, within what the question names.
         selected: which are.
         seconds: time that it took to score all Gaussians.
+        place: what they are within; None for anywhere.
     """
 
     question: Question
@@ -136,6 +137,7 @@ class Selection:
     threshold: Threshold
     selected: Bool[np.ndarray, "n"]
     seconds: float
+    place: "Selection | None" = None
 
 
 @dataclass(eq=False)
@@ -234,8 +236,10 @@ def select(run: Queryable, question: Question, frame: int, prompt: Prompt | None
     begun = perf_counter()
     scores, seconds = np.asarray(score()), perf_counter() - begun
     inside = np.isfinite(scores)
+    place = None
     if question.within is not None:
-        inside &= _place(run, question, frame)
+        place = _place(run, question, frame)
+        inside &= place.selected
     if question.top is None:
         threshold = prompt.threshold(scores[inside], question.threshold)
         selected = inside & (scores > threshold.value)
@@ -244,13 +248,13 @@ def select(run: Queryable, question: Question, frame: int, prompt: Prompt | None
         selected = np.zeros(len(scores), bool)
         selected[best] = True
         threshold = Threshold(float(scores[best].min(initial=np.inf)), f"the {question.top} best")
-    return Selection(question, frame, prompt, scores, threshold, selected, seconds)
+    return Selection(question, frame, prompt, scores, threshold, selected, seconds, place)
 
 
-def _place(run: Queryable, question: Question, frame: int) -> Bool[np.ndarray, "n"]:
-    """The Gaussians within which a question is to be answered."""
-    place = select(run, Question(text=question.within, negatives=question.negatives), frame).selected
-    if not place.any():
+def _place(run: Queryable, question: Question, frame: int) -> Selection:
+    """What a question is to be answered within, on the level that fits it best."""
+    place = select(run, Question(text=question.within, negatives=question.negatives), frame)
+    if not place.selected.any():
         raise ValueError(f"--within {question.within!r}: expected something to look within, found none of it")
     return place
 
@@ -301,6 +305,7 @@ def answer(
             "features": run.kind,
             **run.about(question, frame),
             "level": found.prompt.level,
+            "within_level": None if found.place is None else found.place.prompt.level,
             "meant": found.prompt.name,
             "against": found.prompt.negatives,
             "threshold": found.threshold.value,

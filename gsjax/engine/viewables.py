@@ -11,15 +11,14 @@ import numpy as np
 from gsjax.data.ordered import open_as_sequence
 from gsjax.data.origin import relative_to_origin
 from gsjax.data.photographs import Photographs
-from gsjax.engine.deform.file import NAME as DEFORMATION
 from gsjax.engine.deform.file import read_beside, read_deformation
 from gsjax.engine.deform.query import QueryableScene, probabilities_of
 from gsjax.engine.distill.file import NAME
-from gsjax.engine.distill.over_time import over_time_of
+from gsjax.engine.distill.over_time import OverTime, with_rows_of
 from gsjax.engine.distill.query import QueryableField
 from gsjax.engine.distill.saved import AS_IT_WAS, FieldRun, Whereabouts, field_of, open_field_run
 from gsjax.engine.files import read_drawable, read_frames, reopen
-from gsjax.engine.folder import SCRIPT, expect_run, is_run
+from gsjax.engine.folder import DEFORMATION, SCRIPT, expect_run, is_run
 from gsjax.engine.messages import Notes, describe
 from gsjax.engine.parts.films import edited, read_film
 from gsjax.engine.parts.saved import PartsRun, blend_of, open_parts_run, read_parts
@@ -237,7 +236,7 @@ def _of_track(path: Path, notes: Notes, now: Whereabouts) -> Viewable:
     be queried if it has a field."""
     field, asking = _field_of_run(path, notes, now), None
     names: dict[int, str] = {}
-    shots, times = None, None
+    shots, times, saved = None, None, None
     try:
         saved = open_run(path)
     except ValueError as error:
@@ -248,9 +247,9 @@ def _of_track(path: Path, notes: Notes, now: Whereabouts) -> Viewable:
         recording = saved.recording.judged
         origin = recording.origin
         shots, times = _shots_of_recording(saved.recording), recording.times[: tracking.num_frames]
-        over_time = None if field is None else over_time_of(field, notes)
-        if field is not None and over_time is not None:
-            asking = asking_of(QueryableField(field, over_time))
+    if field is not None:
+        over_time = with_rows_of(field, OverTime(tracking, origin, saved), notes)
+        asking = None if over_time is None else asking_of(QueryableField(field, over_time))
     count = tracking.scene.num_moving
     return Viewable(
         path.absolute().name,

@@ -81,7 +81,8 @@ def fit_joint(
     """The simplest joint that explains a rigid motion.
 
     A prismatic joint is fitted as a line to the path of the points' centroid, a revolute joint to where the
-    points go, in the least-squares sense. Both are judged by where they move the part's own points.
+    points go: to the path of their centroid and to their turn about it, in the least-squares sense, each
+    weighed by how well it is known. Both are judged by where they move the part's own points.
 
     Args:
         motions: rigid motions that take the part from its canonical pose to its pose at each frame, in the
@@ -130,7 +131,8 @@ def _turn(motions: Float[np.ndarray, "frames 4 4"], points: Float[np.ndarray, "p
     """
     rotations, middle = motions[:, :3, :3], points.mean(0)
     middles = rotations @ middle + motions[:, :3, 3]
-    spread = np.linalg.cholesky(np.cov(points.T, bias=True) + 1e-12 * np.eye(3))
+    values, vectors = np.linalg.eigh(np.cov(points.T, bias=True))
+    spread = vectors * np.sqrt(np.maximum(values, 0.0))
     first = _principal(Rotation.from_matrix(rotations).as_rotvec())
     across = np.linalg.svd(first[None])[2][1:]
 

@@ -21,7 +21,7 @@ from pathlib import Path, PurePosixPath
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from numpy.lib import format as npy
 
 from gsjax.perception.levels import LEVELS, joined_levels
@@ -48,12 +48,14 @@ class PictureFeatures:
         ids: row of the codebook for each pixel, [H,W]; -1 where there is none. None for maps.
         codebook: embeddings of the masks, [n,C]. None for maps.
         map: features of the pixels, [h,w,C]. None for masks.
+        filled: with all levels, those on which a pixel has another's mask, [H,W,levels]. None for one level.
     """
 
     path: Path
     ids: Int[np.ndarray, "..."] | None = None
     codebook: Float[np.ndarray, "..."] | None = None
     map: Float[np.ndarray, "..."] | None = None
+    filled: Bool[np.ndarray, "..."] | None = None
 
     @property
     def dimension(self) -> int:
@@ -167,7 +169,8 @@ def _langsplat(rows: Path, level: str) -> PictureFeatures:
         raise ValueError(f"{rows}: expected {len(LANGSPLAT_LEVELS)} levels, found {len(ids)}")
     wanted, codebook = _rows(rows, ids[places], len(codebook)), codebook.astype(np.float32)
     if level == EACH:
-        return PictureFeatures(rows, *joined_levels(list(wanted), [codebook] * len(wanted)))
+        ids, codebook, filled = joined_levels(list(wanted), [codebook] * len(wanted))
+        return PictureFeatures(rows, ids, codebook, filled=filled)
     return PictureFeatures(rows, wanted[0], codebook)
 
 

@@ -1,46 +1,64 @@
-"""Masks on several levels: things, their parts, and the parts of these, as SAM finds them and LangSplat (Qin
-et al. 2024, section 3.2) learns them.
+"""Masks on several levels: things, their parts, and the parts of these. LangSplat (Qin et al. 2024, section
+3.2) keeps three, as SAM finds them.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from typing import Literal, get_args
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-LEVELS = ("small", "medium", "large")
+Level = Literal["small", "medium", "large"]
+LEVELS: tuple[Level, ...] = get_args(Level)
 """Levels by the size of what they hold apart."""
+_WITHIN = 0.8  # share of a mask that lies in a larger one of which it is a part
 
 
 def labels_on_levels(
-    masks: Bool[np.ndarray, "n H W"], max_fraction: float = 1.0
+    masks: Bool[np.ndarray, "n H W"], max_fraction: float = 1.0, min_pixels: int = 1
 ) -> Int[np.ndarray, "levels H W"]:
-    """A label image for each level from masks that may overlap: 0 for background, 1 + the row of the mask
-    elsewhere. Of the masks that cover a pixel, the smallest is its label on the level "small", the largest on
-    "large" and, on "medium", the one half-way between them, of two the larger.
+    """A label image for each level from masks that may overlap: 1 + the row of the mask, 0 where none of that
+    level is. A mask that lies in no other is "large", one that lies in a large one "medium", and all that lie
+    deeper are "small". Of masks of one level, the smaller is on top.
 
     Args:
         masks: masks of one image.
         max_fraction: a mask that covers more of the image is left out.
+        min_pixels: and so is one of fewer pixels.
     """
     areas = masks.sum(axis=(1, 2))
-    kept = np.flatnonzero((areas > 0) & (areas <= max_fraction * masks[0].size if len(masks) else True))
-    order = kept[np.argsort(areas[kept], kind="stable")]
+    size = masks.shape[1] * masks.shape[2]
+    kept = np.flatnonzero((areas >= max(min_pixels, 1)) & (areas <= max_fraction * size))
     labels = np.zeros((len(LEVELS), *masks.shape[1:]), np.int32)
-    count = masks[order].sum(axis=0)
-    wanted = np.stack([np.zeros_like(count), count // 2, count - 1])  # places among those that cover a pixel
-    below = np.zeros_like(count)
-    for row in order:
-        labels[masks[row] & (below == wanted)] = row + 1
-        below += masks[row]
+    depths: dict[int, int] = {}
+    for row in kept[np.argsort(-areas[kept], kind="stable")].tolist():
+        around = [k for k in depths if (masks[row] & masks[k]).sum() >= _WITHIN * areas[row]]
+        depths[row] = max((depths[k] + 1 for k in around), default=0)
+        level = max(0, len(LEVELS) - 1 - depths[row])
+        labels[level][masks[row]] = row + 1
     return labels
+
+
+def labels_on_level(labels: Int[np.ndarray, "levels H W"], level: Level) -> Int[np.ndarray, "H W"]:
+    """Labels on one level; where it has none, those of the next larger level or, without one, of the next
+    smaller.
+
+    Args:
+        labels: on all levels; 0 where there is none.
+        level: the level.
+    """
+    found = labels[LEVELS.index(level)].copy()
+    for other in _instead(LEVELS.index(level), len(labels)):
+        np.copyto(found, labels[other], where=found == 0)
+    return found
 
 
 def joined_levels(
     ids: Sequence[Int[np.ndarray, "H W"]], codebooks: Sequence[Float[np.ndarray, "_ C"]]
-) -> tuple[Int[np.ndarray, "H W"], Float[np.ndarray, "k channels"]]:
+) -> tuple[Int[np.ndarray, "H W"], Float[np.ndarray, "k channels"], Bool[np.ndarray, "H W levels"]]:
     """The masks of all levels as one image of ids: its codebook has the embeddings of a pixel on all levels,
     one after another. On a level where a pixel has no mask it has that of the next larger level or, without
-    one, of the next smaller.
+    one, of the next smaller; these levels are returned too.
 
     Args:
         ids: row of the level's codebook for each pixel; -1 where there is none. The smallest level is first.
@@ -53,9 +71,20 @@ def joined_levels(
     rows = np.where(known[rows], rows, -1)
     filled = rows.copy()
     for level, row in enumerate(filled):
-        for other in (*range(level + 1, len(rows)), *range(level)[::-1]):
+        for other in _instead(level, len(rows)):
             np.copyto(row, rows[other], where=row < 0)
-    combined, place = np.unique(filled.reshape(len(rows), -1).T, axis=0, return_inverse=True)
-    unknown = int(combined[0, 0] < 0) if len(combined) else 0
-    codebook = book[combined[unknown:]].reshape(len(combined) - unknown, -1)
-    return (place.reshape(rows.shape[1:]) - unknown).astype(np.int32), codebook.astype(np.float32)
+    key = np.zeros(rows.shape[1:], np.int64)  # a number for each combination: sorted faster than rows
+    for row in filled:
+        key = key * (len(book) + 1) + row + 1
+    combined, first, place = np.unique(key, return_index=True, return_inverse=True)
+    unknown = int(combined[0] == 0) if len(combined) else 0
+    codebook = book[filled.reshape(len(rows), -1)[:, first[unknown:]].T]
+    codebook = codebook.reshape(len(combined) - unknown, len(rows) * book.shape[1])
+    joined = (place.reshape(rows.shape[1:]) - unknown).astype(np.int32)
+    return joined, codebook.astype(np.float32), np.moveaxis((rows < 0) & (filled >= 0), 0, -1)
+
+
+def _instead(level: int, count: int) -> Iterator[int]:
+    """The levels to turn to where one has no mask."""
+    yield from range(level + 1, count)
+    yield from reversed(range(level))

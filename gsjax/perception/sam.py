@@ -83,14 +83,13 @@ class SamSegmenter:
         return name_by_size(labels_of_masks(found.masks, found.scores, self.max_fraction), self.min_pixels)
 
     def levels(self, image: Num[np.ndarray, "H W 3"]) -> Int[np.ndarray, "levels H W"]:
-        """Labels on the levels of `gsjax.perception.levels`, each as without clicks: things, their parts, and
-        the parts of these.
+        """Labels of everything on the levels of `gsjax.perception.levels`: things, their parts, and the parts
+        of these; 0 where there is none.
 
         Args:
             image: RGB, uint8 or floats 0 to 1.
         """
-        found = labels_on_levels(self.find(image).masks, self.max_fraction)
-        return np.stack([name_by_size(level, self.min_pixels) for level in found])
+        return labels_on_levels(self.find(image).masks, self.max_fraction, self.min_pixels)
 
     def find(self, image: Num[np.ndarray, "H W 3"]) -> Detections:
         """Masks of everything with their boxes, in descending order of score."""

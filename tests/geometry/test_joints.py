@@ -107,7 +107,15 @@ def test_the_path_of_a_short_handle_tells_its_axis():
 
 
 @pytest.mark.parametrize("frames", [1, 2, 12])
-@pytest.mark.parametrize("points", [np.zeros((1, 3)), np.zeros((9, 3)), np.outer(np.arange(9.0), [0, 0, 1])])
+@pytest.mark.parametrize(
+    "points",
+    [
+        np.zeros((1, 3)),
+        np.zeros((9, 3)),
+        np.outer(np.arange(9.0), [0, 0, 1]),
+        np.outer(np.arange(-900.0, 900), [1, 2, 3]),
+    ],
+)
 def test_points_without_extent_and_single_frames(points, frames):
     joint = Joint("revolute", np.array([0.0, 0.0, 1.0]), np.array([0.3, 0.0, 0.0]), np.linspace(0, 1, frames))
     found = fit_joint(joint.motions(), points)

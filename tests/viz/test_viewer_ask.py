@@ -167,6 +167,9 @@ def test_another_level_asks_the_latest_query_again(scene, answers):
     scene = replace(scene, asking=answers.asking())
     with open_viewer(scene, port=0) as viewer, browser(viewer, scene) as (page, _):
         folder = page._questions
+        folder._level.value = "small"  # before anything is asked
+        folder._level.value = "the best fit"
+        assert "One of: green" in folder._status.content
         folder._text.value = "green"
         until(lambda: "150 of 300" in folder._count.content)
         folder._level.value = "large"

@@ -16,7 +16,6 @@ from gsjax.io.parsed import parse_json
 from gsjax.methods.deform import DeformResult, Moving
 from gsjax.scene.deformation import Nodes
 
-NAME = "deformation.npz"
 _AGAIN = "reconstruct it again with this version of gsjax"
 
 

@@ -19,14 +19,14 @@ from gsjax.data.ordered import open_as_sequence
 from gsjax.engine.budget import Budget, note_if_few
 from gsjax.engine.deform.data import Tools, deform_data
 from gsjax.engine.deform.depth import METRIC, Depth, DepthSource, shows_one_object, with_depth
-from gsjax.engine.deform.file import NAME, write_deformation
+from gsjax.engine.deform.file import write_deformation
 from gsjax.engine.deform.poses import as_refined
 from gsjax.engine.deform.results import summarize
 from gsjax.engine.deform.scores import judge
 from gsjax.engine.drive import drive
 from gsjax.engine.ending import exit_code, finish
 from gsjax.engine.files import write_scene
-from gsjax.engine.folder import RunFolder, expect_dataset
+from gsjax.engine.folder import DEFORMATION, RunFolder, expect_dataset
 from gsjax.engine.locks import releasing_locks
 from gsjax.engine.machine import describe as describe_machine
 from gsjax.engine.messages import Notes, counted, stage
@@ -136,7 +136,7 @@ def run(options: Options, by_preset: Callable[[str], Options]) -> int:
         watch(ticks, progress, schedule, folder, console, budget=budget)
         run, result = ticks.run, ticks.result
         data, refined = as_refined(folder, problem, run.params, data, notes)
-        write_deformation(folder.path / NAME, result, sequence.origin, sequence.background)
+        write_deformation(folder.path / DEFORMATION, result, sequence.origin, sequence.background)
         write_scene(folder.scene, jax.device_get(result.at(0.0)), origin=sequence.origin)
         with stage(console, "scoring held-out frames"):
             judged = judge(folder, result, run.plans[PLAN], data, options.tools, budget)

@@ -3,6 +3,7 @@ encoder runs again."""
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
@@ -11,11 +12,11 @@ from rich.console import Console
 from rich.progress import track
 
 from gsjax.data.photographs import photographs_of
-from gsjax.engine.distill.query import MARK, MOST
 from gsjax.engine.distill.saved import FieldRun
 from gsjax.engine.messages import Notes, describe
-from gsjax.engine.pictures import frame_rate, lit
-from gsjax.engine.track.saved import SavedRun, open_run
+from gsjax.engine.pictures import MARK, MOST, frame_rate, lit
+from gsjax.engine.track.loop import Tracking
+from gsjax.engine.track.saved import SavedRun, open_run, read_tracking
 from gsjax.io.atomic import write_npz
 from gsjax.io.video import VideoWriter
 from gsjax.scene.gaussians import Gaussians
@@ -29,15 +30,20 @@ class OverTime:
     """The tracked run whose first frame the scene of a field is.
 
     Attributes:
-        saved: the run.
+        tracking: the scene over time.
+        origin: what its places are relative to, where they lie far from 0.
+        saved: the run with its recording; None where that is gone.
     """
 
-    saved: SavedRun
+    tracking: Tracking
+    origin: Any
+    saved: SavedRun | None
 
     @property
     def frame_ids(self) -> tuple[int, ...]:
-        """Numbers of the frames."""
-        return tuple(self.saved.recording.tracked.frame_ids[: self.saved.tracking.num_frames])
+        """Numbers of the frames in the recording; 0, 1, ... without it."""
+        count = self.tracking.num_frames
+        return tuple(range(count) if self.saved is None else self.saved.recording.tracked.frame_ids[:count])
 
     def motion(self, gaussians: Gaussians) -> Motion:
         """The motion of the scene.
@@ -45,60 +51,98 @@ class OverTime:
         Args:
             gaussians: in the first frame, in any colours.
         """
-        tracking = self.saved.tracking
-        return moved(gaussians, tracking.means()[:, : tracking.scene.num_moving], tracking.quats())
+        moving = self.tracking.scene.num_moving
+        return moved(gaussians, self.tracking.means()[:, :moving], self.tracking.quats())
 
     def write(
         self,
         folder: Path,
-        shares: Gaussians,
+        painted: Gaussians,
         selected: Bool[np.ndarray, "n"],
-        camera: int | None,
+        camera: str | None,
         drawer: Drawer,
+        notes: Notes,
         console: Console,
     ) -> None:
-        """Write video.mp4, the frames of a camera with what was found in its colours and the rest dimmed; and
-        over_time.npz: the number of each frame (`frames`), its time (`times`), the means of what was found
-        [T,n,3], and the number of pixels that show it (`pixels`).
+        """Write over_time.npz: the number of each frame (`frames`), the means of what was found [T,n,3] and,
+        with the recording, the time of each frame (`times`) and the number of pixels that show what was found
+        (`pixels`); and then video.mp4, the frames of a camera with what was found in its colours and the rest
+        dimmed.
 
         Args:
             folder: for the files.
-            shares: the scene; red is 1 in what was found, else 0.
+            painted: the scene; red is 1 in what was found, else 0.
             selected: what was found.
-            camera: its id (default: the first held-out one, else the first tracked).
+            camera: its name (default, and where a photograph of another name was asked about: the first
+                held-out one, else the first tracked).
             drawer: draws the scene.
+            notes: receives a warning where nothing can be filmed.
             console: shows the progress.
         """
-        saved, motion, pixels = self.saved, self.motion(shares), []
-        sequence = saved.seen_by(camera).tracked.select(frames=slice(0, motion.num_frames))
+        arrays: dict[str, np.ndarray] = {"frames": np.array(self.frame_ids)}
+        arrays["means"] = in_world(self.tracking.means()[:, selected], self.origin)
+        if self.saved is not None:
+            try:
+                arrays |= self._film(self.saved, folder / "video.mp4", painted, camera, drawer, console)
+            except (ValueError, OSError) as error:
+                notes.warn(f"what was found is not filmed: {describe(error)}")
+        write_npz(folder / "over_time.npz", arrays)
+
+    def _film(
+        self,
+        saved: SavedRun,
+        path: Path,
+        painted: Gaussians,
+        camera: str | None,
+        drawer: Drawer,
+        console: Console,
+    ) -> dict[str, np.ndarray]:
+        """Writes the video; returns the times of its frames, and the number of pixels."""
+        ids = {str(one): one for one in saved.recording.judged.camera_ids}
+        motion, pixels = self.motion(painted), []
+        sequence = saved.seen_by(ids.get(camera or "")).tracked.select(frames=slice(0, motion.num_frames))
         photographs = photographs_of(sequence)
-        with VideoWriter(folder / "video.mp4", frame_rate(sequence.times)) as video:
+        with VideoWriter(path, frame_rate(sequence.times)) as video:
             for t in track(range(motion.num_frames), "filming", console=console, transient=True):
                 there = jax.tree.map(lambda a: a[None], photographs.camera(t))
                 mask = drawer(motion.at(t), there).colors[..., 0] > MOST
                 pixels.append(int(mask.sum()))
                 video.write(lit(photographs.image(t), mask, MARK))
-        means = in_world(saved.tracking.means()[:, selected], saved.recording.tracked.origin)
-        arrays = {"frames": np.asarray(sequence.frame_ids), "times": sequence.times, "means": means}
-        write_npz(folder / "over_time.npz", arrays | {"pixels": np.array(pixels)})
+        return {"times": np.asarray(sequence.times), "pixels": np.array(pixels)}
 
 
 def over_time_of(run: FieldRun, notes: Notes) -> OverTime | None:
-    """The tracked run of a field's scene; None where there is none, or it cannot be read.
+    """The tracked run of a field's scene; None where the scene is not that of a tracked run.
 
     Args:
         run: the field and its scene.
-        notes: receives a warning where it cannot be read.
+        notes: receives warnings.
     """
     folder = run.file.absolute().parent
     if run.file.name != "scene.ply" or not (folder / "trajectory.npz").is_file():
         return None
     try:
-        saved = open_run(folder)
+        saved: SavedRun | None = open_run(folder)
+    except (ValueError, OSError) as error:
+        notes.warn(f"what is found is not filmed: {describe(error)}")
+        saved = None
+    try:
+        tracking, origin = read_tracking(folder) if saved is None else (saved.tracking, run.origin)
     except (ValueError, OSError) as error:
         notes.warn(f"what is found is not followed over time: {describe(error)}")
         return None
-    if saved.tracking.scene.gaussians.num != run.gaussians.num:
-        notes.warn("what is found is not followed over time: some Gaussians of the run cannot be drawn")
-        return None
-    return OverTime(saved)
+    return with_rows_of(run, OverTime(tracking, origin, saved), notes)
+
+
+def with_rows_of(run: FieldRun, over_time: OverTime, notes: Notes) -> OverTime | None:
+    """The tracked run, if its rows are those of the field; else None, and a warning.
+
+    Args:
+        run: the field and its scene.
+        over_time: the tracked run.
+        notes: receives the warning.
+    """
+    if over_time.tracking.scene.gaussians.num == run.gaussians.num:
+        return over_time
+    notes.warn("what is found is not followed over time: some Gaussians of the run cannot be drawn")
+    return None

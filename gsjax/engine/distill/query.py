@@ -19,6 +19,7 @@ from gsjax.data.photographs import Photographs
 from gsjax.engine.distill.file import NAME, read_field
 from gsjax.engine.distill.saved import FieldRun, short_names
 from gsjax.engine.messages import Notes, describe
+from gsjax.engine.pictures import MARK, MOST
 from gsjax.engine.query import SCENE_CAPTIONS, Queryable, Question, Selection, write_mask
 from gsjax.geometry.cameras import Camera, camera_centers
 from gsjax.geometry.spherical_harmonics import evaluate_sh
@@ -38,10 +39,6 @@ if TYPE_CHECKING:
 else:
     OverTime = Any  # slow to import, as all that tracks is
 
-MARK = (255, 70, 160)
-"""Colour of the outlines of what was found, RGB."""
-MOST = 0.5
-"""Share of a pixel's light above which it shows what was found."""
 _LEAST_ALPHA = 0.5  # share of a pixel's light that the scene must send
 _PANEL_HEIGHT = 240  # pixels, at least
 
@@ -191,8 +188,8 @@ class QueryableField(Queryable):
             panels = {behind_is: behind, **panels}
         write_png(folder / "overview.png", in_rows(panels, len(panels) // 2, _PANEL_HEIGHT))
         if self._over_time is not None:
-            number = None if question.camera is None else int(question.camera)
-            self._over_time.write(folder, values, selected, number, drawer, console)
+            name = None if question.camera is None else question.camera.split("/")[0]
+            self._over_time.write(folder, values, selected, name, drawer, notes, console)
         return pixels
 
     def _read(self, text: str, negatives: tuple[str, ...] | None) -> Prompt:

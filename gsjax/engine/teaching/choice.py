@@ -8,12 +8,12 @@ from gsjax.engine.options import ClipWeights, SamWeights
 from gsjax.engine.recording import located
 from gsjax.engine.teaching.source import KINDS
 from gsjax.perception.feature_files import EACH
-from gsjax.perception.levels import LEVELS
+from gsjax.perception.levels import LEVELS, Level
 
 Masks = Literal["auto", "files", "segment"]
 Second = Literal["none", "maskclip"]
-Level = Literal["default", "small", "medium", "large"]
-Levels = Literal["default", "small", "medium", "large", "each"]
+OneLevel = Level | Literal["default"]
+Levels = OneLevel | Literal["each"]
 NO_TEACHER = "none"
 """The value of `features` by which nothing teaches, where a method can do without."""
 OF_CLIP = ("clip", "maskclip")
@@ -32,9 +32,9 @@ class TeacherOptions(SamWeights, ClipWeights):
     masks: Masks = "auto"
     """Source of the masks: the recording's own files, or a segmenter without weights. auto: the
     files, or the segmenter if there are none."""
-    level: Level = "default"
-    """Size of objects, in LangSplat's files or of SAM's masks: of those that cover a pixel the largest, the
-    smallest, or one between (medium). default: as the files have it; of SAM's masks, small."""
+    level: OneLevel = "default"
+    """Size of objects in LangSplat's files, or of SAM's masks: large (things), medium (their parts) or small
+    (the parts of these). default: as the files have it; of SAM's masks, the smallest."""
 
 
 @dataclass(frozen=True)
@@ -42,9 +42,9 @@ class TeacherChoice(TeacherOptions):
     """Which masks and features teach, with what `gsjax distill` alone offers."""
 
     level: Levels = "default"
-    """Size of objects, in LangSplat's files or of SAM's masks: of those that cover a pixel the largest, the
-    smallest, or one between (medium); each: all three at once, and a query says on which it found what it
-    found. default: as the files have it; of SAM's masks, small."""
+    """Size of objects in LangSplat's files, or of SAM's masks: large (things), medium (their parts), small
+    (the parts of these), or each: all three at once, and a query says on which it found what it found.
+    default: as the files have it; of SAM's masks, the smallest."""
     second: Second = "none"
     """Second teacher beside --features clip, which gives one vector per mask: maskclip gives CLIP's vector of
     each patch, from the same --weights. The weight of its loss is --distill.weights.map."""
@@ -107,9 +107,10 @@ class TeacherChoice(TeacherOptions):
                 f"--level {self.level}: expected --features FOLDER, with LangSplat's files, or --sam, found "
                 f"{self.features}"
             )
-        if self.levels and (optional or self.second != "none"):
-            other = "a field (gsjax distill)" if optional else "no --second, whose maps have one level"
-            raise ValueError(f"--level {self.level}: expected {other}; leave it out")
+        one_level = "maps of patches" if "maskclip" in (self.features, self.second) else ""
+        one_level = "a scene that deforms" if optional else one_level
+        if self.levels and one_level:
+            raise ValueError(f"--level {self.level}: {one_level} has features on one level; leave it out")
         if self.second != "none" and self.features != "clip":
             raise ValueError(
                 f"--second {self.second}: expected --features clip, which it complements, found "

@@ -19,8 +19,8 @@ from gsjax.engine.teaching.source import ABOUT, Source
 from gsjax.methods.distill import Teacher, teacher_of_maps, teacher_of_objects, with_maps
 from gsjax.methods.distill.teacher import UNKNOWN_ID
 from gsjax.methods.protocols import LanguageEncoder
-from gsjax.perception.feature_files import PictureFeatures, read_feature_folder
-from gsjax.perception.levels import LEVELS, joined_levels
+from gsjax.perception.feature_files import EACH, PictureFeatures, read_feature_folder
+from gsjax.perception.levels import joined_levels, labels_on_level
 from gsjax.perception.outlines import snap_outlines
 from gsjax.perception.segmenters import PieceSegmenter, PlaneOrRegionSegmenter
 
@@ -42,8 +42,9 @@ class _View(NamedTuple):
     labels: Int[np.ndarray, "n"]
 
 
-_Objects = tuple[list[np.ndarray], list[np.ndarray]]
-"""Of each photograph, the row of a vector for each pixel, -1 where unknown, and these vectors."""
+_Objects = tuple[list[np.ndarray], list[np.ndarray], list[np.ndarray] | None]
+"""Of each photograph, the row of a vector for each pixel, -1 where unknown, these vectors, and, with levels,
+those that are filled from others (`Teacher.filled`)."""
 
 
 class Teaching:
@@ -118,7 +119,7 @@ class Teaching:
         found = self._features([i], self._views([i], quiet), quiet)
         if isinstance(found, Teacher):
             return found
-        (ids,), (rows,) = found
+        (ids,), (rows,), _ = found
         known = np.asarray(rows)[np.unique(ids[ids >= 0])].any()
         return teacher_of_objects([ids], [rows]) if known else None
 
@@ -167,15 +168,18 @@ class Teaching:
                     f"{self._choice.features}: expected files of one kind, found a feature a pixel in "
                     f"{len(maps)} and masks with embeddings in {len(found) - len(maps)}"
                 )
-            ids = [_as_large(one, self._photographs, i) for one, i in zip(found, indices, strict=True)]
-            return ids, [one.codebook for one in found]
+            photographs, pairs = self._photographs, list(zip(found, indices, strict=True))
+            ids = [_as_large(one.ids, photographs, i) for one, i in pairs]
+            filled = [_as_large(one.filled, photographs, i) for one, i in pairs if one.filled is not None]
+            return ids, [one.codebook for one in found], filled or None
         assert views is not None
         shown = track(indices, "features", console=console, transient=True)
         objects = []
         for i, levels in zip(shown, views, strict=True):
             ids, rows = [view.ids for view in levels], [self._embedded(i, view) for view in levels]
-            objects.append((ids[0], rows[0]) if len(levels) == 1 else joined_levels(ids, rows))
-        return [ids for ids, _ in objects], [rows for _, rows in objects]
+            objects.append((ids[0], rows[0], None) if len(levels) == 1 else joined_levels(ids, rows))
+        ids, rows, filled = (list(each) for each in zip(*objects, strict=True))
+        return ids, rows, filled if self.source.levels else None
 
     def _views(self, indices: Sequence[int], console: Console) -> list[list[_View]] | None:
         """Masks of photographs on each level; None where features have no need of them."""
@@ -194,6 +198,8 @@ class Teaching:
             shown = {"image": image, "K": K} | ({} if depth is None else {"depth": depth})
             found = self._cache(self._segmenter_key, shown, lambda: {"labels": segmenter(image, depth, K)})
             labels = found["labels"].astype(np.int64)
+            if labels.ndim == 3 and (level := self._choice.level) not in ("default", EACH):
+                labels = labels_on_level(labels, level)
             if self.masks == "sam" or depth is None:  # no background here: 0 is what lies in no mask
                 labels = np.where(labels == 0, UNKNOWN_ID, labels)
         return [self._view(i, level) for level in labels.reshape(-1, *labels.shape[-2:])]
@@ -317,8 +323,7 @@ def _segmenter(choice: TeacherChoice, masks: str) -> tuple[Callable[..., np.ndar
         raise ValueError(f"--sam: {error}") from error
     if choice.level == "default":
         return sam, key
-    which = slice(None) if choice.levels else LEVELS.index(choice.level)
-    return (lambda image, depth, K: sam.levels(image)[which]), f"{key} {choice.level}"
+    return (lambda image, depth, K: sam.levels(image)), f"{key} levels"
 
 
 def _names(views: list[_View], known: Mapping[int, str]) -> dict[int, str]:
@@ -347,10 +352,12 @@ def _expect_shape(one: PictureFeatures, photographs: Photographs, i: int) -> Non
         )
 
 
-def _as_large(one: PictureFeatures, photographs: Photographs, i: int) -> Int[np.ndarray, "h w"]:
-    """Row of a file's codebook for each pixel of its photograph."""
-    assert one.ids is not None
+def _as_large(masks: np.ndarray | None, photographs: Photographs, i: int) -> np.ndarray:
+    """What a file says of its pixels, as large as its photograph."""
+    assert masks is not None
     width, height = (int(side) for side in photographs.sizes[i])
-    if one.ids.shape == (height, width):
-        return one.ids
-    return cv2.resize(one.ids, (width, height), interpolation=cv2.INTER_NEAREST_EXACT)
+    if masks.shape[:2] == (height, width):
+        return masks
+    kind = np.uint8 if masks.dtype == bool else masks.dtype
+    large = cv2.resize(masks.astype(kind), (width, height), interpolation=cv2.INTER_NEAREST_EXACT)
+    return large.astype(masks.dtype)

@@ -19,6 +19,7 @@ from gsjax.methods.distill.field import (
     fitted_to_vectors,
     init_field,
 )
+from gsjax.methods.distill.levels import completed
 from gsjax.methods.distill.result import DistillResult
 from gsjax.methods.distill.solve import SolveBatch, graph_of, passes, solve_step, unsolved
 from gsjax.methods.distill.teacher import Teacher, max_rows
@@ -114,6 +115,9 @@ class Distill:
         expect_alike(cameras, teacher)
         expect_finite(gaussians.means)
         config, solved, located, rows, untrained = self.config, None, None, None, None
+        frozen = frozen_views(gaussians, cameras, rasterize_mode)
+        if teacher.filled is not None:
+            teacher = completed(teacher, frozen, gaussians.num)
         if config.start != "random":
             solved = unsolved(teacher, jnp.asarray(gaussians.means), config)
             config = replace(config, channels=solved.channels)
@@ -124,8 +128,8 @@ class Distill:
             untrained, located, rows = active_table(untrained, located)
         most = max_rows(teacher)
         views = [
-            view_batch(teacher, v, most, located, frozen)
-            for v, frozen in enumerate(frozen_views(gaussians, cameras, rasterize_mode))
+            view_batch(teacher, v, most, located, one)
+            for v, one in enumerate(frozen)
             if teacher.maps is not None or (teacher.ids[v] >= 0).any()
         ]
         about = {"num_gaussians": gaussians.num, "rasterize_mode": rasterize_mode} | dict(scene or {})

@@ -22,7 +22,7 @@ from gsjax.scene.feature_grid import FeatureGrid, Located, locate
 
 FORMAT = 1
 """Format of field.npz."""
-_BEST = 32  # Gaussians by which the level of a query is told
+_BEST, _ALIKE = 32, 0.02  # Gaussians by which the level of a query is told; cosines that are alike
 _UNKNOWN = {"kind": "files", "names": {}, "weights": None}  # an unknown source
 
 
@@ -108,9 +108,8 @@ class DistillResult:
         if level not in (self.levels or (None,)):
             there = ", ".join(self.levels) or "none, as these features have no levels"
             raise ValueError(f"level: expected {there}, found {level}")
-        each = self.field.dimension // max(1, len(self.levels))
-        first = 0 if level is None else each * self.levels.index(level)
-        return slice(first, first + each)
+        first = 0 if level is None else self._dimension * self.levels.index(level)
+        return slice(first, first + self._dimension)
 
     def direction(self, row: int, level: str | None = None) -> Float[Array, "d"]:
         """The feature of a Gaussian in the teacher's channels, of length 1, or 0 where it has none.
@@ -150,7 +149,7 @@ class DistillResult:
 
     def best_level(self, vectors: Float[ArrayLike, "q d"]) -> str | None:
         """The level whose best Gaussians score highest for a query, as in LangSplat (Qin et al. 2024,
-        section 3.4); None where there are no levels.
+        section 3.4), and the largest of those that score as high; None where there are no levels.
 
         Args:
             vectors: the query, then negatives, in the teacher's channels.
@@ -159,8 +158,9 @@ class DistillResult:
             ValueError: the vectors' number of channels is not the teacher's.
         """
         queries = self._queries(vectors)
-        best = {level: float(_best_score(*self._directions(level), queries)) for level in self.levels}
-        return max(best, key=best.__getitem__, default=None)
+        ahead = {level: float(_best_ahead(*self._directions(level), queries)) for level in self.levels}
+        most = max(ahead.values(), default=0.0)
+        return next((level for level in reversed(ahead) if ahead[level] > most - _ALIKE), None)
 
     def query(
         self,
@@ -208,6 +208,14 @@ class DistillResult:
         with open(path, "wb") as stream:
             np.savez_compressed(stream, **arrays, about=np.array(json.dumps(about)))
 
+    @property
+    def _dimension(self) -> int:
+        """Number of the teacher's channels on a level."""
+        every, count = self.field.dimension, max(1, len(self.levels))
+        if every % count:
+            raise ValueError(f"levels: expected {every} channels in {count} equal parts, found a remainder")
+        return every // count
+
     @cached_property
     def _known(self) -> dict[str | None, tuple[Float[Array, "n r"], Float[Array, "d r"]]]:
         return {}
@@ -222,10 +230,9 @@ class DistillResult:
 
     def _queries(self, vectors: Float[ArrayLike, "q d"]) -> Float[Array, "q d"]:
         queries = jnp.asarray(vectors, self.field.lift.dtype)
-        wanted = self.field.dimension // max(1, len(self.levels))
-        if queries.shape[1] != wanted:
+        if queries.shape[1] != self._dimension:
             raise ValueError(
-                f"expected a query of {wanted} numbers, as in this field's features, found "
+                f"expected a query of {self._dimension} numbers, as in this field's features, found "
                 f"{queries.shape[1]}; use the encoder that the field was distilled from (--weights)"
             )
         return queries
@@ -237,7 +244,9 @@ def _scores(directions, lifted, queries):
 
 
 @jax.jit
-def _best_score(directions, lifted, queries):
-    """The mean score of the best Gaussians, as one alone may be by chance."""
-    scores = jnp.nan_to_num(_scores(directions, lifted, queries), nan=-1.0)
-    return jax.lax.top_k(scores, min(_BEST, len(scores)))[0].mean()
+def _best_ahead(directions, lifted, queries):
+    """By how much the query's cosine is ahead of those of its negatives, if any: the mean of the best
+    Gaussians, as one alone may be by chance."""
+    cosines = cosines_of(directions, lifted, queries)
+    ahead = cosines[:, 0] - (cosines[:, 1:].max(axis=1) if len(queries) > 1 else 0.0)
+    return jax.lax.top_k(jnp.nan_to_num(ahead, nan=-2.0), min(_BEST, len(ahead)))[0].mean()

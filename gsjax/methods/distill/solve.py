@@ -200,7 +200,7 @@ def _targets_drawn_back(batch: Batch, config: DistillConfig) -> _Sums:
     empty = jnp.zeros((len(batch.view.rows), features.shape[-1] + 1), features.dtype)
 
     def cotangent(first, inside, image, alphas):
-        targets, weights = _targets(batch, first, inside, config.weights.map)
+        targets, weights = _targets(batch, first, inside, config.weights.map, alphas.dtype)
         shown = alphas[..., None] * targets
         squares = jnp.where(weights > 0, jnp.sum(shown**2, axis=-1) / jnp.maximum(weights, _LEAST), 0.0)
         joined = jnp.concatenate([shown, (weights * alphas)[..., None]], axis=-1)
@@ -215,7 +215,8 @@ def _product(values: Float[Array, "n r"], batch: Batch, config: DistillConfig) -
 
     def cotangent(first, inside, image, alphas):
         zero = jnp.zeros((), image.dtype)
-        return _weights(batch, first, inside, config.weights.map)[..., None] * image, zero, zero
+        weights = _weights(batch, first, inside, config.weights.map, image.dtype)
+        return weights[..., None] * image, zero, zero
 
     back, target, pixels = _drawn_back(values[batch.view.rows], batch, config, cotangent)
     return _Sums(back, jnp.zeros(len(back), back.dtype), target, pixels)
@@ -243,9 +244,9 @@ def _drawn_back(values: Float[Array, "seen c"], batch: Batch, config: DistillCon
     return jax.lax.scan(strip, begin, jnp.arange(strips))[0]
 
 
-def _weights(batch: Batch, first, inside, map_weight: float) -> Float[Array, "high width"]:
+def _weights(batch: Batch, first, inside, map_weight: float, dtype) -> Float[Array, "high width"]:
     """m_p in the rows of a strip. A pixel of a map has `map_weight` if there are masks too."""
-    weights = jnp.zeros((len(inside), batch.plan.width))
+    weights = jnp.zeros((len(inside), batch.plan.width), dtype)
     if batch.codebook is not None:
         weights += _ids(batch, first, len(inside)) >= 0
     if batch.map is not None:
@@ -253,7 +254,7 @@ def _weights(batch: Batch, first, inside, map_weight: float) -> Float[Array, "hi
     return weights
 
 
-def _targets(batch: Batch, first, inside, map_weight: float):
+def _targets(batch: Batch, first, inside, map_weight: float, dtype):
     """m_p e_p and m_p in the rows of a strip."""
     targets: Any = 0.0
     if batch.codebook is not None:
@@ -262,7 +263,7 @@ def _targets(batch: Batch, first, inside, map_weight: float):
     if batch.map is not None:
         weight = inside[:, None] * (1.0 if batch.codebook is None else map_weight)
         targets += weight[..., None] * stretched(batch.map, first, len(inside), batch.plan)
-    return targets, _weights(batch, first, inside, map_weight)
+    return targets.astype(dtype), _weights(batch, first, inside, map_weight, dtype)
 
 
 def _ids(batch: Batch, first, high: int) -> Int[Array, "high width"]:
@@ -310,7 +311,7 @@ def _advanced(field: FeatureField, state: SolveState, neighbors, config: Distill
 
 def _preconditioner(state: SolveState, neighbors: Int[Array, "n k"]) -> Float[Array, "n"]:
     num, count = neighbors.shape
-    pairs = count + jnp.zeros(num).at[neighbors.ravel()].add(1.0)
+    pairs = count + jnp.zeros(num, state.mass.dtype).at[neighbors.ravel()].add(1.0)
     return state.mass + state.tie * pairs + _LEAST
 
 

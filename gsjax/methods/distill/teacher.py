@@ -22,6 +22,8 @@ class Teacher(NamedTuple):
             the same object, for the contrastive loss; without a codebook, ids serve for that alone.
         codebook: the distinct embeddings, [K, D]; None for a teacher of maps only.
         maps: feature maps of any resolution, [h,w,D] per view, stretched over the view; None without.
+        filled: for a codebook of L levels, whose channels follow one another: the levels on which a pixel has
+            no mask of its own but that of another level, [H,W,L] per view. None without levels.
 
     Embeddings and maps are scaled to a mean length of 1: cosines do not depend on their length, but the speed
     of training would.
@@ -30,6 +32,7 @@ class Teacher(NamedTuple):
     ids: list[np.ndarray]
     codebook: Float[np.ndarray, "k d"] | None
     maps: list[np.ndarray] | None = None
+    filled: list[np.ndarray] | None = None
 
     @property
     def dimension(self) -> int:
@@ -40,7 +43,11 @@ class Teacher(NamedTuple):
         return self.maps[0].shape[-1]
 
 
-def teacher_of_objects(masks: Sequence[np.ndarray], embeddings: Sequence[np.ndarray]) -> Teacher:
+def teacher_of_objects(
+    masks: Sequence[np.ndarray],
+    embeddings: Sequence[np.ndarray],
+    filled: Sequence[np.ndarray] | None = None,
+) -> Teacher:
     """A teacher of masks: each pixel has the embedding of the object whose mask contains it.
 
     Objects with equal embeddings are one object, within a view and across views.
@@ -49,6 +56,7 @@ def teacher_of_objects(masks: Sequence[np.ndarray], embeddings: Sequence[np.ndar
         masks: labels of each view, integers [H,W], 0 to n; negative where unknown.
         embeddings: embeddings of the labels 0 to n of each view, [n+1, D]; a row of zeros for an unknown
             label.
+        filled: as in `Teacher`.
 
     Raises:
         ValueError: there is no view, a label has no embedding, dimensions differ, numbers are not finite, or
@@ -86,7 +94,8 @@ def teacher_of_objects(masks: Sequence[np.ndarray], embeddings: Sequence[np.ndar
         for mask, start in zip(masks, starts[:-1], strict=True)
     ]
     _warn_of_empty_views(ids)
-    return Teacher(ids, codebook[known] / _mean_length([codebook[known]]))
+    book = codebook[known] / _mean_length([codebook[known]])
+    return Teacher(ids, book, None, None if filled is None else list(filled))
 
 
 def teacher_of_maps(

@@ -73,7 +73,7 @@ class AskFolder:
             self._save_status = gui.add_html("")
         self._display_worker = Debouncer(self._update_view, _SETTLE_S, _PATIENCE_S)
         self._query_worker = Debouncer(self._ask, _TYPED_S, math.inf)
-        self._latest: Callable[[], None] = self._query_worker.request  # asks the latest query again
+        self._latest: Callable[[], None] = lambda: None  # asks the latest query again
         self._text.on_update(lambda _: self._query_worker.request())
         like.on_click(lambda _: self._ask_similar())
         if self._level is not None:
@@ -89,8 +89,10 @@ class AskFolder:
         self._display_worker.close()
 
     def _ask(self) -> None:
-        text, self._latest = self._text.value.strip(), self._query_worker.request
-        ask = (lambda: self._asking.ask(text, self._frame(), self._on_level)) if text else None
+        text, ask = self._text.value.strip(), None
+        if text:
+            self._latest = self._query_worker.request
+            ask = lambda: self._asking.ask(text, self._frame(), self._on_level)  # noqa: E731
         self._answer(ask, self._asking.hint)
 
     def _ask_similar(self) -> None:

@@ -8,7 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gsjax.engine.deform.file import NAME, write_deformation
+from gsjax.engine.deform.file import write_deformation
+from gsjax.engine.folder import DEFORMATION
 from gsjax.engine.teaching.source import Source
 from gsjax.geometry.cameras import intrinsics
 from gsjax.methods.deform import QUESTIONS, DeformingScene, DeformResult, Meaning, Timeline
@@ -48,7 +49,7 @@ def written(run, names=("tissue", "tool"), metric=True, nearer=0.0):
         metric=metric,
     )
     run.mkdir()
-    write_deformation(run / NAME, DeformResult(DeformingScene(gaussians), None, meaning, timeline))
+    write_deformation(run / DEFORMATION, DeformResult(DeformingScene(gaussians), None, meaning, timeline))
     return run
 
 

@@ -114,15 +114,16 @@ def test_weights_are_read_once_however_many_pictures_there_are(tmp_path, monkeyp
 
 
 def test_masks_of_sam_teach_on_all_levels_or_on_one(tmp_path, monkeypatch):
-    """A thing whose left half is a part of it: on the smallest level the right half is the thing alone."""
+    """A thing and a part of it, which is on the middle level and, without a smaller one, on the smallest."""
     weights = tmp_path / "sam"
     weights.mkdir()
     monkeypatch.setattr(field_teacher, "folder_digest", lambda path: "digest")
-    masks = np.zeros((2, 12, 16), bool)
+    masks, segmented = np.zeros((2, 12, 16), bool), []
     masks[0, 2:10, 2:14], masks[1, 4:8, 4:8] = True, True
 
     class Found(SamSegmenter):
         def find(self, image):
+            segmented.append(1)
             return Detections(np.zeros((2, 4)), np.ones(2), masks)
 
     monkeypatch.setattr("gsjax.perception.sam.load_sam", lambda path: Found(None, None, None, min_pixels=1))
@@ -132,7 +133,7 @@ def test_masks_of_sam_teach_on_all_levels_or_on_one(tmp_path, monkeypatch):
         for level in ("default", "small", "medium", "large", "each")
     }
     ids = {level: said.teacher.ids[0] for level, said in taught_by.items()}
-    for level, parts in {"default": 2, "small": 2, "medium": 1, "large": 1, "each": 2}.items():
+    for level, parts in {"default": 2, "small": 2, "medium": 2, "large": 1, "each": 2}.items():
         np.testing.assert_array_equal(ids[level] >= 0, masks[0])
         assert len(np.unique(ids[level][masks[0]])) == parts, level
     assert taught_by["each"].source.levels == ("small", "medium", "large")
@@ -140,19 +141,25 @@ def test_masks_of_sam_teach_on_all_levels_or_on_one(tmp_path, monkeypatch):
     each, one = (taught_by[level].teacher for level in ("each", "small"))
     assert each.dimension == 3 * one.dimension
     part, rest = (each.codebook[ids["each"][y, 5]].reshape(3, -1) for y in (5, 9))
-    assert not np.allclose(part[0], part[1])
-    np.testing.assert_allclose(part[1:], rest[1:])
+    assert not np.allclose(part[1], part[2])
+    np.testing.assert_allclose(part[0], part[1])
+    np.testing.assert_allclose(rest, np.stack([part[2]] * 3))
+    assert len(segmented) == 2 * 2  # of each photograph once for default, and once for all levels
     assert taught_by["each"].of(1).dimension == each.dimension
+    masks[:] = False  # in another photograph nothing is found
+    taught_by["each"]._photographs = replace(shown, load_image=lambda i: np.zeros((12, 16, 3), np.uint8))
+    assert taught_by["each"].of(1) is None
     for options, words in (
         (
             {"features": "clip", "weights": weights, "sam": weights, "second": "maskclip"},
-            "expected no --second",
+            "maps of patches",
         ),
+        ({"features": "maskclip", "weights": weights, "sam": weights}, "maps of patches"),
         ({"features": "closed"}, "expected --features FOLDER, with LangSplat's files, or --sam"),
     ):
         with pytest.raises(ValueError, match=f"--level each: {words}"):
             TeacherChoice(**options, level="each").check()
-    with pytest.raises(ValueError, match=r"--level each: expected a field \(gsjax distill\)"):
+    with pytest.raises(ValueError, match="--level each: a scene that deforms has"):
         TeacherChoice("closed", sam=weights, level="each").check(optional=True)
 
 

@@ -1,0 +1,144 @@
+"""A teacher on several levels, completed: where a view lacks the mask of a level, others may have it.
+
+A segmenter misses masks, so that in each view some pixels have none on a level, and were given that of
+another level (`Teacher.filled`). Taken at its word, such a view teaches that a drawer is a cabinet. So views
+vote first: on each level a Gaussian is what most of its pixels are that have a mask there and, only where
+hardly any has one, what it is on the next larger level. Drawn, the Gaussians tell what each filled pixel is.
+"""
+
+from collections.abc import Sequence
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from gsjax.methods.distill.teacher import Teacher
+from gsjax.methods.distill.votes import label_votes
+from gsjax.rasterize.frozen import FrozenView, paint
+from gsjax.rasterize.plan import Plan
+
+_KINDS = 256  # of embeddings that are told apart, on all levels together
+_LEAST = 0.1  # share of a Gaussian's pixels that must have a mask of a level, for it to have one
+_SEED, _ITERATIONS = 0, 10  # of clustering
+_AT_ONCE = 32  # kinds that are drawn at once
+
+
+def completed(teacher: Teacher, views: Sequence[tuple[FrozenView, Plan]], num: int) -> Teacher:
+    """The teacher with what other views say in place of what was filled in from other levels.
+
+    Args:
+        teacher: a teacher of masks on levels, with `filled`.
+        views: its frozen views, with their plans.
+        num: number of Gaussians.
+    """
+    assert teacher.codebook is not None
+    assert teacher.filled is not None
+    levels = teacher.filled[0].shape[-1]
+    embeddings, place = np.unique(
+        teacher.codebook.reshape(len(teacher.codebook) * levels, -1), axis=0, return_inverse=True
+    )
+    place, (kinds, centers) = place.reshape(-1, levels), _kinds(embeddings)
+    of_gaussians = _kinds_of_gaussians(teacher, views, kinds[place], len(centers), num)
+    rows = []  # of the embeddings, and of the centres after them, of each pixel on each level
+    for (view, plan), ids, filled in zip(views, teacher.ids, teacher.filled, strict=True):
+        told = np.stack([_drawn(view, plan, each, len(centers)) for each in of_gaussians], axis=-1)
+        row = np.where(filled & (told >= 0), len(embeddings) + told, place[np.maximum(ids, 0)])
+        rows.append(np.where((ids >= 0)[..., None], row, -1))
+    return _with_rows(teacher, rows, np.concatenate([embeddings, centers]))
+
+
+def _kinds(embeddings: Float[np.ndarray, "u d"]) -> tuple[Int[np.ndarray, "u"], Float[np.ndarray, "k d"]]:
+    """The kind of each embedding, and the mean embedding of each kind: itself where they are few, else of a
+    cluster."""
+    if len(embeddings) <= _KINDS:
+        return np.arange(len(embeddings)), embeddings
+    from scipy.cluster.vq import kmeans2  # slow to import
+
+    units = embeddings / np.maximum(np.linalg.norm(embeddings, axis=1, keepdims=True), 1e-12)
+    _, kinds = kmeans2(units, _KINDS, iter=_ITERATIONS, minit="++", rng=_SEED)
+    there, kinds = np.unique(kinds, return_inverse=True)
+    return kinds, np.stack([embeddings[kinds == kind].mean(axis=0) for kind in range(len(there))])
+
+
+def _kinds_of_gaussians(
+    teacher: Teacher,
+    views: Sequence[tuple[FrozenView, Plan]],
+    kinds: Int[np.ndarray, "rows levels"],
+    count: int,
+    num: int,
+) -> Int[np.ndarray, "levels n"]:
+    """The kind with the most votes for each Gaussian on each level; where too few pixels have a mask of a
+    level, that on the next larger level or, without one, the next smaller. -1 where there is none at all."""
+    levels, filled_of = kinds.shape[1], teacher.filled or []
+    _, every = _voted(views, [np.where(ids >= 0, 0, -1) for ids in teacher.ids], 1, num)
+    best = np.full((levels, num), -1)
+    for level in range(levels):
+        of_level = [
+            np.where((ids >= 0) & ~filled[..., level], kinds[np.maximum(ids, 0), level], -1)
+            for ids, filled in zip(teacher.ids, filled_of, strict=True)
+        ]
+        kind, total = _voted(views, of_level, count, num)
+        best[level] = np.where(total > _LEAST * every, kind, -1)
+    filled_in = best.copy()
+    for level, row in enumerate(filled_in):
+        for other in (*range(level + 1, levels), *range(level)[::-1]):
+            np.copyto(row, best[other], where=row < 0)
+    return filled_in
+
+
+def _voted(
+    views: Sequence[tuple[FrozenView, Plan]], kinds: Sequence[np.ndarray], count: int, num: int
+) -> tuple[Int[np.ndarray, "n"], Float[np.ndarray, "n"]]:
+    """The kind with the most votes for each Gaussian, and the votes for all kinds together."""
+    best, most, total = np.zeros(num, int), np.zeros(num), np.zeros(num)
+    for first in range(0, count, _AT_ONCE):
+        some = min(_AT_ONCE, count)  # one program for all
+        votes = np.zeros((num, some))
+        for (view, plan), pixels in zip(views, kinds, strict=True):
+            here = np.where((pixels >= first) & (pixels < first + some), pixels - first, -1)
+            np.add.at(
+                votes, np.asarray(view.rows), np.asarray(label_votes(view, plan, jnp.asarray(here), some))
+            )
+        better = votes.max(axis=1) > most
+        best[better] = first + votes.argmax(axis=1)[better]
+        most, total = np.maximum(most, votes.max(axis=1)), total + votes.sum(axis=1)
+    return best, total
+
+
+def _drawn(view: FrozenView, plan: Plan, kinds: Int[np.ndarray, "n"], count: int) -> Int[np.ndarray, "h w"]:
+    """The kind of Gaussians that a pixel shows most of; -1 where it shows none."""
+    best, most = np.full((plan.height, plan.width), -1), np.zeros((plan.height, plan.width))
+    some = min(_AT_ONCE, count)
+    for first in range(0, count, _AT_ONCE):
+        image = np.asarray(_painted(view, plan, jnp.asarray(kinds - first), some))
+        better = image.max(axis=-1) > most
+        best[better] = first + image.argmax(axis=-1)[better]
+        most = np.maximum(most, image.max(axis=-1))
+    return best
+
+
+@partial(jax.jit, static_argnames=("plan", "count"))
+def _painted(view: FrozenView, plan: Plan, kinds: Int[Array, "n"], count: int):
+    return paint(view, jax.nn.one_hot(kinds, count), plan)[0]
+
+
+def _with_rows(teacher: Teacher, rows: list[np.ndarray], embeddings: Float[np.ndarray, "u d"]) -> Teacher:
+    """The teacher with other rows of embeddings for each pixel on each level; -1 where unknown."""
+    levels = rows[0].shape[-1]
+    keys = []
+    for row in rows:
+        key = np.zeros(row.shape[:2], np.int64)  # a number for each combination
+        for level in range(levels):
+            key = key * (len(embeddings) + 1) + row[..., level] + 1
+        keys.append(key.ravel())
+    combined, place = np.unique(np.concatenate(keys), return_inverse=True)
+    unknown = int(combined[0] == 0)
+    digits = [combined[unknown:] // (len(embeddings) + 1) ** (levels - 1 - k) for k in range(levels)]
+    columns = np.stack([digit % (len(embeddings) + 1) - 1 for digit in digits], axis=1)
+    ends = np.cumsum([row.shape[0] * row.shape[1] for row in rows])[:-1]
+    parts = zip(np.split(place - unknown, ends), rows, strict=True)
+    ids = [part.reshape(row.shape[:2]).astype(np.int32) for part, row in parts]
+    codebook = embeddings[columns].reshape(len(columns), -1)
+    return teacher._replace(ids=ids, codebook=codebook.astype(np.float32), filled=None)
