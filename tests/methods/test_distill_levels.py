@@ -55,7 +55,7 @@ def test_what_no_view_has_on_a_level_stays_that_of_the_next(scene):
     found = completed(given, frozen_views(gaussians, cameras(8)), gaussians.num)
     for v in range(8):
         same = np.isclose(embeddings_of(found, v), embeddings_of(given, v), atol=1e-5).all(axis=(-1, -2))
-        assert same.mean() > 0.98  # but for outlines, where Gaussians of the ball show some background
+        assert same.mean() > 0.95  # but for outlines, where Gaussians of the ball show some background
 
 
 def test_many_kinds_are_clustered_and_drawn_a_few_at_a_time(scene, monkeypatch):
