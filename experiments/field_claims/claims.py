@@ -1,5 +1,5 @@
-"""What are FD-3DGS's losses worth once the rest has converged? One is left out or changed at a time, in a field
-that begins as the least-squares solution."""
+"""What are FD-3DGS's losses worth once the rest has converged? One is left out or changed at a time, in a
+field that begins as the least-squares solution."""
 
 from dataclasses import replace
 from pathlib import Path
