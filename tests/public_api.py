@@ -1,0 +1,82 @@
+"""The page of what `import gsjax` offers, and whether CHANGELOG.md says what changed in it.
+
+python -m tests.public_api              # writes docs/api/public.md
+python -m tests.public_api --release    # and what the next changes are compared with
+"""
+
+import ast
+import hashlib
+import inspect
+import json
+import re
+import sys
+from pathlib import Path
+
+import gsjax
+
+ROOT = Path(__file__).resolve().parents[1]
+PAGE, RELEASED = ROOT / "docs/api/public.md", ROOT / "tests/released_api.json"
+AGAIN = "python -m tests.public_api"
+"""What to run where the page is not current."""
+_INTRODUCTION = """# What is promised
+
+What `import gsjax` offers: these names, as they are written here. Before version 1.0 a minor version may
+change them, a patch version does not, and CHANGELOG.md says what changed: a test fails otherwise. The same
+holds, without a test, for options of commands and for the files of a run.
+
+All else that can be imported is documented for those who compose methods of their own, but internal: it may
+move in any version.
+"""
+
+
+def signatures() -> dict[str, str]:
+    """What is promised of each public name, as source."""
+    return {name: _signature(name) for name in gsjax.__all__}
+
+
+def page() -> str:
+    """The page, from the source of the public names."""
+    blocks = [f"## {name}\n\n```py\n{signature}\n```\n" for name, signature in signatures().items()]
+    return _INTRODUCTION + "\n" + "\n".join(blocks)
+
+
+def unmentioned() -> list[str]:
+    """Public names that differ from those of the last release and that the changelog's newest section does
+    not have in backticks."""
+    before, now = json.loads(RELEASED.read_text()), digests()
+    changed = sorted(name for name in before | now if before.get(name) != now.get(name))
+    newest = re.split(r"^## ", (ROOT / "CHANGELOG.md").read_text(), flags=re.MULTILINE)[1]
+    quoted = set(re.findall(r"\w+", " ".join(re.findall(r"`([^`]*)`", newest))))
+    return [name for name in changed if name not in quoted]
+
+
+def digests() -> dict[str, str]:
+    """A short digest of each signature."""
+    return {name: hashlib.sha256(text.encode()).hexdigest()[:16] for name, text in signatures().items()}
+
+
+def _signature(name: str) -> str:
+    thing = inspect.unwrap(getattr(gsjax, name))
+    tree = ast.parse(Path(inspect.getsourcefile(thing)).read_text(encoding="utf-8"))
+    node = next(node for node in tree.body if getattr(node, "name", None) == thing.__name__)
+    if isinstance(node, ast.FunctionDef):
+        return _function(node)
+    lines = [f"class {node.name}({', '.join(map(ast.unparse, node.bases))}):".replace("()", "")]
+    for part in node.body:
+        if isinstance(part, ast.AnnAssign) and not part.target.id.startswith("_"):
+            lines.append(f"    {ast.unparse(part)}")
+        elif isinstance(part, ast.FunctionDef) and not part.name.startswith("_"):
+            kinds = [f"    @{ast.unparse(one)}" for one in part.decorator_list]
+            lines += [*kinds, f"    {_function(part)}"]
+    return "\n".join(lines)
+
+
+def _function(node: ast.FunctionDef) -> str:
+    returns = "" if node.returns is None else f" -> {ast.unparse(node.returns)}"
+    return f"def {node.name}({ast.unparse(node.args)}){returns}: ..."
+
+
+if __name__ == "__main__":
+    PAGE.write_text(page(), encoding="utf-8")
+    if "--release" in sys.argv[1:]:
+        RELEASED.write_text(json.dumps(digests(), indent=1) + "\n")
