@@ -1,7 +1,7 @@
 """The page of what `import gsjax` offers, and whether CHANGELOG.md says what changed in it.
 
 python -m tests.public_api              # writes docs/api/public.md
-python -m tests.public_api --release    # and what the next changes are compared with
+python -m tests.public_api release    # and what the next changes are compared with
 """
 
 import ast
@@ -78,5 +78,5 @@ def _function(node: ast.FunctionDef) -> str:
 
 if __name__ == "__main__":
     PAGE.write_text(page(), encoding="utf-8")
-    if "--release" in sys.argv[1:]:
+    if "release" in sys.argv[1:]:
         RELEASED.write_text(json.dumps(digests(), indent=1) + "\n")
