@@ -1,4 +1,5 @@
-"""Makes the gallery, docs/gallery.md with its pictures in docs/gallery, and the figure of all trades.
+"""Makes the gallery, docs/gallery.md with its short films and pictures in docs/gallery, and the figure of all
+trades.
 
     .venv/bin/python docs/make_gallery.py            # `make gallery`
 
@@ -19,6 +20,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator
+from PIL import Image
 
 from gsjax.engine.folder import RunFolder
 from gsjax.io.video import read_video_frames
@@ -26,6 +28,7 @@ from gsjax.io.video import read_video_frames
 ROOT = Path(__file__).resolve().parents[1]
 RUNS, PICTURES, PAGE = ROOT / "runs/gallery", ROOT / "docs/gallery", ROOT / "docs/gallery.md"
 WIDTH, QUALITY = 900, 85  # of a picture, pixels at most, and of its JPEG
+FILM_WIDTH, FILM_HZ, FILM_QUALITY = 480, 10, 60  # of a film, and of its animated WebP
 
 TABLE = "simulated:tabletop?width=160&height=120&frames=1"
 TISSUE = "simulated:tissue?width=160&height=128&frames=16"
@@ -33,6 +36,8 @@ FURNITURE = "simulated:articulated?width=200&height=150&frames=10"
 COMMANDS = {
     "demo": f"track simulated:tabletop?width=240&height=180 --out {RUNS}/demo --frames 0:30 --cameras 0 1 "
     "--mask-camera 1 --eval-cameras 2 --track.start.iterations 60",
+    "demo/field": f"distill {RUNS}/demo --preset solve",
+    "demo/field/query": f"query {RUNS}/demo/field can",
     "table": f"track {TABLE} --out {RUNS}/table",
     "table/field": f"distill {RUNS}/table",
     "table/field/query": f"query {RUNS}/table/field can",
@@ -53,6 +58,7 @@ def main() -> None:
     PICTURES.mkdir(exist_ok=True)
     draw_trades(PICTURES / "trades.png")
     shown = {name: _write(name, picture) for name, picture in pictures().items()}
+    shown |= {name: write_film(PICTURES / f"{name}.webp", video) for name, video in films().items()}
     PAGE.write_text(page(shown), encoding="utf-8")
 
 
@@ -73,27 +79,31 @@ def made(folder: Path, command: str) -> bool:
 
 def pictures() -> dict[str, np.ndarray]:
     """Out of the runs: RGB, by the name of the file."""
+    return {"field": read(RUNS / "table/field/query/overview.png")}
+
+
+def films() -> dict[str, Path]:
+    """Videos of the runs, by the name of the film."""
     return {
-        "tracker": moments(RUNS / "demo/video_1.mp4"),
-        "field": read(RUNS / "table/field/query/overview.png"),
-        "tissue": beside(list(map(read, sorted(RUNS.glob("tissue/query/frames/*.png"))[:2])), 0),
-        "parts": moments(next(RUNS.glob("furniture/video_*.mp4"))),
-        "edit": moments(RUNS / "furniture/edit/ops/video.mp4"),
+        "tracker": RUNS / "demo/video_1.mp4",
+        "asked": RUNS / "demo/field/query/video.mp4",
+        "parts": next(RUNS.glob("furniture/video_*.mp4")),
+        "edit": RUNS / "furniture/edit/ops/video.mp4",
+        "tissue": RUNS / "tissue/query/video.mp4",
     }
 
 
-def moments(video: Path, count: int = 3) -> np.ndarray:
-    """Frames of a film, from its first to its last."""
-    frames = read_video_frames(video)
-    return beside([frames[t] for t in np.linspace(0, len(frames) - 1, count).round().astype(int)], 1)
-
-
-def beside(parts: list[np.ndarray], axis: int, gap: int = 6) -> np.ndarray:
-    """Pictures side by side, or below each other, with white between them."""
-    shape = list(parts[0].shape)
-    shape[axis] = gap
-    white = np.full(shape, 255, np.uint8)
-    return np.concatenate([piece for part in parts for piece in (white, part)][1:], axis=axis)
+def write_film(path: Path, video: Path) -> str:
+    """Writes a video as an animated WebP, which pages show by themselves; returns its path from the page."""
+    frames = [Image.fromarray(frame) for frame in read_video_frames(video)]
+    width, height = frames[0].size
+    scale = min(1.0, FILM_WIDTH / width)
+    small = [
+        one.resize((round(scale * width), round(scale * height)), Image.Resampling.LANCZOS) for one in frames
+    ]
+    often = {"duration": round(1000 / FILM_HZ), "loop": 0, "quality": FILM_QUALITY, "method": 6}
+    small[0].save(path, save_all=True, append_images=small[1:], **often)
+    return f"gallery/{path.name}"
 
 
 def read(path: Path) -> np.ndarray:
@@ -115,7 +125,8 @@ SECTIONS = {
     "The tracker": ("tracker", ("tracker_trade", "tracker_ablation", "optimizers", "basin")),
     "Parts": ("parts", ("parts_ablation", "parts_trade", "parts_failures", "parts_tracked", "bar_blends")),
     "Edits": ("edit", ("parts_edits",)),
-    "Semantic fields": ("field", ("field_ablation", "field_trade")),
+    "Semantic fields": ("field", ("field_ladder", "field_levels")),
+    "Semantic fields, over time": ("asked", ()),
     "Scenes that deform": ("tissue", ("deform_trade", "deform_pulling", "deform_flow")),
     "Static fit": (None, ("static_fit", "fit_trade", "known_scene")),
     "Grasping and policies": (None, ("grasping", "policies")),
@@ -134,8 +145,8 @@ CAPTIONS = {
     "parts_tracked": "IoU with the true masks over frames.",
     "bar_blends": "A bending, twisting bar, moved by handles.",
     "parts_edits": "Edits of discovered parts.",
-    "field_ablation": "Each variant, three seeds.",
-    "field_trade": "One setting changed at a time.",
+    "field_ladder": "Quality over the seconds that a field takes.",
+    "field_levels": "Parts, a pair and things, asked of one level and of three.",
     "deform_trade": "One setting changed at a time.",
     "deform_pulling": "Held-out frames (real): deforming, static, and copies of other frames.",
     "deform_flow": "Share of pixels below each flow error (real).",
@@ -150,11 +161,12 @@ CAPTIONS = {
 """What the figure of each experiment shows."""
 
 SAYS = {
-    "tracker": ("demo", "Camera 1 at three moments: input and render above, error and labels below."),
-    "parts": ("furniture", "One camera at three moments: picture, render, error, and the parts in colours."),
+    "tracker": ("demo", "Camera 1: input and render above, error and labels below."),
+    "asked": ("demo/field/query", "The can, found once and carried along by the tracked Gaussians."),
+    "parts": ("furniture", "One camera: picture, render, error, and the parts in colours."),
     "edit": ("furniture/edit/ops", "Only the first part that was found is shown; all else is a ghost."),
     "field": ("table/field/query", "The can: in the photograph, its scores, alone, left out, recoloured."),
-    "tissue": ("tissue/query", "Two held-out frames: the scene, without the tool, it alone, recoloured."),
+    "tissue": ("tissue/query", "The scene as reconstructed, and without the tool."),
 }
 """Which run a picture is of, and what it shows."""
 
@@ -164,7 +176,7 @@ def page(shown: dict[str, str]) -> str:
     lines = [
         "# Gallery",
         "",
-        "Small runs on built-in scenes (simulated, and no results), with their commands, and figures "
+        "Films of small runs on built-in scenes (simulated, no results), with their commands, and figures "
         "of [experiments](experiments.md): `gsjax experiment run NAME` makes each, and "
         "`experiments/NAME/results.md` has its full caption. `make gallery` takes 20 minutes the first time.",
         "",

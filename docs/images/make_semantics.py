@@ -12,7 +12,6 @@ from pathlib import Path
 import cv2
 import jax.numpy as jnp
 import numpy as np
-from make_picture import join
 
 from gsjax.engine.track.saved import SavedRun, open_run
 from gsjax.engine.track.views import views
@@ -21,7 +20,7 @@ from gsjax.methods.track import distill_features, first_pose, render_features
 from gsjax.perception.gabor import GaborEncoder
 from gsjax.viz.colors import PcaColors, colorize_features, fit_pca_colors, overlay_labels, to_uint8
 
-WIDTH, MOMENTS = 400, 3
+WIDTH, MOMENTS, GAP = 400, 3, 6
 _BARE = 236  # where the scene was never seen
 
 
@@ -61,6 +60,14 @@ def _sized(picture: np.ndarray) -> np.ndarray:
     height = round(WIDTH * picture.shape[0] / picture.shape[1])
     how = cv2.INTER_AREA if picture.shape[1] > WIDTH else cv2.INTER_CUBIC
     return cv2.resize(picture, (WIDTH, height), interpolation=how)
+
+
+def join(parts: list[np.ndarray], axis: int) -> np.ndarray:
+    """The parts beside each other with a white gap between them."""
+    shape = list(parts[0].shape)
+    shape[axis] = GAP
+    white = np.full(shape, 255, np.uint8)
+    return np.concatenate([piece for part in parts for piece in (white, part)][1:], axis=axis)
 
 
 if __name__ == "__main__":
