@@ -1,10 +1,11 @@
 """`gsjax query`: find what a text means in a run: an object of a tracked run, in every frame; Gaussians where
 there is a field (`gsjax distill`); or Gaussians over time in a deforming scene (`gsjax deform`)."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from time import perf_counter
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import tyro
 from rich.console import Console
@@ -56,14 +57,14 @@ class FieldOptions:
     """A picture of the thing to find; with an alpha channel, only its opaque part."""
     top: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
     """Select the N Gaussians with the best scores, instead of those above a threshold."""
-    level: Level | None = None
+    level: Level | Literal["auto"] = "auto"
     """Level to look on, in a field that was distilled with --level each: small for parts, large for things.
-    Default: the level that the query fits best; for --point, small."""
+    auto: the level that the query fits best; for --point, small."""
     within: Annotated[str | None, tyro.conf.arg(metavar="TEXT")] = None
     """Find only what is part of what this text finds, on the level that it fits best: `handle --within
     drawer`."""
     film: bool = True
-    """Film what was found in the scene of a run of `gsjax track`."""
+    """Film what was found, over all frames, where the field is that of a run of `gsjax track`."""
     scene: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """Present path of the scene's file, if it was moved (default: its first path, or next to the field)."""
     images: Annotated[str | None, tyro.conf.arg(metavar="FOLDER")] = None
@@ -251,11 +252,13 @@ def _print(question: Question, unit: str, seen_in: str, info: dict[str, Any], se
     least = "above" if question.top is None else "at least"
     rows = {
         "found": f"{question.words}{meant}: {info['gaussians']:,} of {info['of']:,} Gaussians",
-        "centre": ", ".join(f"{x:.3f}" for x in info["center"]) + unit,
+        "centre": _place(info["center"], unit, info["frame"]),
         "size": " x ".join(f"{x:.3f}" for x in info["size"]) + unit,
         "score": f"{least} {info['threshold']:.3f} ({info['rule']}), {info['best_score']:.3f} at best"
         + against,
     }
+    if (last := info["at_last"]) is not None and last["frame"] != info["frame"]:
+        rows["at last"] = _place(last["center"], unit, last["frame"])
     if pixels := info["pixels"]:
         unseen = [name for name, count in pixels.items() if not count]
         more = ", ..." if len(unseen) > _LISTED else ""
@@ -265,6 +268,11 @@ def _print(question: Question, unit: str, seen_in: str, info: dict[str, Any], se
     rows["time"] = f"{seconds:.1f} s, of which the query took {1e3 * info['query_seconds']:.1f} ms"
     for name, row in rows.items():
         print(f"{name:<10}{row}")
+
+
+def _place(center: Sequence[float], unit: str, frame: int | None) -> str:
+    """A place in words, and the frame in which it is one."""
+    return ", ".join(f"{x:.3f}" for x in center) + unit + ("" if frame is None else f" in frame {frame}")
 
 
 def _question(options: Options) -> Question:
@@ -278,7 +286,7 @@ def _question(options: Options) -> Question:
         camera=options.camera,
         frame=deform.frame,
         frames=deform.frames,
-        level=options.field.level,
+        level=None if options.field.level == "auto" else options.field.level,
         within=options.field.within,
         threshold=gaussians.threshold,
         top=options.field.top,

@@ -314,6 +314,8 @@ def answer(
             "of": len(selected),
             "best_score": float(found.scores.max()),
             "center": means.mean(axis=0),
+            "frame": None if run.frame_ids is None else int(run.frame_ids[frame]),
+            "at_last": None if run.frame_ids is None else _at_last(run, selected),
             "size": np.ptp(means, axis=0),
             "query_seconds": found.seconds,
             "pixels": pixels,
@@ -321,6 +323,13 @@ def answer(
         }
         write_json(new / "query.json", info)
     return info
+
+
+def _at_last(run: Queryable, selected: Bool[np.ndarray, "n"]) -> dict[str, Any]:
+    """The number of the last frame, and the middle of the selected Gaussians in it."""
+    assert run.frame_ids is not None
+    means = np.asarray(run.at(len(run.frame_ids) - 1).means)[selected]
+    return {"frame": int(run.frame_ids[-1]), "center": in_world(means, run.origin).mean(axis=0)}
 
 
 def asking_of(run: Queryable) -> Asking:
@@ -373,12 +382,18 @@ def write_mask(folder: Path, name: str, mask: Bool[np.ndarray, "h w"]) -> int:
 def _check_count(run: Queryable, found: Selection, notes: Notes) -> None:
     """Raises ValueError if nothing is selected, and warns if everything is."""
     selected, threshold, words = found.selected, found.threshold, found.question.words
+    if not selected.any() and not math.isfinite(threshold.value):
+        raise ValueError(
+            f"{words} fits all Gaussians alike, with a score of {found.scores.max():.3f}, so none can be told "
+            "from the others; take --threshold, --top or --negatives"
+        )
     if not selected.any():
         where = "" if run.frame_ids is None else f" in frame {run.frame_ids[found.frame]}"
+        place = found.scores if found.place is None else found.scores[found.place.selected]
+        within, best = "" if found.place is None else "there ", float(place.max())
         raise ValueError(
-            f"{words} matches nothing in this scene{where}: the best score is "
-            f"{found.scores.max():.3f}, and more than {threshold.value:.5g} is required ({threshold.rule}); "
-            "try a lower --threshold"
+            f"{words} matches nothing in this scene{where}: the best score {within}is {best:.3f}, and more "
+            f"than {threshold.value:.5g} is required ({threshold.rule}); try a lower --threshold"
         )
     if selected.all():
         notes.warn(

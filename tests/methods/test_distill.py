@@ -154,10 +154,9 @@ def test_the_result_scores_its_gaussians_and_others(two_balls, result, problem):
     np.testing.assert_array_equal(result.query("2", encoder=reader), result.scores(BOOK[2:]))
     with pytest.raises(ValueError, match="encoder: expected one that reads texts"):
         result.query("can")
-    with pytest.raises(
-        ValueError, match="expected a query of 24 numbers, as in this field's features, found 7"
-    ):
-        result.scores(BOOK[:, :7])
+    for wrong in (BOOK[:, :7], BOOK[0]):
+        with pytest.raises(ValueError, match=r"expected queries \[q, 24\], as long as this field's features"):
+            result.scores(wrong)
     with pytest.raises(ValueError, match="means: expected the centres"):
         replace(result, means=None).features()
 

@@ -96,6 +96,17 @@ def test_conjugate_gradients_reach_the_dense_solution_in_float64(scene, kind):
     assert not any(info["skipped"] for info in infos)
 
 
+@pytest.mark.parametrize("preset", ["vote", "solve"])
+def test_what_is_seen_and_in_no_mask_is_nothing(scene, preset):
+    """Not what lies beside it: one ball has masks, the other and the background have none."""
+    gaussians, labels, masks = scene
+    teacher = teacher_of_objects([np.where(mask == 1, 1, -1) for mask in masks], [BOOK] * len(masks))
+    ticks, _ = solved(gaussians, teacher, PRESETS[preset])
+    cosines = np.asarray(ticks.result.cosines(BOOK[1:2]))[:, 0]
+    assert (cosines[labels == 1] > 0.99).all()
+    assert (cosines[labels == 2] == 0).mean() > 0.9  # but for those at the outline of the first
+
+
 @pytest.mark.usefixtures("x64")
 @pytest.mark.parametrize("kind", ["masks", "maps", "both"])
 @pytest.mark.parametrize(("dtype", "error"), [(jnp.float64, 1e-7), (jnp.float32, 2e-5)])

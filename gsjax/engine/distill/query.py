@@ -39,6 +39,7 @@ if TYPE_CHECKING:
 else:
     OverTime = Any  # slow to import, as all that tracks is
 
+_LEAST_LENGTH = 0.05  # of a feature; those that teach have a mean length of 1
 _LEAST_ALPHA = 0.5  # share of a pixel's light that the scene must send
 _PANEL_HEIGHT = 240  # pixels, at least
 
@@ -235,7 +236,14 @@ class QueryableField(Queryable):
                 f"--point {x:g},{y:g}: expected a pixel that shows the scene, found an empty one; choose "
                 "another"
             )
-        return np.asarray(features[0])[run.stored.channels(question.level or next(iter(self.levels), None))]
+        level = question.level or next(iter(self.levels), None)
+        vector = np.asarray(features[0])[run.stored.channels(level)]
+        if np.linalg.norm(vector) < _LEAST_LENGTH:
+            raise ValueError(
+                f"--point {x:g},{y:g}: expected something that a mask covered when the field was distilled, "
+                "found what none did; choose another"
+            )
+        return vector
 
 
 def _changed_at(file: Path) -> int | None:

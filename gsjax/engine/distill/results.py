@@ -16,6 +16,7 @@ from gsjax.engine.summary import (
 )
 from gsjax.viz.plots import losses_over_steps, save
 
+_ASK = {"files": "--point X,Y --camera ID"}  # features of an unknown encoder read no texts
 SCORES = (
     Score("cosine to the teacher", "cosine", "", 3, "more", at("test", "cosine")),
     Score("mIoU 2D", "miou_2d", "", 3, "more", at("test", "miou_2d")),
@@ -62,6 +63,6 @@ def summarize(folder: RunFolder, found: Metrics) -> Summary:
         ],
         notes=[*names, *found["notes"]],
         machine=found["machine"],
-        hints=[("query it", f"gsjax query {folder.path} TEXT")],
+        hints=[("query it", f"gsjax query {folder.path} {_ASK.get(found['features'], 'TEXT')}")],
         complete=found["complete"],
     )

@@ -230,10 +230,10 @@ class DistillResult:
 
     def _queries(self, vectors: Float[ArrayLike, "q d"]) -> Float[Array, "q d"]:
         queries = jnp.asarray(vectors, self.field.lift.dtype)
-        if queries.shape[1] != self._dimension:
+        if queries.ndim != 2 or queries.shape[1] != self._dimension:
             raise ValueError(
-                f"expected a query of {self._dimension} numbers, as in this field's features, found "
-                f"{queries.shape[1]}; use the encoder that the field was distilled from (--weights)"
+                f"expected queries [q, {self._dimension}], as long as this field's features, found "
+                f"{list(queries.shape)}; use the encoder that the field was distilled from (--weights)"
             )
         return queries
 

@@ -35,6 +35,7 @@ from gsjax.optim.step import Step, all_finite
 from gsjax.rasterize.frozen import paint_shown, rows_within, strip_of
 
 _LEAST = 1e-12
+_TOLD = 0.05  # share of the pixels that show a Gaussian that must have a teacher
 _SPREAD = 64  # most neighbours over which a vector spreads to Gaussians that no pixel shows
 
 
@@ -60,7 +61,8 @@ class SolveState(NamedTuple):
     Attributes:
         total: the sums of the present pass over the views.
         wanted: the right-hand side.
-        mass: D, how much pixels show of each Gaussian.
+        mass: D, how much pixels that have a teacher show of each Gaussian.
+        shown: how much all pixels show of it.
         tie: lambda.
         conjugate: the state of the iterations; None for a vote.
         target: sum of the squared targets, sum_p m_p |alpha_p e_p|^2.
@@ -71,6 +73,7 @@ class SolveState(NamedTuple):
     total: Float[Array, "n r"]
     wanted: Float[Array, "n r"]
     mass: Float[Array, "n"]
+    shown: Float[Array, "n"]
     tie: Float[Array, ""]
     conjugate: Conjugate | None
     target: Float[Array, ""]
@@ -79,10 +82,11 @@ class SolveState(NamedTuple):
 
 
 class _Sums(NamedTuple):
-    """What a view adds to a pass: to its Gaussians' rows, to `mass`, `target` and `pixels`."""
+    """What a view adds to a pass: to its Gaussians' rows, to `mass`, `shown`, `target` and `pixels`."""
 
     rows: Float[Array, "seen r"]
     mass: Float[Array, "seen"]
+    shown: Float[Array, "seen"]
     target: Float[Array, ""]
     pixels: Float[Array, ""]
 
@@ -106,7 +110,7 @@ def solve_step(config: DistillConfig) -> Step:
         each = jnp.zeros(len(empty), empty.dtype)
         nothing = Conjugate(empty, empty, jnp.zeros(empty.shape[1], empty.dtype))
         nothing = None if config.start == "vote" else nothing
-        return SolveState(empty, empty, each, zero, nothing, zero, zero, zero)
+        return SolveState(empty, empty, each, each, zero, nothing, zero, zero, zero)
 
     def update(field: FeatureField, state: SolveState, batch: SolveBatch, *, step: Any, key: Any):
         turn, rows = jnp.asarray(batch.turn), batch.view.view.rows
@@ -124,6 +128,7 @@ def solve_step(config: DistillConfig) -> Step:
         summed = state._replace(
             total=state.total.at[rows].add(found.rows),
             mass=state.mass.at[rows].add(found.mass),
+            shown=state.shown.at[rows].add(found.shown),
             target=target,
             pixels=pixels,
             loss=jnp.where(turn == 0, target / jnp.maximum(pixels, 1.0), state.loss),
@@ -194,20 +199,21 @@ def graph_of(means: Float[Array, "n 3"], config: DistillConfig) -> Int[Array, "n
 
 
 def _targets_drawn_back(batch: Batch, config: DistillConfig) -> _Sums:
-    """W^T M alpha e and W^T M alpha of a view."""
+    """W^T M alpha e, W^T M alpha and W^T alpha of a view."""
     features = batch.map if batch.codebook is None else batch.codebook
     assert features is not None
-    empty = jnp.zeros((len(batch.view.rows), features.shape[-1] + 1), features.dtype)
+    empty = jnp.zeros((len(batch.view.rows), features.shape[-1] + 2), features.dtype)
 
     def cotangent(first, inside, image, alphas):
         targets, weights = _targets(batch, first, inside, config.weights.map, alphas.dtype)
         shown = alphas[..., None] * targets
         squares = jnp.where(weights > 0, jnp.sum(shown**2, axis=-1) / jnp.maximum(weights, _LEAST), 0.0)
-        joined = jnp.concatenate([shown, (weights * alphas)[..., None]], axis=-1)
+        every = inside[:, None] * alphas
+        joined = jnp.concatenate([shown, jnp.stack([weights * alphas, every], axis=-1)], axis=-1)
         return joined, squares.sum(), weights.sum()
 
     back, target, pixels = _drawn_back(empty, batch, config, cotangent)
-    return _Sums(back[:, :-1], back[:, -1], target, pixels)
+    return _Sums(back[:, :-2], back[:, -2], back[:, -1], target, pixels)
 
 
 def _product(values: Float[Array, "n r"], batch: Batch, config: DistillConfig) -> _Sums:
@@ -219,7 +225,8 @@ def _product(values: Float[Array, "n r"], batch: Batch, config: DistillConfig) -
         return weights[..., None] * image, zero, zero
 
     back, target, pixels = _drawn_back(values[batch.view.rows], batch, config, cotangent)
-    return _Sums(back, jnp.zeros(len(back), back.dtype), target, pixels)
+    nothing = jnp.zeros(len(back), back.dtype)
+    return _Sums(back, nothing, nothing, target, pixels)
 
 
 def _drawn_back(values: Float[Array, "seen c"], batch: Batch, config: DistillConfig, cotangent):
@@ -282,11 +289,13 @@ def _after_pass(field: FeatureField, state: SolveState, batch: SolveBatch, confi
 
 
 def _voted(field: FeatureField, state: SolveState, neighbors, config: DistillConfig):
-    """After the vote: it is the first guess, and what no pixel shows has the mean of its neighbours."""
+    """After the vote: it is the first guess, and what no pixel shows has the mean of its neighbours. What
+    pixels show that have no teacher has nothing: it lies beside things, but is none of them."""
     seen = state.mass > _LEAST
     votes = jnp.where(seen[:, None], state.total / jnp.maximum(state.mass, _LEAST)[:, None], 0.0)
     tie = config.solve.smoothness * state.mass.sum() / jnp.maximum(seen.sum(), 1)
-    field = eqx.tree_at(lambda f: f.encoding, field, _spread(votes, seen, neighbors))
+    found = _spread(votes, seen | _untold(state), neighbors)
+    field = eqx.tree_at(lambda f: f.encoding, field, _without_untold(found, state))
     return field, state._replace(wanted=state.total, tie=tie)
 
 
@@ -305,8 +314,18 @@ def _advanced(field: FeatureField, state: SolveState, neighbors, config: Distill
     product = state.total + state.tie * _laplacian(state.conjugate.direction, neighbors)
     scale = _preconditioner(state, neighbors)
     x, after = advanced(field.encoding, state.conjugate, product, scale)
-    field = eqx.tree_at(lambda f: f.encoding, field, x)
+    field = eqx.tree_at(lambda f: f.encoding, field, _without_untold(x, state))
     return field, state._replace(conjugate=after, loss=_objective(x, after.residual, state))
+
+
+def _untold(state: SolveState) -> Bool[Array, "n"]:
+    """The Gaussians that pixels show, but hardly any that has a teacher."""
+    return (state.shown > _LEAST) & (state.mass <= _TOLD * state.shown)
+
+
+def _without_untold(x: Float[Array, "n r"], state: SolveState) -> Float[Array, "n r"]:
+    """The vectors, zeros for those that nobody has told anything of."""
+    return jnp.where(_untold(state)[:, None], 0.0, x)
 
 
 def _preconditioner(state: SolveState, neighbors: Int[Array, "n k"]) -> Float[Array, "n"]:

@@ -80,7 +80,7 @@ def test_features_on_three_levels_are_learned_together(shown, pristine, tmp_path
     assert read_field(tmp_path / "field.npz").levels == result.levels
     with pytest.raises(ValueError, match="level: expected small, medium, large, found huge"):
         result.scores(codes[:1], "huge")
-    with pytest.raises(ValueError, match=r"expected a query of 20 numbers, .* found 60"):
+    with pytest.raises(ValueError, match=r"expected queries \[q, 20\], .* found \[1, 60\]"):
         result.scores(np.ones((1, 60)))
 
 

@@ -103,6 +103,21 @@ def test_a_query_is_of_the_level_that_it_fits_best_or_of_a_given_one(gsjax, pris
         assert f"'{name}', on level {level}: " in said
 
 
+def test_a_field_is_opened_in_python(field, scene, tmp_path):
+    from gsjax import open_field
+
+    found = open_field(field)
+    np.testing.assert_array_equal(np.asarray(found.query("can")) > 0.5, scene[1] == CAN)
+    with pytest.raises(FileNotFoundError, match=r"expected a field \(field\.npz\), found none"):
+        open_field(tmp_path / "nothing")
+    gaussians = read_ply(scene[0])[0]
+    write_ply(
+        tmp_path / "other.ply", eqx.tree_at(lambda g: g.means, gaussians, np.asarray(gaussians.means) + 1)
+    )
+    with pytest.warns(UserWarning, match="has changed since the field"):
+        open_field(field, tmp_path / "other.ply")
+
+
 def test_a_level_that_a_field_has_not(gsjax, field):
     code, said = gsjax("query", field, "can", "--level", "small")
     assert code == 2
