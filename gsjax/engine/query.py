@@ -384,8 +384,8 @@ def _check_count(run: Queryable, found: Selection, notes: Notes) -> None:
     selected, threshold, words = found.selected, found.threshold, found.question.words
     if not selected.any() and not math.isfinite(threshold.value):
         raise ValueError(
-            f"{words} fits all Gaussians alike, with a score of {found.scores.max():.3f}, so none can be told "
-            "from the others; take --threshold, --top or --negatives"
+            f"{words} fits all Gaussians alike, with a score of {found.scores.max():.3f}, so none can be "
+            "told from the others; take --threshold, --top or --negatives"
         )
     if not selected.any():
         where = "" if run.frame_ids is None else f" in frame {run.frame_ids[found.frame]}"

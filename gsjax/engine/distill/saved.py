@@ -102,8 +102,8 @@ def field_of(path: Path) -> Path | None:
 
 
 def open_field(path: str | os.PathLike, scene: str | os.PathLike | None = None) -> DistillResult:
-    """The field that `gsjax distill` made, with the Gaussians of its scene. Warns with UserWarning if the scene
-    has changed since.
+    """The field that `gsjax distill` made, with the Gaussians of its scene. Warns with UserWarning if the
+    scene has changed since.
 
     Args:
         path: the field's folder, or the run that it is in.
