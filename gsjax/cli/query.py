@@ -1,13 +1,14 @@
 """`gsjax query`: find what a text means in a run: an object of a tracked run, in every frame; Gaussians where
 there is a field (`gsjax distill`); or Gaussians over time in a deforming scene (`gsjax deform`)."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from time import perf_counter
 from typing import Annotated, Any, Literal
 
+import numpy as np
 import tyro
+from jaxtyping import Float
 from rich.console import Console
 
 from gsjax.engine.distill.file import FOLDER
@@ -270,7 +271,7 @@ def _print(question: Question, unit: str, seen_in: str, info: dict[str, Any], se
         print(f"{name:<10}{row}")
 
 
-def _place(center: Sequence[float], unit: str, frame: int | None) -> str:
+def _place(center: Float[np.ndarray, "3"], unit: str, frame: int | None) -> str:
     """A place in words, and the frame in which it is one."""
     return ", ".join(f"{x:.3f}" for x in center) + unit + ("" if frame is None else f" in frame {frame}")
 
