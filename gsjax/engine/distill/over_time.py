@@ -1,6 +1,7 @@
 """What a query of a field finds, over the frames of the tracked run whose Gaussians carry the field along: no
 encoder runs again."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -57,7 +58,7 @@ class OverTime:
     def write(
         self,
         folder: Path,
-        painted: Gaussians,
+        paint: Callable[[np.ndarray], Gaussians],
         selected: Bool[np.ndarray, "n"],
         camera: str | None,
         drawer: Drawer,
@@ -67,11 +68,12 @@ class OverTime:
         """Write over_time.npz: the number of each frame (`frames`), the means of what was found [T,n,3] and,
         with the recording, the time of each frame (`times`) and the number of pixels that show what was found
         (`pixels`); and then video.mp4, the frames of a camera with what was found in its colours and the rest
-        dimmed.
+        dimmed. Where most of what was found is of objects, what is not stays behind as they move, and is left
+        out.
 
         Args:
             folder: for the files.
-            painted: the scene; red is 1 in what was found, else 0.
+            paint: paints the scene, red 1 in what is given, else 0.
             selected: what was found.
             camera: its name (default, and where a photograph of another name was asked about: the first
                 held-out one, else the first tracked).
@@ -80,10 +82,14 @@ class OverTime:
             console: shows the progress.
         """
         arrays: dict[str, np.ndarray] = {"frames": np.array(self.frame_ids)}
+        carried = selected & (np.asarray(self.tracking.scene.labels) != 0)
+        selected = carried if 2 * carried.sum() > selected.sum() else selected
         arrays["means"] = in_world(self.tracking.means()[:, selected], self.origin)
         if self.saved is not None:
             try:
-                arrays |= self._film(self.saved, folder / "video.mp4", painted, camera, drawer, console)
+                arrays |= self._film(
+                    self.saved, folder / "video.mp4", paint(selected), camera, drawer, console
+                )
             except (ValueError, OSError) as error:
                 notes.warn(f"what was found is not filmed: {describe(error)}")
         write_npz(folder / "over_time.npz", arrays)

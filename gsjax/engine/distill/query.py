@@ -11,7 +11,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 from rich.console import Console
 from rich.progress import track
 
@@ -154,8 +154,7 @@ class QueryableField(Queryable):
         names, pixels = short_names(photographs.names), {}
         low, high = _ends(scores)
         shares = np.clip((np.nan_to_num(scores) - low) / max(high - low, 1e-6), 0, 1)
-        painted = np.stack([selected, shares, np.zeros(len(scores))], axis=1).astype(np.float32)
-        values = _painted(run.gaussians, painted)
+        values = _with_shares(run.gaussians, selected, shares)
         best: tuple[float, int, np.ndarray] | None = None
         for v in track(which, "drawing", console=console, transient=True):
             drawn = drawer(values, _one(photographs.camera(v))).colors
@@ -190,7 +189,8 @@ class QueryableField(Queryable):
         write_png(folder / "overview.png", in_rows(panels, len(panels) // 2, _PANEL_HEIGHT))
         if self._over_time is not None:
             name = None if question.camera is None else question.camera.split("/")[0]
-            self._over_time.write(folder, values, selected, name, drawer, notes, console)
+            paint = partial(_with_shares, run.gaussians, shares=shares)
+            self._over_time.write(folder, paint, selected, name, drawer, notes, console)
         return pixels
 
     def _read(self, text: str, negatives: tuple[str, ...] | None) -> Prompt:
@@ -273,6 +273,14 @@ def _ends(scores: Float[np.ndarray, "n"]) -> tuple[float, float]:
     """The least and largest score, without a few outliers at the lower end."""
     scores = np.nan_to_num(scores)
     return float(np.percentile(scores, 1)), float(scores.max())
+
+
+def _with_shares(
+    gaussians: Gaussians, selected: Bool[np.ndarray, "n"], shares: Float[np.ndarray, "n"]
+) -> Gaussians:
+    """The scene with red 1 in what is selected, and green the shares."""
+    colors = np.stack([selected, shares, np.zeros(len(shares))], axis=1)
+    return _painted(gaussians, colors.astype(np.float32))
 
 
 def _seen_from(gaussians: Gaussians, camera: Camera) -> Gaussians:
