@@ -36,7 +36,7 @@ def signatures() -> dict[str, str]:
 
 def page() -> str:
     """The page, from the source of the public names."""
-    blocks = [f"## {name}\n\n```py\n{signature}\n```\n" for name, signature in signatures().items()]
+    blocks = [f"## {name}\n\n```\n{signature}\n```\n" for name, signature in signatures().items()]
     return _INTRODUCTION + "\n" + "\n".join(blocks)
 
 
