@@ -15,8 +15,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from gsjax.data import Photographs, Sequence, open_photographs, open_sequence
-    from gsjax.engine.checkpoint import load, open_scene, save
-    from gsjax.engine.distill.saved import open_field
+    from gsjax.engine.checkpoint import load, open_field, open_scene, save
     from gsjax.engine.verbs import deform, distill, fit, parts, track
     from gsjax.geometry.cameras import Camera
     from gsjax.io.ply import read_ply, write_ply
@@ -40,8 +39,7 @@ __version__ = "0.1.0"
 # Loaded at first use (PEP 562): `gsjax --help` need not wait for JAX.
 _HOMES = {
     "gsjax.data": ("Photographs", "Sequence", "open_photographs", "open_sequence"),
-    "gsjax.engine.checkpoint": ("load", "open_scene", "save"),
-    "gsjax.engine.distill.saved": ("open_field",),
+    "gsjax.engine.checkpoint": ("load", "open_field", "open_scene", "save"),
     "gsjax.engine.verbs": ("deform", "distill", "fit", "parts", "track"),
     "gsjax.geometry.cameras": ("Camera",),
     "gsjax.io.ply": ("read_ply", "write_ply"),

@@ -1,5 +1,5 @@
 """What was reconstructed, read back: `gsjax.save` and `gsjax.load`, a tick of any method in one file, without
-a template; and `gsjax.open_scene`, the scene of a run of the command line."""
+a template; and `gsjax.open_scene` and `gsjax.open_field`, what commands made."""
 
 import dataclasses
 import os
@@ -11,8 +11,10 @@ from gsjax.engine.drive import Tick
 from gsjax.io.checkpoints import CheckpointError, load_checkpoint, save_checkpoint
 
 if TYPE_CHECKING:
+    from gsjax.methods.distill import DistillResult
     from gsjax.viz.viewer import Viewable
 else:
+    DistillResult = Any
     Viewable = Any  # slow to import, as all that shows a scene is
 
 
@@ -81,3 +83,29 @@ def open_scene(path: str | os.PathLike) -> Viewable:
     for text in notes.warnings:
         warnings.warn(text, UserWarning, stacklevel=2)
     return scene
+
+
+def open_field(path: str | os.PathLike, scene: str | os.PathLike | None = None) -> DistillResult:
+    """The field that `gsjax distill` made, with the Gaussians of its scene. What is odd is warned of.
+
+    Args:
+        path: the field's folder, or the run that it is in.
+        scene: present path of the scene's file, if it was moved.
+
+    Raises:
+        FileNotFoundError: there is no field, or its scene is missing.
+        ValueError: a file has other contents, or the field does not fit the scene.
+    """
+    from rich.console import Console
+
+    from gsjax.engine.distill.saved import Whereabouts, field_of, open_field_run
+    from gsjax.engine.messages import Notes
+
+    folder = field_of(Path(path))
+    if folder is None:
+        raise FileNotFoundError(f"{path}: expected a field (field.npz), found none; gsjax distill makes one")
+    notes, now = Notes(Console(quiet=True)), Whereabouts(None if scene is None else Path(scene))
+    found = open_field_run(folder, notes, now, photographs=False).stored
+    for text in notes.warnings:
+        warnings.warn(text, UserWarning, stacklevel=2)
+    return found

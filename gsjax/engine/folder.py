@@ -20,8 +20,7 @@ from gsjax.io.parsed import parse_json, parse_yaml
 from gsjax.io.scenes import is_scene
 from gsjax.io.sequences import scenes_in_words, scenes_within
 
-DEFORMATION = "deformation.npz"
-"""The scene of a run of `gsjax deform`, over time."""
+DEFORMATION = "deformation.npz"  # the scene of a run of `gsjax deform`, over time
 _WRITTEN = (
     *("config.yml", "metrics.json", "metrics.jsonl", "report.html", "trajectory.npz", "scene.ply"),
     *("cameras.npz", "poses.npz", "parts.npz", "field.npz", DEFORMATION, "video_*.mp4", ".*.partial*"),
@@ -29,10 +28,7 @@ _WRITTEN = (
     *("scene_labels.npz", "resume"),
 )
 """All that a run, and what is made from it, writes into its folder; `screenshots` are kept."""
-_VALUABLE = (
-    *("metrics.json", "trajectory.npz", "scene.ply", "canonical/scene.ply", "field.npz"),
-    DEFORMATION,
-)
+_VALUABLE = ("metrics.json", "trajectory.npz", "scene.ply", "canonical/scene.ply", "field.npz", DEFORMATION)
 """Results that make an unfinished run worth keeping."""
 _RESUMED = ("resume/*", "canonical/resume/*", "canonical/scene.ply")
 """What a run resumes from; `gsjax parts` contains a fit, which may be all that is there."""

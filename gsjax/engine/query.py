@@ -3,12 +3,9 @@ the files about them. A kind of run adds how it is asked and drawn (`Queryable`)
 deforms."""
 
 import math
-import re
-import threading
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
-from itertools import count
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -22,17 +19,15 @@ from rich.console import Console
 from gsjax.engine.files import write_scene
 from gsjax.engine.folder import OF_QUERY, replaced_folder
 from gsjax.engine.messages import Notes
-from gsjax.io.atomic import write_json, write_new, write_npz
+from gsjax.io.atomic import write_json, write_npz
 from gsjax.io.pictures import write_png
 from gsjax.methods.query import Prompt, Threshold
 from gsjax.scene.gaussians import Gaussians
 from gsjax.scene.origin import in_world
 from gsjax.scene.selection import only, shifted, tinted
-from gsjax.viz.viewer import Answer, Asking
 
 SCENE_CAPTIONS = {"recolored": "recoloured", "moved": "moved"}
 """Captions of the scenes of `Question.changed`, by the names of their files."""
-_EXTRACTED = "extracted"  # folder of parts that the viewer saved, in that of the run
 _HIGHEST = 1.0  # highest score: a cosine is from -1 to 1, a share against others from 0 to 1
 
 
@@ -195,7 +190,13 @@ class Queryable(ABC):
 
     @abstractmethod
     def like(self, row: int, frame: int, level: str | None) -> Prompt:
-        """The prompt for what is similar to a Gaussian, by its row, on a level (default: the smallest)."""
+        """The prompt for what is similar to a Gaussian.
+
+        Args:
+            row: of the Gaussian.
+            frame: index of the frame.
+            level: of its features (default: the smallest).
+        """
 
     @abstractmethod
     def scorer(self, prompt: Prompt, frame: int) -> Callable[[], Float[Array, "n"]]:
@@ -292,9 +293,9 @@ def answer(
         _write_selection(new / "selection.npz", run, gaussians, found)
         for name, kept in (("object", selected), ("without", ~selected)):
             if kept.any():
-                _write_part(new / f"{name}.ply", run, gaussians, kept)
+                write_part(new / f"{name}.ply", run, gaussians, kept)
         for name, scene in question.changed(gaussians, selected).items():
-            _write_part(new / f"{name}.ply", run, scene)
+            write_part(new / f"{name}.ply", run, scene)
         pixels = run.draw(new, found, notes, console)
         means = in_world(np.asarray(gaussians.means)[selected], run.origin)
         info = {
@@ -330,41 +331,6 @@ def _at_last(run: Queryable, selected: Bool[np.ndarray, "n"]) -> dict[str, Any]:
     assert run.frame_ids is not None
     means = np.asarray(run.at(len(run.frame_ids) - 1).means)[selected]
     return {"frame": int(run.frame_ids[-1]), "center": in_world(means, run.origin).mean(axis=0)}
-
-
-def asking_of(run: Queryable) -> Asking:
-    """Queries of a run for the viewer's page, which saves to `extracted/` in the run's folder."""
-    one_by_one = threading.Lock()
-
-    def answered(words: str, question: Question, frame: int, prompt: Prompt) -> Answer:
-        found = select(run, question, frame, prompt)
-        on = "" if prompt.level is None else f" on level {prompt.level}"
-        return Answer(words + on, found.scores, *found.threshold, found.seconds)
-
-    def ask(text: str, frame: int, level: str | None = None) -> Answer:
-        question = Question(text=text, level=level)
-        with one_by_one:  # several pages may query before the encoder is loaded
-            run.refresh()
-            prompt = run.prompt(question, frame)
-        return answered(text, question, frame, prompt)
-
-    def like(row: int, frame: int, level: str | None = None) -> Answer:
-        with one_by_one:
-            run.refresh()
-        prompt = run.like(row, frame, level)
-        meant = "" if prompt.name is None else f" ({prompt.name})"
-        return answered(f"like Gaussian {row}{meant}", Question(), frame, prompt)
-
-    def save(selected: Bool[np.ndarray, "n"], name: str, frame: int) -> Path:
-        folder = run.path / _EXTRACTED
-        folder.mkdir(exist_ok=True)
-        called = name if run.frame_ids is None else f"{name} frame {run.frame_ids[frame]}"
-        stem = "_".join(re.findall(r"[^\W_]+", called.lower())) or "selection"
-        files = (folder / (f"{stem}.ply" if number == 1 else f"{stem}_{number}.ply") for number in count(1))
-        gaussians = run.at(frame)
-        return write_new(files, lambda path: _write_part(path, run, gaussians, selected))
-
-    return Asking(run.hint, ask, like, save, run.levels)
 
 
 def write_mask(folder: Path, name: str, mask: Bool[np.ndarray, "h w"]) -> int:
@@ -411,10 +377,17 @@ def _write_selection(path: Path, run: Queryable, gaussians: Gaussians, found: Se
     write_npz(path, arrays | {"all_scores": all_scores})
 
 
-def _write_part(
+def write_part(
     path: Path, run: Queryable, gaussians: Gaussians, kept: Bool[np.ndarray, "n"] | None = None
 ) -> None:
-    """Writes some Gaussians (default: all) as a PLY file, with their labels where there are any."""
+    """Writes Gaussians as a PLY file, with their labels where there are any.
+
+    Args:
+        path: the file.
+        run: of the Gaussians.
+        gaussians: all of them.
+        kept: which are written (default: all).
+    """
     labels = run.labels
     if kept is not None:
         gaussians, labels = only(gaussians, kept), None if labels is None else labels[kept]

@@ -11,6 +11,7 @@ import numpy as np
 from gsjax.data.ordered import open_as_sequence
 from gsjax.data.origin import relative_to_origin
 from gsjax.data.photographs import Photographs
+from gsjax.engine.asking import asking_of
 from gsjax.engine.deform.file import read_beside, read_deformation
 from gsjax.engine.deform.query import QueryableScene, probabilities_of
 from gsjax.engine.distill.file import NAME
@@ -24,7 +25,6 @@ from gsjax.engine.parts.films import edited, read_film
 from gsjax.engine.parts.saved import PartsRun, blend_of, open_parts_run, read_parts
 from gsjax.engine.parts.viewer import Filmed, camera_names, editing_of
 from gsjax.engine.photographs import photographs_of_run
-from gsjax.engine.query import asking_of
 from gsjax.engine.recording import Recording
 from gsjax.engine.track.saved import open_run, read_tracking
 from gsjax.io.parsed import parse_yaml

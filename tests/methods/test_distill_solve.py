@@ -104,7 +104,7 @@ def test_what_is_seen_and_in_no_mask_is_nothing(scene, preset):
     ticks, _ = solved(gaussians, teacher, PRESETS[preset])
     cosines = np.asarray(ticks.result.cosines(BOOK[1:2]))[:, 0]
     assert (cosines[labels == 1] > 0.99).all()
-    assert (cosines[labels == 2] == 0).mean() > 0.9  # but for those at the outline of the first
+    assert (cosines[labels == 2] == 0).mean() > 0.8  # but for those at the outline of the first
 
 
 @pytest.mark.usefixtures("x64")

@@ -1,7 +1,5 @@
 """The folder of `gsjax distill` read back: the field, its scene, and the photographs of it."""
 
-import os
-import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -12,7 +10,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
-from rich.console import Console
 
 from gsjax.data.photographs import Photographs
 from gsjax.engine.distill.file import FOLDER, NAME, read_field
@@ -99,29 +96,6 @@ class FieldRun:
 def field_of(path: Path) -> Path | None:
     """The folder of the field at `path`, or in the run there; None where there is none."""
     return next((folder for folder in (path, path / FOLDER) if (folder / NAME).is_file()), None)
-
-
-def open_field(path: str | os.PathLike, scene: str | os.PathLike | None = None) -> DistillResult:
-    """The field that `gsjax distill` made, with the Gaussians of its scene. Warns with UserWarning if the
-    scene has changed since.
-
-    Args:
-        path: the field's folder, or the run that it is in.
-        scene: present path of the scene's file, if it was moved.
-
-    Raises:
-        FileNotFoundError: there is no field, or its scene is missing.
-        ValueError: a file has other contents, or the field does not fit the scene.
-    """
-    folder = field_of(Path(path))
-    if folder is None:
-        raise FileNotFoundError(f"{path}: expected a field ({NAME}), found none; gsjax distill makes one")
-    now = Whereabouts(None if scene is None else Path(scene))
-    with Notes(Console(quiet=True)) as notes:
-        found = open_field_run(folder, notes, now, photographs=False).stored
-    for note in notes.all:
-        warnings.warn(note, stacklevel=2)
-    return found
 
 
 def open_field_run(
