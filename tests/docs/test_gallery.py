@@ -5,6 +5,7 @@ import shlex
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from tests.docs.blocks import ROOT, check_command
 
@@ -36,12 +37,28 @@ def test_what_was_stopped_is_made_anew(gallery, tmp_path):
         (tmp_path / "metrics.json").unlink()
 
 
-def test_the_page_is_as_the_script_has_it_and_its_pictures_are_small(gallery):
-    shown = {name: f"gallery/{name}.jpg" for name in gallery.SAYS}
-    assert gallery.PAGE.read_text(encoding="utf-8") == gallery.page(shown)
+def test_the_page_is_as_the_script_has_it_and_its_films_and_pictures_are_small(
+    gallery, monkeypatch, tmp_path
+):
+    monkeypatch.setattr(gallery, "RUNS", tmp_path)
+    (tmp_path / "furniture").mkdir()
+    (tmp_path / "furniture" / "video_3.mp4").touch()
+    files = {name: f"{name}.{'webp' if name in gallery.films() else 'jpg'}" for name in gallery.SAYS}
+    written = gallery.PAGE.read_text(encoding="utf-8")
+    monkeypatch.undo()
+    assert written == gallery.page({name: f"gallery/{file}" for name, file in files.items()})
     sizes = {path.name: path.stat().st_size for path in gallery.PICTURES.iterdir()}
-    assert sizes.keys() == {"trades.png", *(f"{name}.jpg" for name in gallery.SAYS)}
-    assert max(sizes.values()) < 150_000
+    assert sizes.keys() == {"trades.png", *files.values()}
+    assert max(sizes.values()) < 300_000
+
+
+def test_a_video_becomes_a_film_that_moves(gallery, monkeypatch, tmp_path):
+    frames = np.zeros((4, 60, 1000, 3), np.uint8)
+    frames[:, :, :, 0] = np.arange(4)[:, None, None] * 60
+    monkeypatch.setattr(gallery, "read_video_frames", lambda path: frames)
+    assert gallery.write_film(tmp_path / "some.webp", tmp_path / "some.mp4") == "gallery/some.webp"
+    with Image.open(tmp_path / "some.webp") as film:
+        assert (film.n_frames, film.size) == (4, (480, 29))
 
 
 def test_trades_are_those_of_the_committed_results(gallery, tmp_path):
