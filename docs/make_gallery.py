@@ -1,5 +1,5 @@
-"""Makes the gallery, docs/gallery.md with its short films and pictures in docs/gallery, and the figure of all
-trades.
+"""Makes the gallery, docs/gallery.md with its short films and pictures in docs/gallery, the figure of all
+trades, and the film of the README.
 
     .venv/bin/python docs/make_gallery.py            # `make gallery`
 
@@ -28,6 +28,7 @@ from gsjax.io.video import read_video_frames
 ROOT = Path(__file__).resolve().parents[1]
 RUNS, PICTURES, PAGE = ROOT / "runs/gallery", ROOT / "docs/gallery", ROOT / "docs/gallery.md"
 WIDTH, QUALITY = 900, 85  # of a picture, pixels at most, and of its JPEG
+OF_README, OF_README_WIDTH = ROOT / "docs/images/tracking.webp", 728
 FILM_WIDTH, FILM_HZ, FILM_QUALITY = 480, 10, 60  # of a film, and of its animated WebP
 
 TABLE = "simulated:tabletop?width=160&height=120&frames=1"
@@ -58,7 +59,9 @@ def main() -> None:
     PICTURES.mkdir(exist_ok=True)
     draw_trades(PICTURES / "trades.png")
     shown = {name: _write(name, picture) for name, picture in pictures().items()}
-    shown |= {name: write_film(PICTURES / f"{name}.webp", video) for name, video in films().items()}
+    for name, video in films().items():
+        shown[name] = write_film(PICTURES / f"{name}.webp", read_video_frames(video))
+    write_film(OF_README, panels_in_a_row(read_video_frames(films()["tracker"])), OF_README_WIDTH)
     PAGE.write_text(page(shown), encoding="utf-8")
 
 
@@ -93,11 +96,20 @@ def films() -> dict[str, Path]:
     }
 
 
-def write_film(path: Path, video: Path) -> str:
-    """Writes a video as an animated WebP, which pages show by themselves; returns its path from the page."""
-    frames = [Image.fromarray(frame) for frame in read_video_frames(video)]
+def panels_in_a_row(frames: np.ndarray, gap: int = 4) -> np.ndarray:
+    """Of frames with input and render above, error and labels below: input, render and labels in a row."""
+    height, width = frames.shape[1] // 2, frames.shape[2] // 2
+    panels = frames[:, :height, :width], frames[:, :height, width:], frames[:, height:, width:]
+    white = np.full((len(frames), height, gap, 3), 255, np.uint8)
+    return np.concatenate([panels[0], white, panels[1], white, panels[2]], axis=2)
+
+
+def write_film(path: Path, video: np.ndarray, most: int = FILM_WIDTH) -> str:
+    """Writes frames [T,H,W,3] as an animated WebP of at most that width, which pages show by themselves;
+    returns its path from the page."""
+    frames = [Image.fromarray(frame) for frame in video]
     width, height = frames[0].size
-    scale = min(1.0, FILM_WIDTH / width)
+    scale = min(1.0, most / width)
     small = [
         one.resize((round(scale * width), round(scale * height)), Image.Resampling.LANCZOS) for one in frames
     ]

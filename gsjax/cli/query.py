@@ -176,9 +176,8 @@ def _expect_track(path: Path) -> None:
 
 def _query_field(options: Options, path: Path, console: Console) -> None:
     """Query a field."""
-    from gsjax.engine.distill.query import (
-        QueryableField,
-    )  # each kind of run alone, as they are slow to import
+    # Each kind of run imports what it needs alone: all together they are slow to import.
+    from gsjax.engine.distill.query import QueryableField
 
     begun, folder = perf_counter(), options.run / "query"
     question = _question(options)

@@ -305,10 +305,10 @@ class _Followed(NamedTuple):
 def _extend(tracks: list[dict[int, int]], t: int, places: list[int], worlds: list[list[np.ndarray]]) -> None:
     """Give the instances of an object in frame `t` to its tracks, by the least squared distances from where
     those were last; new tracks take the rest."""
-    last = np.array([worlds[u := max(track)][track[u]][:3, 3] for track in tracks]).reshape(-1, 3)
-    now = np.array([worlds[t][i][:3, 3] for i in places])
     from scipy.optimize import linear_sum_assignment  # slow to import
 
+    last = np.array([worlds[u := max(track)][track[u]][:3, 3] for track in tracks]).reshape(-1, 3)
+    now = np.array([worlds[t][i][:3, 3] for i in places])
     rows, columns = linear_sum_assignment(np.square(last[:, None] - now).sum(-1))
     for row, column in zip(rows, columns, strict=True):
         tracks[row][t] = places[column]

@@ -98,7 +98,7 @@ class QueryableField(Queryable):
         prompt = self._prompt(question)
         level = question.level
         if level is None and question.point is not None:  # by itself it cannot say how much is meant
-            level = next(iter(self.levels), None)
+            level = self.run.stored.smallest
         return prompt._replace(level=level or self.run.stored.best_level(prompt.vectors))
 
     def _prompt(self, question: Question) -> Prompt:
@@ -124,7 +124,7 @@ class QueryableField(Queryable):
         return Prompt(np.stack([vector, *(run.encoder.embed_text(text) for text in against)]), against)
 
     def like(self, row: int, frame: int, level: str | None) -> Prompt:
-        level = level or next(iter(self.levels), None)
+        level = level or self.run.stored.smallest
         return Prompt(np.asarray(self.run.stored.direction(row, level))[None], level=level)
 
     def scorer(self, prompt: Prompt, frame: int) -> Callable[[], Float[Array, "n"]]:
@@ -236,8 +236,7 @@ class QueryableField(Queryable):
                 f"--point {x:g},{y:g}: expected a pixel that shows the scene, found an empty one; choose "
                 "another"
             )
-        level = question.level or next(iter(self.levels), None)
-        vector = np.asarray(features[0])[run.stored.channels(level)]
+        vector = np.asarray(features[0])[run.stored.channels(question.level or run.stored.smallest)]
         if np.linalg.norm(vector) < _LEAST_LENGTH:
             raise ValueError(
                 f"--point {x:g},{y:g}: expected something that a mask covered when the field was distilled, "

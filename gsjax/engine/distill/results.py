@@ -16,7 +16,6 @@ from gsjax.engine.summary import (
 )
 from gsjax.viz.plots import losses_over_steps, save
 
-_ASK = {"files": "--point X,Y --camera ID"}  # features of an unknown encoder read no texts
 SCORES = (
     Score("cosine to the teacher", "cosine", "", 3, "more", at("test", "cosine")),
     Score("mIoU 2D", "miou_2d", "", 3, "more", at("test", "miou_2d")),
@@ -35,6 +34,15 @@ _CLASSES = (
     Column("boundary IoU, 2D", "boundary_iou_2d", "", 3),
 )
 _VIEWS = (Column("view", "view"), Column("cosine to the teacher", "cosine", "", 3))
+
+
+def asked_by(features: str) -> str:
+    """What `gsjax query` is given, as its usage has it: an unknown encoder reads no texts.
+
+    Args:
+        features: the kind of the features.
+    """
+    return "--point X,Y --camera ID" if features == "files" else "TEXT"
 
 
 def summarize(folder: RunFolder, found: Metrics) -> Summary:
@@ -63,6 +71,6 @@ def summarize(folder: RunFolder, found: Metrics) -> Summary:
         ],
         notes=[*names, *found["notes"]],
         machine=found["machine"],
-        hints=[("query it", f"gsjax query {folder.path} {_ASK.get(found['features'], 'TEXT')}")],
+        hints=[("query it", f"gsjax query {folder.path} {asked_by(found['features'])}")],
         complete=found["complete"],
     )

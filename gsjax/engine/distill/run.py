@@ -13,7 +13,7 @@ from rich.console import Console
 from gsjax.engine.budget import Budget, note_if_few
 from gsjax.engine.distill.file import FOLDER, NAME
 from gsjax.engine.distill.judge import judge
-from gsjax.engine.distill.results import summarize
+from gsjax.engine.distill.results import asked_by, summarize
 from gsjax.engine.distill.scene import FieldScene, SceneOptions, open_field_scene
 from gsjax.engine.drive import Tick, drive
 from gsjax.engine.ending import exit_code, finish
@@ -127,8 +127,8 @@ def run(options: Options) -> int:
             """Writes the field of the solution, which can be queried while it is trained further."""
             if now.step == solved < total:
                 _write(folder, now.result)
-                words = f"a first answer is there: gsjax query {out} TEXT, or gsjax view {out}"
-                console.print(words, soft_wrap=True)
+                ask = f"gsjax query {out} {asked_by(teaching.source.kind)}"
+                console.print(f"a first answer is there: {ask}, or gsjax view {out}", soft_wrap=True)
 
         watch(ticks, progress, schedule, folder, console, budget=budget, evaluate=first_answer)
         steps, result = ticks.run.step, ticks.result

@@ -126,19 +126,14 @@ def _painted(view: FrozenView, plan: Plan, kinds: Int[Array, "n"], count: int):
 
 def _with_rows(teacher: Teacher, rows: list[np.ndarray], embeddings: Float[np.ndarray, "u d"]) -> Teacher:
     """The teacher with other rows of embeddings for each pixel on each level; -1 where unknown."""
-    levels = rows[0].shape[-1]
-    keys = []
-    for row in rows:
-        key = np.zeros(row.shape[:2], np.int64)  # a number for each combination
-        for level in range(levels):
-            key = key * (len(embeddings) + 1) + row[..., level] + 1
-        keys.append(key.ravel())
-    combined, place = np.unique(np.concatenate(keys), return_inverse=True)
+    flat = np.concatenate([row.reshape(-1, row.shape[-1]) for row in rows])
+    key = np.zeros(len(flat), np.int64)  # a number for each combination
+    for of_level in flat.T:
+        key = key * (len(embeddings) + 1) + of_level + 1
+    combined, first, place = np.unique(key, return_index=True, return_inverse=True)
     unknown = int(combined[0] == 0)
-    digits = [combined[unknown:] // (len(embeddings) + 1) ** (levels - 1 - k) for k in range(levels)]
-    columns = np.stack([digit % (len(embeddings) + 1) - 1 for digit in digits], axis=1)
     ends = np.cumsum([row.shape[0] * row.shape[1] for row in rows])[:-1]
     parts = zip(np.split(place - unknown, ends), rows, strict=True)
     ids = [part.reshape(row.shape[:2]).astype(np.int32) for part, row in parts]
-    codebook = embeddings[columns].reshape(len(columns), -1)
+    codebook = embeddings[flat[first[unknown:]]].reshape(len(combined) - unknown, -1)
     return teacher._replace(ids=ids, codebook=codebook.astype(np.float32), filled=None)

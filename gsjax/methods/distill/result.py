@@ -96,6 +96,11 @@ class DistillResult:
         """The levels of the features; none where there is one alone."""
         return () if self.source is None else tuple(self.source.levels)
 
+    @property
+    def smallest(self) -> str | None:
+        """The smallest level; None where there are none."""
+        return next(iter(self.levels), None)
+
     def channels(self, level: str | None) -> slice:
         """The teacher's channels that are of a level; all of them where there are no levels.
 
@@ -118,14 +123,14 @@ class DistillResult:
             row: of the Gaussian.
             level: of the feature (default: the smallest).
         """
-        directions, lifted = self._directions(level or next(iter(self.levels), None))
+        directions, lifted = self._directions(level or self.smallest)
         return jnp.matmul(lifted, directions[row], precision="highest")
 
-    def cosines(self, vectors: Float[ArrayLike, "q d"], level: str | None = None) -> Float[Array, "n q"]:
+    def cosines(self, vectors: Float[ArrayLike, "..."], level: str | None = None) -> Float[Array, "n q"]:
         """Cosines of the features of Gaussians and vectors in the teacher's channels.
 
         Args:
-            vectors: vectors, such as the embeddings of texts.
+            vectors: vectors [q, d], such as the embeddings of texts.
             level: of the features (default: as `best_level` finds it).
 
         Raises:
@@ -134,11 +139,11 @@ class DistillResult:
         queries = self._queries(vectors)
         return cosines_of(*self._directions(level or self.best_level(queries)), queries)
 
-    def scores(self, vectors: Float[ArrayLike, "q d"], level: str | None = None) -> Float[Array, "n"]:
+    def scores(self, vectors: Float[ArrayLike, "..."], level: str | None = None) -> Float[Array, "n"]:
         """Score of each Gaussian for the first vector, against the others (`relevancy`).
 
         Args:
-            vectors: the query, then negatives, in the teacher's channels.
+            vectors: the query, then negatives, in the teacher's channels, [q, d].
             level: of the features (default: as `best_level` finds it).
 
         Raises:
@@ -147,12 +152,12 @@ class DistillResult:
         queries = self._queries(vectors)
         return _scores(*self._directions(level or self.best_level(queries)), queries)
 
-    def best_level(self, vectors: Float[ArrayLike, "q d"]) -> str | None:
+    def best_level(self, vectors: Float[ArrayLike, "..."]) -> str | None:
         """The level whose best Gaussians score highest for a query, as in LangSplat (Qin et al. 2024,
         section 3.4), and the largest of those that score as high; None where there are no levels.
 
         Args:
-            vectors: the query, then negatives, in the teacher's channels.
+            vectors: the query, then negatives, in the teacher's channels, [q, d].
 
         Raises:
             ValueError: the vectors' number of channels is not the teacher's.
@@ -228,7 +233,7 @@ class DistillResult:
             self._known[level] = directions_of(of_level, located)
         return self._known[level]
 
-    def _queries(self, vectors: Float[ArrayLike, "q d"]) -> Float[Array, "q d"]:
+    def _queries(self, vectors: Float[ArrayLike, "..."]) -> Float[Array, "q d"]:
         queries = jnp.asarray(vectors, self.field.lift.dtype)
         if queries.ndim != 2 or queries.shape[1] != self._dimension:
             raise ValueError(
