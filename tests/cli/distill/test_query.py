@@ -4,6 +4,7 @@ The fields are made up, one row a class: that of a distillation is asked in test
 """
 
 import shutil
+from functools import partial
 
 import cv2
 import equinox as eqx
@@ -15,6 +16,7 @@ from gsjax.engine.teaching.source import Source
 from gsjax.io.ply import read_ply, write_ply
 from gsjax.perception.closed_vocabulary import ClosedVocabulary
 from gsjax.perception.codebook import ClassCodebook
+from gsjax.viz.viewer import drawing
 from tests.cli.conftest import LABELS, write_made_field
 from tests.cli.distill.conftest import CAN, NAMES, found_of, told_of
 
@@ -185,6 +187,8 @@ def test_the_scene_is_read_once_and_drawn_by_one_program(gsjax, field, scene, mo
         return drawers[-1]
 
     monkeypatch.setattr(field_query, "Drawer", kept)
+    # A function of its own: JAX keeps what other tests compiled of the same one.
+    monkeypatch.setattr(drawing, "_draw", partial(drawing._draw))
     for module in ("gsjax.engine.files", "gsjax.engine.distill.scene"):
         monkeypatch.setattr(f"{module}.read_gaussians", lambda file: read.append(file) or read_ply(file))
     code, said = gsjax("query", field, "carton", "--move", 0, 0, 0.01)
