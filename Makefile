@@ -8,7 +8,7 @@ RUN := runs/demo
 DEMO := "simulated:tabletop?width=240&height=180"
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-all test-floors bench gallery docs lint dist clean
+.PHONY: help demo test test-all test-floors bench gallery notebooks docs lint dist clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-11s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -44,6 +44,9 @@ bench: $(VENV)/installed-test ## the whole benchmark suite, on a machine that do
 
 gallery: $(VENV)/installed ## small runs and the experiments' figures into docs/gallery.md
 	$(BIN)/python docs/make_gallery.py
+
+notebooks: $(VENV)/installed-dev ## run docs/notebooks and keep what they show
+	$(BIN)/python docs/make_notebooks.py
 
 docs: $(VENV)/installed-dev ## build the documentation into site/
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict --quiet

@@ -78,7 +78,7 @@ def test_no_module_starts_the_backend_of_jax():
     assert done.returncode == 0, done.stderr
 
 
-@pytest.mark.parametrize("backend", ["module://nowhere.backend_inline", "nonsense", "qtagg", "inline", "AGG"])
+@pytest.mark.parametrize("backend", ["module://nowhere.backend_inline", "nonsense", "qtagg", "absent", "AGG"])
 def test_plots_need_no_backend_of_matplotlib(backend, tmp_path):
     """A notebook hands its own to the programs that it starts, and it need not be there."""
     program = (

@@ -15,17 +15,15 @@ from rich.progress import track
 from gsjax.engine.messages import Notes, counted, reason, stage
 from gsjax.engine.options import Common
 from gsjax.engine.recording import parse_frames
+from gsjax.engine.show import files_of, page_options
 from gsjax.engine.terminal import in_bytes
 from gsjax.engine.viewables import UP, Up, open_viewable
 from gsjax.io.labels import labels_beside
-from gsjax.io.page import Film
 from gsjax.io.scene_file import spatial_order
 from gsjax.io.scenes import FORMATS, Format, format_of, write_gaussians
 from gsjax.io.sequences import frame_files
 from gsjax.scene.gaussians import Gaussians
 from gsjax.viz.viewer import Viewable
-from gsjax.viz.viewer.cameras import first_pose, scene_up
-from gsjax.viz.viewer.player import frame_pause
 
 HELP = (
     " The ending of OUT names the format: .ply (3DGS), .compressed.ply (PlayCanvas), .splat, .spz (Niantic), "
@@ -77,19 +75,14 @@ def run(options: Options) -> int:
         look: dict[str, Any] = {"antialiased": scene.antialiased, "origin": scene.origin}
         look["labels"] = None if scene.labels is None else np.asarray(scene.labels)
         if "up" in written.options:
-            known = UP["-y"] if _read(options.path) else scene_up(scene)
-            look["up"] = (known if options.up == "auto" else UP[options.up]).tolist()
-            look["background"] = scene.background
-            if scene.shots is not None:  # a fit in the open has Gaussians far beyond what was photographed
-                look["view"] = tuple(place.tolist() for place in first_pose(scene)[:2])
-                look["near"] = scene.shots.near
+            look |= page_options(scene, rows, options.path)
+            if options.up != "auto":
+                look["up"] = UP[options.up].tolist()
         if numbered:
+            look.pop("film", None)  # each page shows its own frame
             return _write_frames(options, scene, rows, look, notes, console)
-        moves = len(rows) > 1 and scene.num_moving > 0
-        plays = "film" in written.options and moves
-        if plays:
-            look["film"] = _film_of(scene, rows)
-        elif moves:
+        moves, plays = len(rows) > 1 and scene.num_moving > 0, "film" in look
+        if moves and not plays:
             notes.warn(
                 f"{options.path} moves; only its first of {len(rows)} frames is written. A page (.html) "
                 f"plays all, and 'frame_####{_ending(written)}' writes a file for each"
@@ -152,32 +145,19 @@ def _at(scene: Viewable, row: int) -> Gaussians:
     return scene.gaussians if scene.motion is None else scene.at(row)
 
 
-def _film_of(scene: Viewable, rows: range) -> Film:
-    """A scene over time, at the rate of its recording."""
-    times = scene.times
-    if times is None:
-        times = np.arange(scene.num_frames) * frame_pause(None)
-    return Film(lambda frame: scene.at(rows[frame]), np.asarray(times)[rows], scene.num_moving)
-
-
 def _check(options: Options, out: Path) -> None:
     """Raises an OSError where a file must not be written."""
     if out.is_dir():
         raise IsADirectoryError(
             f"{out}: expected a file, found a folder; name one in it that ends in {', '.join(FORMATS)}"
         )
-    if out.exists() and out.resolve() in _read(options.path):
+    if out.exists() and out.resolve() in files_of(options.path):
         raise FileExistsError(f"{out}: expected another file than the one that is read; name another OUT")
     for file in (out, labels_beside(out)) if "labels" in format_of(out).options else (out,):
         if file.exists() and not options.overwrite:
             raise FileExistsError(
                 f"{file}: is there already; name another OUT, or replace it with --overwrite"
             )
-
-
-def _read(path: Path) -> set[Path]:
-    """The files of Gaussians that are read; none if a run is."""
-    return {file.resolve() for file in frame_files(path) or [path] if file.is_file()}
 
 
 def _ending(written: Format) -> str:

@@ -8,6 +8,7 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 KINDS = ("prismatic", "revolute")
+_FAR_BETTER = 2.0  # errors of a hinge, in those of a turning slide, from which a part is no hinge
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,7 +60,8 @@ class FittedJoint(NamedTuple):
         kind: "fixed", "prismatic", "revolute", or "free" where no joint explains the motion.
         joint: the fitted joint if `kind` is prismatic or revolute, else None.
         errors_m: root mean square distance, metres, of the part's points from their positions under the best
-            fixed, prismatic and revolute joint, by name.
+            fixed, prismatic and revolute joint, by name, and as a "turning slide": along a straight line, and
+            turning in proportion, which is no joint.
         confidence: 0 to 1; relative distance of the errors from the decision boundary. At 0, the part is as
             likely free as on a joint, or as likely on the other joint as on this one.
     """
@@ -91,7 +93,8 @@ def fit_joint(
         noise_m: a part that moves less than this is fixed, and a smaller error counts as none; metres.
         tolerance: largest error of a joint, as a fraction of the extent of the motion, at which it still
             explains the motion. A box that slides and turns steadily at the same time is 4 to 8 % from a
-            hinge: a larger tolerance allows for noise, but calls that box a hinge, with low confidence.
+            hinge, so a turning slide is tried as well: where it explains the motion far better, the part is
+            free.
         least_turn_rad: a joint that turns by less is never revolute, since about a distant axis a small
             rotation looks like a translation; radians.
     """
@@ -105,15 +108,32 @@ def fit_joint(
         along = joint.motions()
         predicted = np.einsum("tij,nj->tni", along[:, :3, :3], points) + along[:, None, :3, 3]
         errors[kind] = _rms(moved - predicted)
+    errors["turning slide"] = _rms(moved - _turning_slide(motions, points))
     if errors["fixed"] <= noise_m:
         return FittedJoint("fixed", None, errors, 1 - errors["fixed"] / noise_m)
     turns = np.ptp(found["revolute"].values) >= least_turn_rad
     kind = min(KINDS if turns else KINDS[:1], key=errors.__getitem__)
     other = KINDS[1 - KINDS.index(kind)] if turns else "fixed"
     allowed = max(noise_m, tolerance * errors["fixed"])
+    if kind == "revolute":
+        allowed = min(allowed, max(noise_m, _FAR_BETTER * errors["turning slide"]))
     if errors[kind] > allowed:
         return FittedJoint("free", None, errors, 1 - allowed / errors[kind])
     return FittedJoint(kind, found[kind], errors, 1 - errors[kind] / max(min(errors[other], allowed), 1e-12))
+
+
+def _turning_slide(
+    motions: Float[np.ndarray, "frames 4 4"], points: Float[np.ndarray, "points 3"]
+) -> Float[np.ndarray, "frames points 3"]:
+    """Where the points are if their middle goes along a straight line, and they turn about it in proportion."""
+    middle = points.mean(0)
+    way = motions[:, :3, :3] @ middle + motions[:, :3, 3] - middle
+    turns = Rotation.from_matrix(motions[:, :3, :3]).as_rotvec()
+    line, axis = _principal(way), _principal(turns)
+    gone, angles = way @ line, np.unwrap(turns @ axis)
+    angles = gone * (gone @ angles) / max(gone @ gone, 1e-12)
+    about = Rotation.from_rotvec(angles[:, None] * axis).as_matrix()
+    return np.einsum("tij,nj->tni", about, points - middle) + middle + (gone[:, None] * line)[:, None]
 
 
 def _slide(shifts: Float[np.ndarray, "frames points 3"], middle: Float[np.ndarray, "3"]) -> Joint:
