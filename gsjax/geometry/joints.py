@@ -125,7 +125,7 @@ def fit_joint(
 def _turning_slide(
     motions: Float[np.ndarray, "frames 4 4"], points: Float[np.ndarray, "points 3"]
 ) -> Float[np.ndarray, "frames points 3"]:
-    """Where the points are if their middle goes along a straight line, and they turn about it in proportion."""
+    """Where the points are if their middle goes along a line, and they turn about it in proportion."""
     middle = points.mean(0)
     way = motions[:, :3, :3] @ middle + motions[:, :3, 3] - middle
     turns = Rotation.from_matrix(motions[:, :3, :3]).as_rotvec()

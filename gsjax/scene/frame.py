@@ -33,7 +33,7 @@ class Frame(eqx.Module):
     time: Float[Array | np.ndarray, ""] | None = None
 
     @property
-    def colors(self) -> Float[Array, "c height width 3"]:
+    def colors(self) -> Float[Array | np.ndarray, "c height width 3"]:
         """The images as floats, 0 to 1."""
         if jnp.issubdtype(self.images.dtype, jnp.floating):
             return self.images

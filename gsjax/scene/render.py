@@ -5,6 +5,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from gsjax.geometry.cameras import Camera
@@ -50,11 +51,11 @@ def render(
     cameras: Camera,
     plan: Plan | None = None,
     *,
-    features: Float[Array, "n f"] | None = None,
-    backgrounds: Float[Array, "c 3"] | None = None,
-    roi: Bool[Array, "c height width"] | None = None,
-    visibility: Float[Array, "c n"] | None = None,
-    means2d_offset: Float[Array, "c n 2"] | None = None,
+    features: Float[Array | np.ndarray, "n f"] | None = None,
+    backgrounds: Float[Array | np.ndarray, "c 3"] | None = None,
+    roi: Bool[Array | np.ndarray, "c height width"] | None = None,
+    visibility: Float[Array | np.ndarray, "c n"] | None = None,
+    means2d_offset: Float[Array | np.ndarray, "c n 2"] | None = None,
 ) -> Rendered:
     """Colour, expected depth and alpha of a scene in C cameras, differentiable in all of them.
 

@@ -1,0 +1,71 @@
+"""Runs the notebooks of docs/notebooks, and keeps their pictures and texts in them.
+
+    .venv/bin/python docs/make_notebooks.py [NAME ...]    # `make notebooks`
+
+What a cell shows as a page is left out, as hosts of repositories do not show it: it is there when the cell is
+run.
+"""
+
+import sys
+from base64 import b64decode, b64encode
+from io import BytesIO
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import nbformat
+from nbclient import NotebookClient
+from PIL import Image
+
+FOLDER = Path(__file__).resolve().parent / "notebooks"
+_MOST_SECONDS = 1800  # of a cell
+_QUALITY = 85  # of a picture's JPEG
+
+
+def main(names: list[str]) -> None:
+    """Run the named notebooks, or all."""
+    for path in sorted(FOLDER.glob("*.ipynb")):
+        if names and path.stem not in names:
+            continue
+        print(path.name, flush=True)
+        notebook = nbformat.read(path, as_version=4)
+        with TemporaryDirectory() as where:  # what cells write is not kept
+            NotebookClient(notebook, timeout=_MOST_SECONDS, resources={"metadata": {"path": where}}).execute()
+        path.write_text(nbformat.writes(cleaned(notebook), indent=1) + "\n", encoding="utf-8")
+
+
+def cleaned(notebook: nbformat.NotebookNode) -> nbformat.NotebookNode:
+    """The notebook without what differs from run to run, and without pages.
+
+    Args:
+        notebook: as it was run.
+    """
+    notebook.metadata = {"kernelspec": {"display_name": "Python 3", "language": "python", "name": "python3"}}
+    for number, cell in enumerate(notebook.cells):
+        cell.id, cell.metadata = f"cell-{number}", {}
+        if cell.cell_type != "code":
+            continue
+        cell.execution_count = None
+        cell.outputs = [output for output in cell.outputs if output.get("name") != "stderr"]
+        for output in cell.outputs:
+            if "execution_count" in output:
+                output.execution_count = None
+            data = output.get("data", {})
+            data.pop("text/html", None)
+            if "image/png" in data:
+                data["image/jpeg"] = smaller(data.pop("image/png"))
+    return notebook
+
+
+def smaller(picture: str) -> str:
+    """A JPEG picture in base64.
+
+    Args:
+        picture: a PNG, as a cell left it.
+    """
+    packed = BytesIO()
+    Image.open(BytesIO(b64decode(picture))).convert("RGB").save(packed, "JPEG", quality=_QUALITY)
+    return b64encode(packed.getvalue()).decode()
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

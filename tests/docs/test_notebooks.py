@@ -1,0 +1,62 @@
+"""The notebooks: their code runs, with fewer steps, and they hold what it showed when it was run in full."""
+
+import json
+from dataclasses import replace
+
+import matplotlib
+import pytest
+
+from gsjax.engine.parts import start as parts_start
+from gsjax.methods.track import first_fit
+from tests.docs.blocks import ROOT
+from tests.docs.test_programs import PARTS
+from tests.engine.cases import TRACK
+
+NOTEBOOKS = {path.stem: path for path in (ROOT / "docs/notebooks").glob("*.ipynb")}
+MOST_BYTES = 600_000  # of a notebook, so that hosts show it
+SHORTER = {
+    "fit": {"steps=800, cap=8000": "steps=4, cap=300, coarse_until=0.0", "(60)": "(2)", ", 60)": ", 2)"},
+    "track": {"gsjax.TrackConfig()": "TRACK", "frames=12": "frames=2"},
+    "parts": {
+        "gsjax.PartsConfig()": "PARTS",
+        "frames=list(range(20))": "frames=[0, 5]",
+        "simulated:articulated?width=160&height=120&frames=20": "simulated:hard_parts?width=96&height=72",
+        "eval_cameras=[1]": "eval_cameras=[3, 6]",
+        "(0, 6, 12, 19)": "(0, 1, 0, 1)",
+    },
+}
+"""Less to do for each notebook: text of it, and what stands for it here."""
+
+
+def cells(name: str, kind: str) -> list[dict]:
+    """The cells of one kind, in order."""
+    notebook = json.loads(NOTEBOOKS[name].read_text(encoding="utf-8"))
+    return [cell for cell in notebook["cells"] if cell["cell_type"] == kind]
+
+
+def test_there_is_one_for_each_of_three_ways_in():
+    assert set(NOTEBOOKS) == set(SHORTER) == {"fit", "track", "parts"}
+
+
+@pytest.mark.parametrize("name", SHORTER)
+def test_it_was_run_in_full_and_shows_what_came_out(name):
+    assert NOTEBOOKS[name].stat().st_size < MOST_BYTES
+    outputs = [output for cell in cells(name, "code") for output in cell["outputs"]]
+    assert not any(output["output_type"] == "error" for output in outputs)
+    assert sum("image/jpeg" in output.get("data", {}) for output in outputs) >= 3
+    text = "".join("".join(output.get("text", ())) for output in outputs)
+    assert "Gaussians" in text
+    assert "/" + "work/" not in text  # no path of a machine
+
+
+@pytest.mark.parametrize("name", SHORTER)
+def test_it_runs(name, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(first_fit, "TrackConfig", lambda: TRACK)
+    monkeypatch.setattr(parts_start, "FIT", replace(parts_start.FIT, steps=40, cap=4000, coarse_until=0.0))
+    text = "\n".join("".join(cell["source"]) for cell in cells(name, "code"))
+    for long, short in SHORTER[name].items():
+        assert long in text, f"{name}: expected {long!r}, which is shortened here"
+        text = text.replace(long, short)
+    with matplotlib.rc_context({"backend": "Agg"}):
+        exec(compile(text, name, "exec"), {"__name__": name, "TRACK": TRACK, "PARTS": PARTS})
