@@ -95,13 +95,17 @@ class Options(Common):
 
     run: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
     """Folder of a run of `gsjax track` or `gsjax deform`; of any run with a field (`gsjax distill`); or any
-    folder with field.npz. The answer is written to query/ in it, in place of an earlier one."""
+    folder with field.npz."""
     text: Annotated[str | None, tyro.conf.Positional, tyro.conf.arg(metavar="[TEXT]")] = None
     """The thing to find: "red can". Or use --image, --point or --box. Without any of them, everything in a
     run of `gsjax deform` is labelled."""
     camera: Annotated[str | None, tyro.conf.arg(metavar="ID")] = None
     """Camera (or photograph) to show the result from, and that --point refers to. Default: for a tracked run
     the first held-out camera or, without one, the first; for a field, all."""
+    out: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
+    """Folder of the answer, in place of an earlier one (default: query/ in RUN)."""
+    pictures: bool = True
+    """Draw what was found, in pictures and films, which takes most of the time."""
     weights: Path | None = None
     """Folder of CLIP's weights, in Hugging Face's layout. For CLIP features: where the weights are now, if
     they were moved."""
@@ -138,11 +142,16 @@ def run(options: Options) -> int:
             _expect_track(options.run)
         _query_objects(options, console)
     except USER_ERRORS as error:
-        folder = options.run / "query"
+        folder = _folder(options)
         if not (folder / "query.json").is_file():
             raise
         raise ValueError(f"{describe(error)} ({folder} still has an earlier answer)") from error
     return 0
+
+
+def _folder(options: Options) -> Path:
+    """The folder of the answer."""
+    return options.run / "query" if options.out is None else options.out
 
 
 def _given(*groups: Any) -> list[str]:
@@ -179,7 +188,7 @@ def _query_field(options: Options, path: Path, console: Console) -> None:
     # Each kind of run imports what it needs alone: all together they are slow to import.
     from gsjax.engine.distill.query import QueryableField
 
-    begun, folder = perf_counter(), options.run / "query"
+    begun, folder = perf_counter(), _folder(options)
     question = _question(options)
     ways = sum(way is not None for way in (question.text, question.image, question.point))
     if ways != 1:
@@ -195,7 +204,8 @@ def _query_field(options: Options, path: Path, console: Console) -> None:
             now = Whereabouts(options.field.scene, options.field.images, options.weights)
             found = open_field_run(path, notes, now)
         over_time = None
-        wanted = options.field.film and found.photographs is not None
+        drawn = options.pictures and found.photographs is not None
+        wanted = options.field.film and drawn
         if wanted and found.file.with_name("trajectory.npz").is_file():
             from gsjax.engine.distill.over_time import over_time_of
 
@@ -203,9 +213,9 @@ def _query_field(options: Options, path: Path, console: Console) -> None:
         info = answer(QueryableField(found, over_time), question, folder, notes, console)
     _print(question, found.unit, "photographs", info, perf_counter() - begun)
     print(f"scene     {found.file}")
-    drawn = ", overview.png" if info["pixels"] else ""
-    drawn += ", over_time.npz, video.mp4" if drawn and over_time is not None else ""
-    print(f"query     {folder}: selection.npz, object.ply{drawn}")
+    files = ["selection.npz", "object.ply", *(["overview.png"] if info["pixels"] else ())]
+    files += [] if over_time is None or not drawn else ["over_time.npz", "video.mp4"]
+    print(f"query     {folder}: {', '.join(files)}")
 
 
 def _query_deformation(options: Options, console: Console) -> None:
@@ -213,7 +223,7 @@ def _query_deformation(options: Options, console: Console) -> None:
     from gsjax.engine.deform.file import read_beside, read_deformation, warn_of_partial
     from gsjax.engine.deform.query import QueryableScene, label_everything
 
-    begun, folder = perf_counter(), options.run / "query"
+    begun, folder = perf_counter(), _folder(options)
     reason = "a run of `gsjax deform` has no use for it; leave it out"
     _expect_none_of(reason, options.field, options.track)
     question = _question(options)
@@ -240,7 +250,8 @@ def _query_deformation(options: Options, console: Console) -> None:
     else:
         found = ", ".join(f"{name}: {count:,}" for name, count in info["classes"].items())
         print(f"{'found':<10}{found} of {info['of']:,} Gaussians, in frame {info['frame']}")
-    print(f"query     {folder}: selection.npz, recolored.ply, frames/, masks/, video.mp4")
+    pictures = ", frames/, masks/, video.mp4" if question.pictures else ""
+    print(f"query     {folder}: selection.npz, recolored.ply{pictures}")
 
 
 def _print(question: Question, unit: str, seen_in: str, info: dict[str, Any], seconds: float) -> None:
@@ -293,6 +304,7 @@ def _question(options: Options) -> Question:
         negatives=gaussians.negatives,
         color=gaussians.color or Question.color,
         move=gaussians.move,
+        pictures=options.pictures,
     )
 
 
@@ -337,4 +349,4 @@ def _query_objects(options: Options, console: Console) -> None:
         debug=options.debug,
         **vars(options.track),
     )
-    ask_for_object(query, console)
+    ask_for_object(query, console, _folder(options), pictures=options.pictures)

@@ -52,6 +52,7 @@ class Question:
         negatives: texts to compare with (default: the encoder's own).
         color: RGB, 0 to 1, of what is found in recolored.ply.
         move: shift of it in moved.ply, metres; None writes none.
+        pictures: whether what is found is drawn.
 
     Raises:
         ValueError: no score can be above the threshold, or each is; it is given beside `top`, which is less
@@ -72,6 +73,7 @@ class Question:
     negatives: tuple[str, ...] | None = None
     color: tuple[float, float, float] = (1.0, 0.25, 0.6)
     move: tuple[float, float, float] | None = None
+    pictures: bool = True
 
     def __post_init__(self):
         if self.threshold is not None and not -math.inf < self.threshold < _HIGHEST:
@@ -296,7 +298,7 @@ def answer(
                 write_part(new / f"{name}.ply", run, gaussians, kept)
         for name, scene in question.changed(gaussians, selected).items():
             write_part(new / f"{name}.ply", run, scene)
-        pixels = run.draw(new, found, notes, console)
+        pixels = run.draw(new, found, notes, console) if question.pictures else {}
         means = in_world(np.asarray(gaussians.means)[selected], run.origin)
         info = {
             "text": question.text,

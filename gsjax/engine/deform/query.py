@@ -208,7 +208,7 @@ def label_everything(
 
     Args:
         scene: the scene.
-        question: the frame of recolored.ply, and those to draw.
+        question: the frame of recolored.ply, and those to draw, if any.
         folder: for the result, which replaces an earlier one once it is complete.
         notes: for query.json.
         console: shows the progress.
@@ -217,7 +217,7 @@ def label_everything(
         ValueError: a frame does not exist.
         FileExistsError: the folder holds something else than a result of a query.
     """
-    frame, result = scene.frame_of(question), scene.result
+    frame, result, shares = scene.frame_of(question), scene.result, {}
     there, codebook = scene.at(frame), jnp.asarray(scene.meaning.codebook, jnp.float32)
     jax.block_until_ready(probabilities_of(there.features, codebook))  # compiles
     begun = perf_counter()
@@ -230,6 +230,8 @@ def label_everything(
         arrays = {"labels": labels, "probabilities": likely, "names": result.names}
         write_npz(new / "selection.npz", arrays)
         write_scene(new / "recolored.ply", recolored(there, shades[labels]), labels, origin=scene.origin)
+        if question.pictures:
+            shares = _draw_labels(new, scene, scene.pictured(question, frame), console)
         info = {
             "text": None,
             "point": None,
@@ -239,7 +241,7 @@ def label_everything(
             "query_seconds": seconds,
             "classes": {name: int((labels == label).sum()) for label, name in enumerate(result.names, 1)},
             "colors": colors,
-            "shares": _draw_labels(new, scene, scene.pictured(question, frame), console),
+            "shares": shares,
             "notes": notes.all,
         }
         write_json(new / "query.json", info)

@@ -18,6 +18,7 @@ from gsjax.engine.messages import Notes
 from gsjax.engine.options import ClipWeights, Common, ObjectText
 from gsjax.engine.pictures import frame_rate, lit
 from gsjax.engine.query import write_mask
+from gsjax.engine.recording import Recording
 from gsjax.engine.track.saved import SavedRun, open_run
 from gsjax.engine.track.views import views
 from gsjax.engine.views import View
@@ -64,8 +65,14 @@ class Answer(NamedTuple):
     rows: Int[np.ndarray, "n"]
 
 
-def ask_for_object(options: ObjectQuery, console: Console) -> None:
-    """Answer, and write query/ into the run folder.
+def ask_for_object(options: ObjectQuery, console: Console, folder: Path, *, pictures: bool = True) -> None:
+    """Answer, and write the folder of the answer.
+
+    Args:
+        options: the run and the text.
+        console: shows the progress.
+        folder: for the answer.
+        pictures: whether to draw the object's masks, and film it.
 
     Raises:
         ValueError, OSError: there is no such run or encoder, or no object matches the text.
@@ -74,7 +81,6 @@ def ask_for_object(options: ObjectQuery, console: Console) -> None:
         saved, answer = ask(options, console, notes)
         recording = saved.seen_by(options.camera)
         camera = recording.tracked.camera_ids[0]
-        folder = saved.path / "query"
         with replaced_folder(folder, OF_QUERY) as new:
             write_npz(
                 new / "selection.npz",
@@ -86,13 +92,7 @@ def ask_for_object(options: ObjectQuery, console: Console) -> None:
                     "times": recording.tracked.times[: saved.tracking.num_frames],
                 },
             )
-            pixels = []
-            with VideoWriter(new / "video.mp4", frame_rate(recording.tracked.times)) as video:
-                for view in progress(views(saved.tracking, recording), saved, console):
-                    mask = view.groups == answer.group
-                    frame_id = recording.tracked.frame_ids[view.t]
-                    pixels.append(write_mask(new, f"{frame_id:06d}", mask))
-                    video.write(lit(view.image, mask, label_color(answer.group)))
+            pixels = _draw(new, saved, recording, answer.group, console) if pictures else []
             found = answer._asdict() | {"label": saved.tracking.scene.label_ids[answer.group]}
             found |= {"text": options.text, "encoder": options.encoder, "camera": camera}
             del found["rows"]  # in selection.npz
@@ -102,6 +102,18 @@ def ask_for_object(options: ObjectQuery, console: Console) -> None:
     score = f"cosine {answer.scores[answer.name]:.2f}, and {answer.min_score:.2f} is required"
     print(f"{answer.name}: {len(answer.rows)} Gaussians ({score}){unseen}")
     print(f"query   {folder}")
+
+
+def _draw(folder: Path, saved: SavedRun, recording: Recording, group: int, console: Console) -> list[int]:
+    """Write the masks of an object and its film; returns the number of pixels of each mask."""
+    pixels = []
+    with VideoWriter(folder / "video.mp4", frame_rate(recording.tracked.times)) as video:
+        for view in progress(views(saved.tracking, recording), saved, console):
+            mask = view.groups == group
+            frame_id = recording.tracked.frame_ids[view.t]
+            pixels.append(write_mask(folder, f"{frame_id:06d}", mask))
+            video.write(lit(view.image, mask, label_color(group)))
+    return pixels
 
 
 def ask(options: ObjectQuery, console: Console, notes: Notes) -> tuple[SavedRun, Answer]:

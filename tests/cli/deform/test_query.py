@@ -76,6 +76,16 @@ def asked(run):
     return json.loads((run / "query" / "query.json").read_text())
 
 
+@pytest.mark.parametrize("text", [(), ("tool",)])
+def test_an_answer_elsewhere_and_without_pictures(gsjax, taught, tmp_path, text):
+    out = tmp_path / "answer"
+    code, said = gsjax("query", taught, *text, "--no-pictures", "--out", out)
+    assert code == 0, said
+    assert f"query {out}: selection.npz, recolored.ply" in said
+    assert "video.mp4" not in said
+    assert {file.suffix for file in out.iterdir()} == {".json", ".npz", ".ply"}
+
+
 def test_a_name_is_found_and_deleted_in_every_frame(gsjax, run):
     code, said = gsjax("query", run, "Tool", "--move", 0, 0, 0.01)
     assert code == 0, said

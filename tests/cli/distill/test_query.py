@@ -58,6 +58,19 @@ def panels(folder):
 # what it finds
 
 
+def test_an_answer_elsewhere_and_without_pictures(gsjax, closed, tmp_path):
+    field, out = shutil.copytree(closed, tmp_path / "closed"), tmp_path / "answers" / "can"
+    code, said = gsjax("query", field, "can", "--no-pictures", "--out", out)
+    assert code == 0, said
+    assert f"query {out}: selection.npz, object.ply" in said
+    assert "overview.png" not in said
+    assert not (field / "query").exists()
+    assert {file.suffix for file in out.iterdir()} == {".json", ".npz", ".ply"}
+    elsewhere = found_of(field, out)
+    assert gsjax("query", field, "can")[0] == 0
+    np.testing.assert_array_equal(found_of(field)["indices"], elsewhere["indices"])
+
+
 def test_a_text_within_another_finds_what_both_mean(gsjax, field, closed, scene, tmp_path):
     """In the field of colours and names, the blue things within the can; and within it no ball."""
     closed = shutil.copytree(closed, tmp_path / "closed")

@@ -40,6 +40,15 @@ def run(tracked, tmp_path):
     return shutil.copytree(tracked, tmp_path / "run")
 
 
+def test_an_answer_elsewhere_and_without_pictures(gsjax, run, tmp_path):
+    out = tmp_path / "answer"
+    code, said = gsjax("query", run, "the blue can", "--no-pictures", "--out", out)
+    assert code == 0, said
+    assert f"query {out}" in said
+    assert {file.name for file in out.iterdir()} == {"query.json", "selection.npz"}
+    assert not (run / "query").exists()
+
+
 def test_query_says_which_object_and_shows_it_over_time(gsjax, run, pristine):
     code, said = gsjax("query", run, "the blue can")
     assert code == 0, said
