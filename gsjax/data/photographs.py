@@ -112,6 +112,13 @@ class Photographs:
         check_intrinsics(self.Ks[:, None], lambda i, _: self.names[i])
         check_poses("viewmat", self.viewmats[:, None], lambda i, _: self.names[i], _POSE_ADVICE)
 
+    def __repr__(self) -> str:
+        sizes = {f"{width}x{height}" for width, height in self.sizes.tolist()}
+        size = sizes.pop() if len(sizes) == 1 else "several sizes"
+        loaders = {"depth": self.load_depth, "masks": self.load_mask, "labels": self.load_labels}
+        there = [name for name, loader in loaders.items() if loader is not None]
+        return f"Photographs({self.name}: {self.num} of {size}{', with ' * bool(there)}{', '.join(there)})"
+
     @property
     def num(self) -> int:
         """Number of photographs, N."""

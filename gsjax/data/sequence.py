@@ -108,6 +108,12 @@ class Sequence:
         if self.truth is not None:
             check_shape("truth.poses", self.truth.poses, (frames, len(self.truth.names), 4, 4))
 
+    def __repr__(self) -> str:
+        size = f"{self.num_frames} frames of {self.num_cameras} cameras, {self.width}x{self.height}"
+        known = {"depth": self.has_depth, "masks": self.has_masks, "truth": self.truth is not None}
+        there = [name for name, known in known.items() if known]
+        return f"Sequence({self.name}: {size}{', with ' * bool(there)}{', '.join(there)})"
+
     @property
     def num_frames(self) -> int:
         """Number of frames, T."""

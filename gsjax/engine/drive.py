@@ -60,6 +60,11 @@ class Tick:
     compile_seconds: float
     progress: float = 0.0
 
+    def __repr__(self) -> str:
+        sizes = {name: getattr(value, "size", 1) for name, value in self.info.items()}
+        told = [f"{name} {float(self.info[name]):.4g}" for name in ("loss", "psnr") if sizes.get(name) == 1]
+        return f"Tick(step {self.step}: {', '.join([*told, f'{self.seconds:.3g} s'])})"
+
     @property
     def step(self) -> int:
         """Number of steps so far."""

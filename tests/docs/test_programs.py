@@ -86,3 +86,8 @@ def test_it_runs(verb, tmp_path, monkeypatch):
     assert now.problem is None  # read from the file
     assert type(now).__name__ == "Tick"
     assert gsjax.load("run.npz").step == now.step
+    given = names.get("photographs", names.get("sequence"))
+    for said in map(repr, (now, now.result, given)):  # what a notebook shows of each
+        assert len(said) < 150, said
+    assert repr(now).startswith(f"Tick(step {now.step}: ")
+    assert given.name in repr(given)

@@ -72,6 +72,11 @@ class DeformResult:
     meaning: Meaning | None
     timeline: Timeline
 
+    def __repr__(self) -> str:
+        frames = f"{len(self.timeline.times)} frames"
+        meant = "" if self.meaning is None else f", with meaning: {', '.join(self.names) or 'features'}"
+        return f"DeformResult({self.scene.gaussians.num:,} Gaussians, {frames}{meant})"
+
     def at(self, time: float) -> Gaussians:
         """The scene at a time, 0 to 1."""
         return _at(self.scene, jnp.asarray(time, jnp.float32), self.moving)

@@ -50,6 +50,11 @@ class DistillResult:
     scene: Mapping[str, Any] = default(default_factory=dict)
     means: Float[Array, "n 3"] | None = None
 
+    def __repr__(self) -> str:
+        count = "unknown" if self.means is None else f"{len(self.means):,}"
+        kind = getattr(self.source, "kind", "unknown")
+        return f"DistillResult({count} Gaussians, features: {kind})"
+
     @cached_property
     def placed(self) -> tuple[FeatureField, Located | None]:
         """The field and the locations of the Gaussians in it, as `gaussian_cosines` takes them.

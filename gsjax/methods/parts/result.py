@@ -39,6 +39,10 @@ class PartsResult(NamedTuple):
     pixel: float
     blend: Blend
 
+    def __repr__(self) -> str:
+        parts, frames = self.scene.num_parts - 1, f"{int(self.done.sum())} of {len(self.done)} frames"
+        return f"PartsResult({parts} parts of {self.scene.gaussians.num:,} Gaussians, {frames})"
+
     @property
     def weights(self) -> Float[Array, "N P"]:
         """The share of each part in the motion of each Gaussian; rows sum to 1."""

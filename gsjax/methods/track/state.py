@@ -31,6 +31,9 @@ class Tracked(NamedTuple):
     scene: TrackedScene
     pose: Pose
 
+    def __repr__(self) -> str:
+        return f"Tracked({self.scene.num_objects} objects, {len(self.labels):,} Gaussians)"
+
     def gaussians(self) -> Gaussians:
         """The whole scene at this pose; empty slots are transparent."""
         return place(self.scene, self.pose)

@@ -214,6 +214,10 @@ class Viewable:
         if self.times is not None:
             _check("times", self.times, (self.num_frames,))
 
+    def __repr__(self) -> str:
+        frames = f", {self.num_frames} frames" if self.num_frames > 1 else ""
+        return f"Viewable({self.title}: {self.gaussians.num:,} Gaussians{frames})"
+
     @property
     def near(self) -> float:
         """Distance of the near plane of its photographs' cameras, metres."""
