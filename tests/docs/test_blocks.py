@@ -44,12 +44,16 @@ def test_what_is_not_run_says_why():
 LONG = ("composition", "howto/loss", "howto/step", "rasterizer", "semantics")
 SLOW = {f"docs/{page}.md" for page in LONG}
 """Of these pages, tests of methods and commands run the calls as well."""
-OF_THE_README = ("README.md", *(f"docs/{verb}.md" for verb in ("fit", "track", "parts", "distill", "deform")))
+OF_THE_FIVE = (
+    "README.md",
+    "docs/programs.md",
+    *(f"docs/{verb}.md" for verb in ("fit", "track", "parts", "distill", "deform")),
+)
 """Their programs have tests of their own: test_readme.py, test_programs.py."""
 PROGRAMS = [
     pytest.param(page, marks=pytest.mark.slow) if page in SLOW else page
     for page in PAGES
-    if programs(page) and page not in OF_THE_README
+    if programs(page) and page not in OF_THE_FIVE
 ]
 
 

@@ -1,5 +1,5 @@
-"""The five programs of a researcher: the same in README.md and on their pages, in the same words, and run
-with fewer steps."""
+"""The five programs of a researcher: the same in docs/programs.md and on their pages, in the same words, and
+run with fewer steps."""
 
 import re
 from dataclasses import replace
@@ -33,9 +33,9 @@ SHORTER = {
 
 
 def program(verb: str) -> Block:
-    """The program of README.md that calls a verb in its last loop."""
-    found = [block for block in programs("README.md") if _loops(block.text)[-1:] == [verb]]
-    assert len(found) == 1, f"README.md: expected one program of gsjax.{verb}, found {len(found)}"
+    """The program of docs/programs.md that calls a verb in its last loop."""
+    found = [block for block in programs("docs/programs.md") if _loops(block.text)[-1:] == [verb]]
+    assert len(found) == 1, f"docs/programs.md: expected one program of gsjax.{verb}, found {len(found)}"
     return found[0]
 
 
@@ -44,7 +44,7 @@ def _loops(text: str) -> list[str]:
 
 
 @pytest.mark.parametrize("verb", VERBS)
-def test_the_page_opens_with_the_program_of_the_readme_and_a_picture(verb):
+def test_the_page_opens_with_the_program_and_a_picture(verb):
     page = f"docs/{verb}.md"
     first = blocks(page)[0]
     assert first.text == program(verb).text
@@ -53,6 +53,10 @@ def test_the_page_opens_with_the_program_of_the_readme_and_a_picture(verb):
     assert len(lines) <= MOST_LINES
     after = (ROOT / page).read_text(encoding="utf-8").split("```")[2]
     assert after.strip().startswith("!["), f"{page}: expected a picture after the program"
+
+
+def test_the_readme_shows_the_first():
+    assert programs("README.md")[0].text == program("fit").text
 
 
 @pytest.mark.parametrize("verb", VERBS)
