@@ -13,7 +13,8 @@ from rich.console import Console
 
 from gsjax.engine.distill.file import FOLDER
 from gsjax.engine.distill.saved import Whereabouts, field_of, open_field_run
-from gsjax.engine.folder import DEFORMATION, expect_folder, is_run
+from gsjax.engine.folder import DEFORMATION, OF_QUERY, expect_folder, expect_ours, is_run
+from gsjax.engine.locks import LOCK
 from gsjax.engine.messages import Notes, describe, stage
 from gsjax.engine.options import Common, ObjectText
 from gsjax.engine.program import USER_ERRORS
@@ -65,7 +66,8 @@ class FieldOptions:
     """Find only what is part of what this text finds, on the level that it fits best: `handle --within
     drawer`."""
     film: bool = True
-    """Film what was found, over all frames, where the field is that of a run of `gsjax track`."""
+    """Film what was found, over all frames, where the field is that of a run of `gsjax track`; its places in
+    all frames are written all the same."""
     scene: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """Present path of the scene's file, if it was moved (default: its first path, or next to the field)."""
     images: Annotated[str | None, tyro.conf.arg(metavar="FOLDER")] = None
@@ -120,12 +122,13 @@ class Options(Common):
 
 
 def run(options: Options) -> int:
-    """Answer, and write query/ into the run folder; returns the exit code.
+    """Answer, and write the folder of the answer; returns the exit code.
 
     Raises:
         ValueError, OSError: there is no such run or encoder, or no object matches the text.
     """
     expect_folder(options.run)
+    _expect_place(options.out)
     console, field = Console(stderr=True, highlight=False), field_of(options.run)
     # A tracked run answers over time, but not the queries that need a field.
     tracked = (options.run / "trajectory.npz").is_file()
@@ -152,6 +155,24 @@ def run(options: Options) -> int:
 def _folder(options: Options) -> Path:
     """The folder of the answer."""
     return options.run / "query" if options.out is None else options.out
+
+
+def _expect_place(out: Path | None) -> None:
+    """Raises a ValueError where an answer must not be written, as another folder would be lost."""
+    if out is None or not out.exists():
+        return
+    if out.resolve() in (here := Path.cwd().resolve(), *here.parents):
+        raise ValueError(f"--out {out}: expected a folder of its own, found the current one; name another")
+    try:
+        expect_ours(out, OF_QUERY)
+        others = sorted(entry.name for entry in out.iterdir() if entry.name[0] == "." and entry.name != LOCK)
+    except FileExistsError:
+        others = ["other files"]
+    if others:
+        raise ValueError(
+            f"--out {out}: expected a new folder, or one with an earlier answer, found one with {others[0]}; "
+            "name another"
+        )
 
 
 def _given(*groups: Any) -> list[str]:
@@ -190,6 +211,8 @@ def _query_field(options: Options, path: Path, console: Console) -> None:
 
     begun, folder = perf_counter(), _folder(options)
     question = _question(options)
+    if not options.pictures and options.camera is not None and question.point is None:
+        raise ValueError("--camera: expected --point, or pictures to draw, found neither; leave it out")
     ways = sum(way is not None for way in (question.text, question.image, question.point))
     if ways != 1:
         raise ValueError(
@@ -204,18 +227,16 @@ def _query_field(options: Options, path: Path, console: Console) -> None:
             now = Whereabouts(options.field.scene, options.field.images, options.weights)
             found = open_field_run(path, notes, now)
         over_time = None
-        drawn = options.pictures and found.photographs is not None
-        wanted = options.field.film and drawn
-        if wanted and found.file.with_name("trajectory.npz").is_file():
+        if found.file.with_name("trajectory.npz").is_file():
             from gsjax.engine.distill.over_time import over_time_of
 
             over_time = over_time_of(found, notes)
-        info = answer(QueryableField(found, over_time), question, folder, notes, console)
+        scene = QueryableField(found, over_time, films=options.field.film)
+        info = answer(scene, question, folder, notes, console)
     _print(question, found.unit, "photographs", info, perf_counter() - begun)
     print(f"scene     {found.file}")
-    files = ["selection.npz", "object.ply", *(["overview.png"] if info["pixels"] else ())]
-    files += [] if over_time is None or not drawn else ["over_time.npz", "video.mp4"]
-    print(f"query     {folder}: {', '.join(files)}")
+    written = ("selection.npz", "object.ply", "overview.png", "over_time.npz", "video.mp4")
+    print(f"query     {folder}: {', '.join(file for file in written if (folder / file).is_file())}")
 
 
 def _query_deformation(options: Options, console: Console) -> None:
@@ -229,6 +250,8 @@ def _query_deformation(options: Options, console: Console) -> None:
     question = _question(options)
     if question.camera is not None:
         raise ValueError(f"--camera: {reason}")
+    if not options.pictures and question.frames is not None:
+        raise ValueError("--frames: expected pictures to draw, found --no-pictures; leave one out")
     ways = sum(way is not None for way in (question.text, question.point, question.box))
     if ways > 1:
         raise ValueError("expected at most one of TEXT, --point and --box, found more")
@@ -250,8 +273,8 @@ def _query_deformation(options: Options, console: Console) -> None:
     else:
         found = ", ".join(f"{name}: {count:,}" for name, count in info["classes"].items())
         print(f"{'found':<10}{found} of {info['of']:,} Gaussians, in frame {info['frame']}")
-    pictures = ", frames/, masks/, video.mp4" if question.pictures else ""
-    print(f"query     {folder}: selection.npz, recolored.ply{pictures}")
+    drawn = ", frames/, masks/, video.mp4" if question.pictures else ""
+    print(f"query     {folder}: selection.npz, recolored.ply{drawn}")
 
 
 def _print(question: Question, unit: str, seen_in: str, info: dict[str, Any], seconds: float) -> None:

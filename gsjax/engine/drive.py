@@ -61,8 +61,11 @@ class Tick:
     progress: float = 0.0
 
     def __repr__(self) -> str:
-        sizes = {name: getattr(value, "size", 1) for name, value in self.info.items()}
-        told = [f"{name} {float(self.info[name]):.4g}" for name in ("loss", "psnr") if sizes.get(name) == 1]
+        known = {name: np.asarray(self.info[name]) for name in ("loss", "psnr") if name in self.info}
+        numbers = {
+            name: value for name, value in known.items() if value.shape == () and value.dtype.kind == "f"
+        }
+        told = [f"{name} {value:.4g}" for name, value in numbers.items()]
         return f"Tick(step {self.step}: {', '.join([*told, f'{self.seconds:.3g} s'])})"
 
     @property

@@ -209,8 +209,8 @@ class Queryable(ABC):
         """Entries of query.json that this kind of run has beside those of `answer`."""
 
     @abstractmethod
-    def draw(self, folder: Path, found: Selection, notes: Notes, console: Console) -> dict[str, int]:
-        """Write pictures of a selection; returns the number of pixels in each mask.
+    def draw(self, folder: Path, found: Selection, notes: Notes, console: Console) -> dict[str, int] | None:
+        """Write pictures of a selection, if wanted; returns the number of pixels in each mask, None of none.
 
         Args:
             folder: for the pictures.
@@ -298,7 +298,7 @@ def answer(
                 write_part(new / f"{name}.ply", run, gaussians, kept)
         for name, scene in question.changed(gaussians, selected).items():
             write_part(new / f"{name}.ply", run, scene)
-        pixels = run.draw(new, found, notes, console) if question.pictures else {}
+        pixels = run.draw(new, found, notes, console)
         means = in_world(np.asarray(gaussians.means)[selected], run.origin)
         info = {
             "text": question.text,

@@ -2,7 +2,7 @@
 
 import html
 import os
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from gsjax.io.scenes import is_scene, write_gaussians
 from gsjax.io.sequences import frame_files
 from gsjax.scene.gaussians import Gaussians
 
@@ -38,38 +39,35 @@ class Shown:
         return f'<iframe srcdoc="{page}" style="width: 100%; height: {self.height}px; border: 0"></iframe>'
 
 
-def show(
-    scene: Gaussians | Sequence[Gaussians] | Viewable | str | os.PathLike,
-    *,
-    up: Sequence[float] | None = None,
-    height: int = 480,
-) -> Shown:
+def show(scene: Any, *, up: str | Sequence[float] | None = None, height: int = 480) -> Shown:
     """A scene to look at in a notebook's cell: drag to turn, scroll to come closer, play if it moves.
 
-    The page holds the scene: 43 bytes for each Gaussian, and 21 more for each in each frame in which it
-    moves.
+    The page holds the scene, without view-dependent colour, in colours of its first moment: 43 bytes for each
+    Gaussian, and for each that moves 21 to 32 more in each moment, before these are compressed. A notebook
+    keeps it when it is saved: of millions of Gaussians better write a page, `gsjax.write_gaussians`.
 
     Args:
-        scene: Gaussians, or a list of them, one for each moment, with the same Gaussian in the same row; what
-            `gsjax.open_scene` opened, or the path that it takes.
-        up: the up direction, [3] (default: that of a run's photographs; of files -y, as in most; else +z).
+        scene: Gaussians, or a list of them, one for each moment, with the same Gaussian in the same row; the
+            result of `gsjax.track`, `parts` or `deform`; what `gsjax.open_scene` opened, or the path that it
+            takes.
+        up: the up direction, [3], or by its name: "z", "-y" (default: that of a run's photographs; for a path
+            of files -y, as in most; else +z).
         height: of the cell's frame, pixels.
 
     Raises:
         FileNotFoundError: there is no scene at the path.
-        ValueError: there is no Gaussian, one holds a number that is not finite, or moments differ in their
-            number.
+        TypeError: it is none of these.
+        ValueError: there is no Gaussian, one holds a number that is not finite, moments differ in their
+            number, or `up` is no direction.
     """
-    from gsjax.io.scenes import write_gaussians
-
     opened, path = _opened(scene)
     options = page_options(opened, range(opened.num_frames), path)
     if up is not None:
-        options["up"] = np.asarray(up, float).tolist()
+        options["up"] = _direction(up)
     with TemporaryDirectory() as folder:
         page = Path(folder) / "scene.html"
         write_gaussians(page, opened.at(0), **options)
-        return Shown(page.read_text(encoding="utf-8"), height)
+        return Shown(page.read_text(encoding="utf-8"), int(height))
 
 
 def page_options(scene: Viewable, frames: range, path: Path | None) -> dict[str, Any]:
@@ -108,25 +106,75 @@ def files_of(path: Path) -> set[Path]:
     Args:
         path: a file, a folder of numbered ones, or a run.
     """
+    if is_scene(path / "meta.json"):  # an unpacked SOG
+        path = path / "meta.json"
     return {file.resolve() for file in frame_files(path) or [path] if file.is_file()}
 
 
 def _opened(scene: Any) -> tuple[Viewable, Path | None]:
     """The scene to look at, and where it was read."""
     from gsjax.engine.checkpoint import open_scene
-    from gsjax.viz.viewer import Motion
     from gsjax.viz.viewer import Viewable as Scene
 
     if isinstance(scene, str | os.PathLike):
         return open_scene(scene), Path(scene)
     if isinstance(scene, Scene):
         return scene, None
+    moments = _moments(scene)
+    if len(moments) == 1:
+        return Scene("scene", moments[0]), None
+    return _playing(moments), None
+
+
+def _moments(scene: Any) -> list[Gaussians]:
+    """The Gaussians at each moment.
+
+    Raises:
+        TypeError: the scene has none.
+    """
+    from gsjax.methods.deform import DeformResult
+    from gsjax.methods.parts import PartsResult
+    from gsjax.methods.track import Tracked
+
     if isinstance(scene, Gaussians):
-        return Scene("scene", scene), None
-    moments = list(scene)
+        return [scene]
+    if isinstance(scene, Tracked):
+        return [scene.gaussians()]
+    if isinstance(scene, PartsResult):
+        return [scene.at(int(t)) for t in np.flatnonzero(scene.done)]
+    if isinstance(scene, DeformResult):
+        return [scene.at(time) for time in scene.timeline.times.tolist()]
+    moments = list(scene) if isinstance(scene, Iterable) else [scene]
+    others = [type(one).__name__ for one in moments if not isinstance(one, Gaussians)]
+    if others:
+        raise TypeError(
+            "scene: expected Gaussians, a list of them, the result of gsjax.track, parts or deform, what "
+            f"gsjax.open_scene opened, or a path; found {type(scene).__name__} of {others[0]}"
+        )
+    return moments
+
+
+def _playing(moments: list[Gaussians]) -> Viewable:
+    """The scene of several moments."""
+    from gsjax.viz.viewer import Motion
+    from gsjax.viz.viewer import Viewable as Scene
+
     counts = sorted({moment.num for moment in moments})
     if len(counts) != 1:
         found = f"{counts[0]} to {counts[-1]}" if counts else "no moment"
         raise ValueError(f"scene: expected moments of the same number of Gaussians, found {found}")
     motion = Motion(len(moments), counts[0], moments.__getitem__)
-    return Scene("scene", moments[0], motion=motion, times=_STEP * np.arange(len(moments))), None
+    return Scene("scene", moments[0], motion=motion, times=_STEP * np.arange(len(moments)))
+
+
+def _direction(up: str | Sequence[float]) -> list[float]:
+    """A direction of length 1."""
+    from gsjax.engine.viewables import UP
+
+    if isinstance(up, str) and up not in UP:
+        raise ValueError(f"up: expected three numbers or one of {', '.join(UP)}, found {up!r}")
+    found = np.asarray(UP[up] if isinstance(up, str) else up, float)
+    length = np.linalg.norm(found)
+    if found.shape != (3,) or not 0 < length < np.inf:
+        raise ValueError(f"up: expected three finite numbers that are not all 0, found {up}")
+    return (found / length).tolist()

@@ -95,3 +95,5 @@ def test_it_runs(verb, tmp_path, monkeypatch):
         assert len(said) < 150, said
     assert repr(now).startswith(f"Tick(step {now.step}: ")
     assert given.name in repr(given)
+    if verb != "distill":  # whose result is no scene
+        assert "<iframe" in gsjax.show(now.result)._repr_html_()

@@ -159,10 +159,12 @@ class QueryableScene(Queryable):
         number = int(self.result.timeline.frame_ids[frame])
         return {"box": question.box, "names": self.result.names, "frame": number}
 
-    def draw(self, folder: Path, found: Selection, notes: Notes, console: Console) -> dict[str, int]:
+    def draw(self, folder: Path, found: Selection, notes: Notes, console: Console) -> dict[str, int] | None:
         """Writes masks/FRAME.png (255 where a pixel's own features score above the threshold) and
         frames/FRAME.png (the scene, it without what was found, that alone, recoloured, moved) of some frames,
         and video.mp4 of all: the scene beside the scene without what was found."""
+        if not found.question.pictures:
+            return None
         result, pictured = self.result, self.pictured(found.question, found.frame)
         pixels: dict[str, int] = {}
         prompt, threshold = found.prompt, found.threshold.value
@@ -217,7 +219,7 @@ def label_everything(
         ValueError: a frame does not exist.
         FileExistsError: the folder holds something else than a result of a query.
     """
-    frame, result, shares = scene.frame_of(question), scene.result, {}
+    frame, result, shares = scene.frame_of(question), scene.result, None
     there, codebook = scene.at(frame), jnp.asarray(scene.meaning.codebook, jnp.float32)
     jax.block_until_ready(probabilities_of(there.features, codebook))  # compiles
     begun = perf_counter()

@@ -58,41 +58,55 @@ class OverTime:
     def write(
         self,
         folder: Path,
-        paint: Callable[[np.ndarray], Gaussians],
         selected: Bool[np.ndarray, "n"],
+        film: Callable[[np.ndarray], dict[str, np.ndarray]] | None = None,
+    ) -> None:
+        """Write over_time.npz: the number of each frame (`frames`), the means of what was found [T,n,3], and
+        what `film` returns of it. Where most of what was found is of objects, what is not stays behind as
+        they move, and is left out.
+
+        Args:
+            folder: for the file.
+            selected: what was found.
+            film: films it (see `film`); None for no film.
+        """
+        carried = selected & (np.asarray(self.tracking.scene.labels) != 0)
+        selected = carried if 2 * carried.sum() > selected.sum() else selected
+        means = in_world(self.tracking.means()[:, selected], self.origin)
+        filmed = {} if film is None else film(selected)
+        write_npz(folder / "over_time.npz", {"frames": np.array(self.frame_ids), "means": means, **filmed})
+
+    def film(
+        self,
+        path: Path,
+        paint: Callable[[np.ndarray], Gaussians],
         camera: str | None,
         drawer: Drawer,
         notes: Notes,
         console: Console,
-    ) -> None:
-        """Write over_time.npz: the number of each frame (`frames`), the means of what was found [T,n,3] and,
-        with the recording, the time of each frame (`times`) and the number of pixels that show what was found
-        (`pixels`); and then video.mp4, the frames of a camera with what was found in its colours and the rest
-        dimmed. Where most of what was found is of objects, what is not stays behind as they move, and is left
-        out.
+        selected: Bool[np.ndarray, "n"],
+    ) -> dict[str, np.ndarray]:
+        """Write the frames of a camera with what was found in its colours and the rest dimmed; returns the
+        time of each frame (`times`) and the number of pixels that show what was found (`pixels`), nothing
+        without the recording.
 
         Args:
-            folder: for the files.
+            path: the video.
             paint: paints the scene, red 1 in what is given, else 0.
-            selected: what was found.
             camera: its name (default, and where a photograph of another name was asked about: the first
                 held-out one, else the first tracked).
             drawer: draws the scene.
             notes: receives a warning where nothing can be filmed.
             console: shows the progress.
+            selected: what was found.
         """
-        arrays: dict[str, np.ndarray] = {"frames": np.array(self.frame_ids)}
-        carried = selected & (np.asarray(self.tracking.scene.labels) != 0)
-        selected = carried if 2 * carried.sum() > selected.sum() else selected
-        arrays["means"] = in_world(self.tracking.means()[:, selected], self.origin)
-        if self.saved is not None:
-            try:
-                arrays |= self._film(
-                    self.saved, folder / "video.mp4", paint(selected), camera, drawer, console
-                )
-            except (ValueError, OSError) as error:
-                notes.warn(f"what was found is not filmed: {describe(error)}")
-        write_npz(folder / "over_time.npz", arrays)
+        if self.saved is None:
+            return {}
+        try:
+            return self._film(self.saved, path, paint(selected), camera, drawer, console)
+        except (ValueError, OSError) as error:
+            notes.warn(f"what was found is not filmed: {describe(error)}")
+            return {}
 
     def _film(
         self,
@@ -103,7 +117,6 @@ class OverTime:
         drawer: Drawer,
         console: Console,
     ) -> dict[str, np.ndarray]:
-        """Writes the video; returns the times of its frames, and the number of pixels."""
         ids = {str(one): one for one in saved.recording.judged.camera_ids}
         motion, pixels = self.motion(painted), []
         sequence = saved.seen_by(ids.get(camera or "")).tracked.select(frames=slice(0, motion.num_frames))

@@ -50,11 +50,13 @@ class QueryableField(Queryable):
     Args:
         run: the field and its scene.
         over_time: the run that tracked the scene.
+        films: whether what is found is filmed over time.
     """
 
-    def __init__(self, run: FieldRun, over_time: OverTime | None = None):
+    def __init__(self, run: FieldRun, over_time: OverTime | None = None, *, films: bool = True):
         source = run.stored.source
         self.run, self._source, self._over_time = run, source, over_time
+        self._films = films
         self._motion = None if over_time is None else over_time.motion(run.gaussians)
         self._read_at = _changed_at(run.path / NAME)
         super().__init__(
@@ -134,18 +136,20 @@ class QueryableField(Queryable):
         image = None if question.image is None else str(question.image)
         return {"image": image, "camera": question.camera, "scene": str(self.run.file)}
 
-    def draw(self, folder: Path, found: Selection, notes: Notes, console: Console) -> dict[str, int]:
+    def draw(self, folder: Path, found: Selection, notes: Notes, console: Console) -> dict[str, int] | None:
         """Writes masks/CAMERA.png, 255 where more than half of a pixel's light comes from the selected
         Gaussians, and overview.png, for the photograph that shows most of them: the photograph, a heat map of
         the scores, and the scenes with the selected Gaussians removed, alone, recoloured and moved. Of a
-        scene that was tracked also what `OverTime.write` writes.
+        scene that was tracked also what `OverTime.write` writes, without pictures too.
 
         All are drawn by one program for each size of picture, with one colour per Gaussian, because compiling
         takes longer than drawing. Gaussians that should not be seen are made invisible rather than removed,
         so their number stays the same."""
         run, question, photographs = self.run, found.question, self.run.photographs
-        if photographs is None:
-            return {}
+        if photographs is None or not question.pictures:
+            if self._over_time is not None:
+                self._over_time.write(folder, found.selected)
+            return None
         which = range(photographs.num)
         if question.camera is not None and question.point is None:
             which = [_index(photographs, question.camera)]
@@ -190,7 +194,8 @@ class QueryableField(Queryable):
         if self._over_time is not None:
             name = None if question.camera is None else question.camera.split("/")[0]
             paint = partial(_with_shares, run.gaussians, shares=shares)
-            self._over_time.write(folder, paint, selected, name, drawer, notes, console)
+            film = partial(self._over_time.film, folder / "video.mp4", paint, name, drawer, notes, console)
+            self._over_time.write(folder, selected, film if self._films else None)
         return pixels
 
     def _read(self, text: str, negatives: tuple[str, ...] | None) -> Prompt:

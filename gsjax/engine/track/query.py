@@ -92,13 +92,13 @@ def ask_for_object(options: ObjectQuery, console: Console, folder: Path, *, pict
                     "times": recording.tracked.times[: saved.tracking.num_frames],
                 },
             )
-            pixels = _draw(new, saved, recording, answer.group, console) if pictures else []
+            pixels = _draw(new, saved, recording, answer.group, console) if pictures else None
             found = answer._asdict() | {"label": saved.tracking.scene.label_ids[answer.group]}
             found |= {"text": options.text, "encoder": options.encoder, "camera": camera}
             del found["rows"]  # in selection.npz
             write_json(new / "query.json", found | {"pixels": pixels, "notes": notes.all})
-    hidden = sum(count == 0 for count in pixels)
-    unseen = f"; camera {camera} does not see it in {hidden} of {len(pixels)} frames" if hidden else ""
+    hidden = sum(count == 0 for count in pixels or ())
+    unseen = f"; camera {camera} does not see it in {hidden} of {len(pixels or ())} frames" if hidden else ""
     score = f"cosine {answer.scores[answer.name]:.2f}, and {answer.min_score:.2f} is required"
     print(f"{answer.name}: {len(answer.rows)} Gaussians ({score}){unseen}")
     print(f"query   {folder}")

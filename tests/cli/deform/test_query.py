@@ -83,6 +83,10 @@ def test_an_answer_elsewhere_and_without_pictures(gsjax, taught, tmp_path, text)
     assert code == 0, said
     assert f"query {out}: selection.npz, recolored.ply" in said
     assert "video.mp4" not in said
+    drawn = json.loads((out / "query.json").read_text())["pixels" if text else "shares"]
+    assert drawn is None
+    code, said = gsjax("query", taught, *text, "--no-pictures", "--out", out, "--frames", "0:2")
+    assert (code, "--frames: expected pictures to draw" in said) == (2, True)
     assert {file.suffix for file in out.iterdir()} == {".json", ".npz", ".ply"}
 
 

@@ -3,6 +3,7 @@
 The fields are made up, one row a class: that of a distillation is asked in test_ply.py.
 """
 
+import json
 import shutil
 from functools import partial
 
@@ -58,6 +59,21 @@ def panels(folder):
 # what it finds
 
 
+def test_an_answer_goes_nowhere_where_something_would_be_lost(gsjax, closed, tmp_path, monkeypatch):
+    field, other, here = shutil.copytree(closed, tmp_path / "closed"), tmp_path / "other", tmp_path / "here"
+    for folder, file in ((other, "query.json"), (other, ".git"), (here, "query.json")):
+        folder.mkdir(exist_ok=True)
+        (folder / file).write_text("{}")
+    monkeypatch.chdir(here)
+    for out, found in ((field, "other files"), (other, "one with .git"), (".", "the current one")):
+        code, said = gsjax("query", field, "can", "--out", out)
+        assert code == 2
+        assert f"--out {out}: expected " in said
+        assert found in said
+    code, said = gsjax("query", field, "can", "--no-pictures", "--camera", "0")
+    assert (code, "--camera: expected --point" in said) == (2, True)
+
+
 def test_an_answer_elsewhere_and_without_pictures(gsjax, closed, tmp_path):
     field, out = shutil.copytree(closed, tmp_path / "closed"), tmp_path / "answers" / "can"
     code, said = gsjax("query", field, "can", "--no-pictures", "--out", out)
@@ -66,6 +82,7 @@ def test_an_answer_elsewhere_and_without_pictures(gsjax, closed, tmp_path):
     assert "overview.png" not in said
     assert not (field / "query").exists()
     assert {file.suffix for file in out.iterdir()} == {".json", ".npz", ".ply"}
+    assert json.loads((out / "query.json").read_text())["pixels"] is None
     elsewhere = found_of(field, out)
     assert gsjax("query", field, "can")[0] == 0
     np.testing.assert_array_equal(found_of(field)["indices"], elsewhere["indices"])

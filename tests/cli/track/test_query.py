@@ -95,6 +95,14 @@ def test_a_tracked_run_answers_what_only_its_field_can(gsjax, run, pristine):
         true = np.array([(mask == 3).sum() for mask in masks])
         np.testing.assert_allclose(found["pixels"], true, atol=0.5 * true.max())
     assert read_video_frames(run / "query" / "video.mp4").shape == (4, 480, 640, 3)
+    # Without pictures, and without the film, it is found there all the same.
+    for name, less in (("bare", "--no-pictures"), ("still", "--no-film")):
+        code, said = gsjax("query", run, "can", "--threshold", 0.6, less, "--out", run / name)
+        assert code == 0, said
+        assert json.loads((run / name / "query.json").read_text())["at_last"] == told["at_last"]
+        with np.load(run / name / "over_time.npz") as found:
+            assert (set(found), found["means"].shape[0]) == ({"frames", "means"}, 4)
+        assert not (run / name / "video.mp4").exists()
     # The viewer asks it in any frame, and saves what was found as it is there.
     with Notes(Console(quiet=True)) as notes:
         scene = open_viewable(run, notes)[0]

@@ -36,9 +36,26 @@ def test_moments_are_played():
 
 def test_moments_of_other_numbers_of_gaussians_are_refused():
     with pytest.raises(ValueError, match="same number of Gaussians, found 20 to 30"):
-        gsjax.show([some(), eqx.filter_jit(lambda g: g)(some(20))])
+        gsjax.show([some(), some(20)])
     with pytest.raises(ValueError, match="found no moment"):
         gsjax.show([])
+
+
+@pytest.mark.parametrize("up", [(0, 0, 0), (0, 0), (0, 0, float("nan")), "up"])
+def test_what_is_no_direction_is_refused(up):
+    with pytest.raises(ValueError, match=r"^up: expected "):
+        gsjax.show(some(), up=up)
+
+
+@pytest.mark.parametrize(("up", "found"), [((0, 0, 2), [0, 0, 1]), ("-y", [0, -1, 0]), ("x", [1, 0, 0])])
+def test_up_is_a_direction_or_its_name(up, found):
+    assert about(gsjax.show(some(), up=up))["up"] == found
+
+
+@pytest.mark.parametrize("scene", [None, 3, {0: some()}, [some(), None]])
+def test_what_is_no_scene_is_refused(scene):
+    with pytest.raises(TypeError, match=r"^scene: expected Gaussians, a list of them, the result of "):
+        gsjax.show(scene)
 
 
 def test_a_file_and_a_run_are_shown_as_exported(ply, tracked, export, tmp_path):
