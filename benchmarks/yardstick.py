@@ -15,6 +15,7 @@ compiled without optimising, as in the tests, in a third of the time; `--optimiz
 """
 
 import argparse
+import hashlib
 import json
 import os
 import platform
@@ -160,15 +161,24 @@ def record(out: Path, only: Sequence[str] = (), optimized: bool = False) -> int:
     env = _environment(out, optimized)
     settings = {"format": FORMAT, "made_with": _made_with(env)}
     cases = json.loads(target.read_text(encoding="utf-8"))["cases"] if target.exists() else {}
-    failed = False
+    failed, sources = False, _digest_of_sources()
     for case in chosen:
         print(f"{case.name} ...", end=" ", flush=True)
         found = _run(case, runs, env)
         failed |= found["exit_code"] != 0
         print(f"{found['seconds']:.0f} s" + (f"\n{found['error']}" if "error" in found else ""), flush=True)
         cases[case.name] = found
+        if _digest_of_sources() != sources:
+            print(f"{case.name}: gsjax's files changed while it ran, so it is not recorded; use a clone")
+            return 1
         target.write_text(json.dumps({**settings, "cases": cases}, indent=1) + "\n", encoding="utf-8")
     return int(failed)
+
+
+def _digest_of_sources() -> str:
+    """A digest of the files of the package, from which each case runs."""
+    files = sorted((Path(__file__).resolve().parents[1] / "gsjax").rglob("*.py"))
+    return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()
 
 
 def _chosen(only: Sequence[str]) -> list[Case]:

@@ -8,6 +8,7 @@ run.
 
 import sys
 from base64 import b64decode, b64encode
+from collections.abc import Iterable
 from io import BytesIO
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -22,7 +23,13 @@ _QUALITY = 85  # of a picture's JPEG
 
 
 def main(names: list[str]) -> None:
-    """Run the named notebooks, or all."""
+    """Run the named notebooks, or all.
+
+    Raises:
+        ValueError: there is none of a name.
+    """
+    if unknown := set(names) - {path.stem for path in FOLDER.glob("*.ipynb")}:
+        raise ValueError(f"expected names of notebooks in {FOLDER}, found {', '.join(sorted(unknown))}")
     for path in sorted(FOLDER.glob("*.ipynb")):
         if names and path.stem not in names:
             continue
@@ -45,7 +52,7 @@ def cleaned(notebook: nbformat.NotebookNode) -> nbformat.NotebookNode:
         if cell.cell_type != "code":
             continue
         cell.execution_count = None
-        cell.outputs = [output for output in cell.outputs if output.get("name") != "stderr"]
+        cell.outputs = joined(output for output in cell.outputs if output.get("name") != "stderr")
         for output in cell.outputs:
             if "execution_count" in output:
                 output.execution_count = None
@@ -54,6 +61,21 @@ def cleaned(notebook: nbformat.NotebookNode) -> nbformat.NotebookNode:
             if "image/png" in data:
                 data["image/jpeg"] = smaller(data.pop("image/png"))
     return notebook
+
+
+def joined(outputs: Iterable[nbformat.NotebookNode]) -> list[nbformat.NotebookNode]:
+    """The outputs, with what was printed in succession as one.
+
+    Args:
+        outputs: of a cell.
+    """
+    found = []
+    for output in outputs:
+        if found and output.output_type == found[-1].output_type == "stream":
+            found[-1].text += output.text
+        else:
+            found.append(output)
+    return found
 
 
 def smaller(picture: str) -> str:

@@ -50,6 +50,14 @@ def unmentioned() -> list[str]:
     return [name for name in changed if name not in quoted]
 
 
+def broken() -> list[str]:
+    """Public names of the last release that a patch version has changed or lacks."""
+    if gsjax.__version__.split(".")[2] == "0":
+        return []
+    before, now = json.loads(RELEASED.read_text()), digests()
+    return sorted(name for name in before if before[name] != now.get(name))
+
+
 def digests() -> dict[str, str]:
     """A short digest of each signature."""
     return {name: hashlib.sha256(text.encode()).hexdigest()[:16] for name, text in signatures().items()}

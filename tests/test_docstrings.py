@@ -21,6 +21,8 @@ FEW = 2  # so many parameters may be left to their names and annotations
 ERRORS = ("ValueError", "TypeError", "OSError", "DataError")
 OPEN_SHAPE = re.compile(r"^(np\.ndarray|(jax\.)?Array)$|\[(np\.ndarray|Array), ['\"]\.\.\.['\"]\]")
 
+METHODS = sorted((PACKAGE / "methods").glob("*/**/__init__.py"))
+
 Definition = ast.Module | ast.ClassDef | ast.FunctionDef
 
 
@@ -169,3 +171,10 @@ def f(a: Float[np.ndarray, "..."], b, some_points):
 def test_what_a_docstring_lacks_is_named(old, new, says):
     assert not_full(FULL) == []
     assert any(says in message for message in not_full(FULL.replace(old, new)))
+
+
+@pytest.mark.parametrize("package", METHODS, ids=lambda path: path.parent.name)
+def test_a_method_lists_its_files(package):
+    listed = ast.get_docstring(ast.parse(package.read_text(encoding="utf-8"))) or ""
+    for file in package.parent.glob("*.py"):
+        assert file == package or file.name in listed, f"{package}: expected {file.name} in the list of files"

@@ -1,6 +1,7 @@
 """The floors of dependencies, and the version, as pyproject.toml tells them."""
 
 import importlib.util
+import re
 import tomllib
 from pathlib import Path
 
@@ -42,5 +43,9 @@ def test_an_unknown_extra_is_named():
         floors.floors(PROJECT, ["nothing"])
 
 
-def test_the_version_is_said_once():
+def test_the_version_is_the_same_in_all_three_places():
     assert gsjax.__version__ == PROJECT["version"]
+    cited = re.search(
+        r"^version: (.*)$", (Path(__file__).resolve().parents[1] / "CITATION.cff").read_text(), re.MULTILINE
+    )
+    assert cited[1] == gsjax.__version__

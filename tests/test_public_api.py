@@ -12,6 +12,19 @@ def test_what_changed_is_in_the_changelog():
     assert not changed, f"the newest section of CHANGELOG.md should say what changed, in backticks: {changed}"
 
 
+def test_a_patch_version_keeps_its_promise():
+    assert public_api.broken() == []
+
+
+def test_a_promise_that_a_patch_version_breaks_is_found(tmp_path, monkeypatch):
+    monkeypatch.setattr(public_api, "RELEASED", tmp_path / "released.json")
+    (tmp_path / "released.json").write_text('{"kept": "same", "changed": "old", "gone": "old"}')
+    monkeypatch.setattr(public_api, "digests", lambda: {"kept": "same", "changed": "new", "added": "new"})
+    for version, names in (("0.2.1", ["changed", "gone"]), ("0.2.0", [])):
+        monkeypatch.setattr("gsjax.__version__", version)
+        assert public_api.broken() == names
+
+
 def test_a_change_that_is_not_in_the_changelog_is_found(tmp_path, monkeypatch):
     monkeypatch.setattr(public_api, "ROOT", tmp_path)
     monkeypatch.setattr(public_api, "RELEASED", tmp_path / "released.json")

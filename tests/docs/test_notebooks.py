@@ -4,6 +4,7 @@ import json
 from dataclasses import replace
 
 import matplotlib
+import matplotlib.pyplot as plt
 import pytest
 
 from gsjax.engine.parts import start as parts_start
@@ -19,8 +20,8 @@ SHORTER = {
     "track": {"gsjax.TrackConfig()": "TRACK", "frames=12": "frames=2"},
     "parts": {
         "gsjax.PartsConfig()": "PARTS",
-        "frames=list(range(20))": "frames=[0, 5]",
         "simulated:articulated?width=160&height=120&frames=20": "simulated:hard_parts?width=96&height=72",
+        "fig, axes = plt.subplots(1, 4": "sequence = sequence.select([0, 5])\nfig, axes = plt.subplots(1, 4",
         "eval_cameras=[1]": "eval_cameras=[3, 6]",
         "(0, 6, 12, 19)": "(0, 1, 0, 1)",
     },
@@ -58,5 +59,10 @@ def test_it_runs(name, tmp_path, monkeypatch):
     for long, short in SHORTER[name].items():
         assert long in text, f"{name}: expected {long!r}, which is shortened here"
         text = text.replace(long, short)
+    names = {"__name__": name, "TRACK": TRACK, "PARTS": PARTS}
     with matplotlib.rc_context({"backend": "Agg"}):
-        exec(compile(text, name, "exec"), {"__name__": name, "TRACK": TRACK, "PARTS": PARTS})
+        exec(compile(text, name, "exec"), names)
+    found = {"fit": "psnr", "track": "moments", "parts": "moments"}[name]
+    assert len(names[found]) == {"fit": 4, "track": 1, "parts": 2}[name]
+    assert plt.get_fignums()
+    plt.close("all")

@@ -8,6 +8,7 @@ slots (3DGS-MCMC, Kheradmand et al. 2024).
     config.py  settings                  start.py    the initial Gaussians
     model.py   the parameters of a fit   update.py   the loss, one step, and densification
     method.py  the method, for the loop  pruning.py  removal of unneeded Gaussians
+    padding.py  photographs of many sizes, padded to a few
 """
 
 from gsjax.geometry.extent import Extent, extent_of

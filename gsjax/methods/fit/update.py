@@ -29,7 +29,7 @@ class Batch(NamedTuple):
     """The input of a step.
 
     Attributes:
-        frame: the photograph, of one camera, RGB in bytes.
+        frame: the photograph, of one camera, RGB in bytes, on the device.
         view: index of the photograph.
         background: RGB behind the scene, 0 to 1.
         progress: share of the fit that is done, 0 to 1, over which learning rates fall.

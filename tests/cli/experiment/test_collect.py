@@ -6,9 +6,12 @@ from pathlib import Path
 
 import pytest
 
+from gsjax import __version__
 from gsjax.engine import machine
 from gsjax.engine.experiments import script as scripts
 from tests.cli.experiment.toys import SCRIPT, calls, cell_files, markdown_table, results
+
+VERSION = re.escape(__version__)
 
 
 def test_no_line_of_the_table_averages_over_two_versions(toy, gsjax):
@@ -100,7 +103,7 @@ def test_machines_are_named_in_the_rows_where_they_differ(toy, gsjax):
     record = json.loads(cell_files()[0].read_text())
     cell_files()[0].write_text(json.dumps({**record, "machine": record["machine"] | {"processor": "abacus"}}))
     _, out, _ = gsjax("table", "toy")
-    assert re.search(r"Machine: abacus, .*, gsjax 0.1.0\+\w{8} \(1 of 4 cells\)\.", out)
+    assert re.search(rf"Machine: abacus, .*, gsjax {VERSION}\+\w{{8}} \(1 of 4 cells\)\.", out)
     found = results(folder)
     assert "machine" not in found["same"]
     assert sum(row["machine"]["processor"] == "abacus" for row in found["rows"]) == 1
@@ -113,7 +116,7 @@ def test_rows_of_two_versions_are_said_to_be(toy, gsjax):
     (folder.parent / "shared.py").write_text("WIDTH = 640")
     scripts._hash_of.cache_clear()
     _, out, _ = gsjax("run", "toy")
-    made = re.findall(r"Machine: .*, gsjax 0.1.0\+(\w{8}) \((\d) of (\d) cells\)", out)
+    made = re.findall(rf"Machine: .*, gsjax {VERSION}\+(\w{{8}}) \((\d) of (\d) cells\)", out)
     assert len({version for version, *_ in made}) == len(made) == 2
     assert sum(int(count) for _, count, _ in made) == int(made[0][2])
 

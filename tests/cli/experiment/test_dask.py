@@ -13,6 +13,7 @@ from pathlib import Path
 
 import pytest
 
+from gsjax import __version__
 from gsjax.engine.experiments.cluster import slurm_cluster
 from tests.cli.experiment.toys import SCRIPT, calls, cell_files, results
 
@@ -155,7 +156,7 @@ def test_a_worker_of_another_gsjax_is_refused(beside, toy, gsjax, monkeypatch):
     assert (code, calls()) == (2, [])
     assert "error: worker tcp://" in err
     assert "expected gsjax 9.9+" in err
-    assert "found 0.1.0+" in err
+    assert f"found {__version__}+" in err
 
 
 @pytest.mark.skipif(os.name != "posix", reason="signals")
