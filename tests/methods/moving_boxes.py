@@ -27,6 +27,7 @@ class Box:
         turns: [T, 3] rotation vectors about `pivot`, against the canonical frame.
         shifts: [T, 3] metres.
         pivot: the middle of the box unless given.
+        gone: frames in which it is not there.
     """
 
     center: tuple[float, float, float]
@@ -34,6 +35,7 @@ class Box:
     turns: np.ndarray
     shifts: np.ndarray
     pivot: tuple[float, float, float] | None = None
+    gone: tuple[int, ...] = ()
 
     def motions(self) -> np.ndarray:
         """[T, 4, 4], canonical to then."""
@@ -88,12 +90,14 @@ class MovingBoxes:
     def at(self, t: int) -> Gaussians:
         """The scene at frame t."""
         means, quats = np.asarray(self.gaussians.means).copy(), np.asarray(self.gaussians.quats).copy()
+        logits = np.asarray(self.gaussians.logit_opacities).copy()
         for k, box in enumerate(self.boxes, 1):
             motion, mine = box.motions()[t], self.bodies == k
             means[mine] = means[mine] @ motion[:3, :3].T + motion[:3, 3]
             quats[mine] = Rotation.from_matrix(motion[:3, :3]).as_quat(scalar_first=True)
-        places = jax.device_put((means, quats))
-        return eqx.tree_at(lambda g: (g.means, g.quats), self.gaussians, places)
+            logits[mine] = -30.0 if t in box.gone else logits[mine]
+        there = jax.device_put((means, quats, logits))
+        return eqx.tree_at(lambda g: (g.means, g.quats, g.logit_opacities), self.gaussians, there)
 
     @cached_property
     def _plan(self):

@@ -24,8 +24,8 @@ from gsjax.methods.parts import (
     order_of_frames,
     prune_parts,
 )
-from gsjax.methods.parts.discovery import close_frame, join_parts, weights_of_run
-from gsjax.methods.parts.finish import cut_weights, moved_weights, touched_parts
+from gsjax.methods.parts.discovery import close_frame, join_parts, touched_parts, weights_of_run
+from gsjax.methods.parts.finish import cut_weights, moved_weights
 from gsjax.methods.parts.pictures import Problem
 from gsjax.methods.parts.timeline import apply, parse_script
 from gsjax.scene.feature_grid import FeatureGridConfig

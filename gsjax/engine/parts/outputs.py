@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from rich.console import Console
 
 from gsjax.engine.ending import ended
@@ -69,6 +69,7 @@ def finished(
             notes.warn(f"scoring was stopped after {counted(scores.num_frames, 'frame')} by {reason(error)}")
             progress.stopped = error if isinstance(error, KeyboardInterrupt) else None
     rows, against_truth = part_rows(scene, trajectory, joints), {}
+    _note_absences(trajectory, found.done, notes)
     warn_of_strays(rows, scene, notes)
     for row in rows if origin is not None else ():
         row["point"] = None if row["point"] is None else in_world(np.array(row["point"]), origin).tolist()
@@ -114,6 +115,21 @@ def finished(
     }
 
 
+def _note_absences(trajectory: Trajectory, done: Bool[np.ndarray, "T"], notes: Notes) -> None:
+    """Say which parts are not there in which frames."""
+    absent = (np.asarray(trajectory.opacities) == 0) & done[:, None]
+    for part in np.flatnonzero(absent.any(0)).tolist():
+        frames = np.flatnonzero(absent[:, part]).tolist()
+        notes.add(f"Part {part} is not there in {len(frames)} of {int(done.sum())} frames: {_runs(frames)}.")
+
+
+def _runs(frames: list[int]) -> str:
+    """Frames as runs of successive ones: 3 to 5, 9."""
+    ends = [t for t in frames if t + 1 not in frames]
+    begins = [t for t in frames if t - 1 not in frames]
+    return ", ".join(f"{a} to {b}" if b > a else f"{a}" for a, b in zip(begins, ends, strict=True))
+
+
 def write_parts(
     path: Path,
     scene: PartScene,
@@ -125,7 +141,8 @@ def write_parts(
     0 is the background, which does not move. All in metres, seconds and the world's axes.
 
     anchor (frame index), means0 [N,3], weights [N,P], labels [N], centres [P,3], R [T,P,3,3], t [T,P,3],
-    times [T].
+    times [T]. Where some part is not there in some frame: opacities [T,P], 0 there and else 1, factors on
+    those of its Gaussians.
 
     Args:
         path: the file.
@@ -143,4 +160,6 @@ def write_parts(
         "t": trajectory.poses.translations,
         "times": trajectory.times,
     }
+    if not (np.asarray(trajectory.opacities) == 1).all():
+        arrays["opacities"] = trajectory.opacities
     write_npz(path, {name: np.asarray(array) for name, array in arrays.items()})

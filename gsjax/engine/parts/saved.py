@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import equinox as eqx
 import jax.numpy as jnp
 import jaxlie
 import numpy as np
@@ -30,6 +31,7 @@ _ARRAYS = {
     "R": ("T", "P", 3, 3),
     "t": ("T", "P", 3),
 }
+_OPTIONAL = {"opacities": ("T", "P")}  # only where some part is not there in some frame
 _AGAIN = "run gsjax parts again with this version of gsjax, or name another folder"
 
 
@@ -138,7 +140,11 @@ def _read(path: Path) -> tuple[Layer, dict[str, int], bool, Float[np.ndarray, "3
     weights, centers = (jnp.asarray(arrays[name], float) for name in ("weights", "centres"))
     poses = HandlePose(jaxlie.SO3.from_matrix(R).wxyz, t)
     names = {name: part for name, part in names.items() if part < parts}
-    layer = Layer(PartScene(gaussians, weights, centers), trajectory_of(times, poses))
+    trajectory = trajectory_of(times, poses)
+    if "opacities" in arrays:
+        shown = jnp.asarray(arrays["opacities"][done], float)
+        trajectory = eqx.tree_at(lambda t: t.opacities, trajectory, shown)
+    layer = Layer(PartScene(gaussians, weights, centers), trajectory)
     return layer, names, len(done) == frames, origin
 
 
@@ -153,7 +159,10 @@ def _kind(file: Path) -> str | None:
 def _arrays(file: Path) -> dict[str, np.ndarray]:
     """The arrays of parts.npz, checked."""
     arrays = read_arrays(file, tuple(_ARRAYS), _AGAIN)
-    frames = check_arrays(file, arrays, _ARRAYS, _AGAIN)["T"]
+    there = {name: shape for name, shape in _OPTIONAL.items() if name in arrays}
+    frames = check_arrays(file, arrays, _ARRAYS | there, _AGAIN)["T"]
+    if there and not ((arrays["opacities"] >= 0) & (arrays["opacities"] <= 1)).all():
+        raise ValueError(f"{file}: opacities: expected numbers from 0 to 1, found others; {_AGAIN}")
     anchor = arrays["anchor"]
     if anchor.dtype.kind not in "iu" or not 0 <= anchor < frames:
         expected = f"the index of one of {frames} frames, 0 to {frames - 1}"

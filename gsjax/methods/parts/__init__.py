@@ -16,7 +16,8 @@ weights.py    the field of skinning weights       discovery.py   from frame to f
 discover.py   the start, from all of these        finish.py      removal of unneeded parts
 unify.py      which parts join or divide          result.py      scene, trajectory and joints
 motion.py     what moves, and hangs together      exposure.py    colours of cameras against the scene
-search.py     parts that jump                     sizes.py       sizes of pictures, and of a pixel
+search.py     parts that jump                     absence.py     parts that leave, or are yet to come
+sizes.py      sizes of pictures, and of a pixel
 states/       parts from two states, of which no motion is seen
 trajectory.py parts over time                     screws.py      poses as rigid motions
 edits.py      edits of trajectories               film.py        layers rendered together

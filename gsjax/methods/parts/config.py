@@ -139,6 +139,8 @@ class PartsConfig:
     """Hash grid of the skinning weights."""
     exposures: bool = True
     """Give the pictures of each camera the exposure and white balance of the scene."""
+    absences: bool = True
+    """Hide parts in frames in which they are not there: they have left, or are yet to come."""
     headroom: float = 1.6
     """Capacity of a render plan, relative to what is needed."""
     seed: int = 0

@@ -24,6 +24,7 @@ Pairs = tuple[tuple[int, int], ...]
 """Joined parts, as (part, the part that it was joined to), or divided ones, as (new part, the part that it
 was split from)."""
 _REWARM = 100  # steps that fit a grid after parts were joined or divided
+_LEAST_CONTACT = 0.05  # share of a part's neighbours that another part must have to touch it
 _REST = 4  # rounds of divisions for which a newly divided part is left alone
 
 
@@ -45,6 +46,7 @@ class Discovery(NamedTuple):
         predicted: poses of the handles before the first step of `frame`.
         joined: joined parts.
         divided: divided parts.
+        absent: frames in which each part is not there; None if all always are, or before that is known.
     """
 
     canonical: Canonical
@@ -61,6 +63,7 @@ class Discovery(NamedTuple):
     predicted: HandlePose
     joined: Pairs = ()
     divided: Pairs = ()
+    absent: Bool[np.ndarray, "T P"] | None = None
 
     @property
     def done(self) -> Bool[np.ndarray, "T"]:
@@ -218,6 +221,22 @@ def join_parts(
     weights = np.where(left, weights @ np.eye(len(into), dtype=np.float32)[into], 0)
     weights = weights / weights.sum(-1, keepdims=True)
     return _with_parts(discovery, weights, left)._replace(joined=(*discovery.joined, *pairs)), weights
+
+
+def touched_parts(discovery: Discovery, weights: Float[np.ndarray, "M P"], part: int) -> list[int]:
+    """The parts that a part touches, to which at least 5 % of its neighbours belong, and the background.
+
+    Args:
+        discovery: the neighbours of each Gaussian.
+        weights: weights of the movable Gaussians.
+        part: index of the part.
+    """
+    labels = weights.argmax(-1)
+    neighbors = np.asarray(discovery.canonical.neighbors)[labels == part].ravel()
+    all_ = np.concatenate([labels, np.full(discovery.canonical.fixed.num, BACKGROUND)])
+    names, counts = np.unique(all_[neighbors], return_counts=True)
+    near = names[counts >= _LEAST_CONTACT * len(neighbors)]
+    return sorted({BACKGROUND, *near.tolist()} - {part})
 
 
 def _split(run: Run, config: PartsConfig) -> Run:

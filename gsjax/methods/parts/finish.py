@@ -1,8 +1,9 @@
 """The end of a discovery: parts that no picture needs are removed, the refinement of the scene and of all
 poses is set up, and the scene and its trajectory are assembled for edits."""
 
-from functools import lru_cache, partial
+from functools import partial
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -10,23 +11,22 @@ from jaxtyping import Array, Bool, Float, Int
 
 from gsjax.geometry.cameras import on_device
 from gsjax.geometry.rotations import quats_to_matrices
-from gsjax.methods.parts.config import PartsConfig, StreamConfig
+from gsjax.methods.parts.absence import absences, loss_of_picture, with_absences
+from gsjax.methods.parts.config import PartsConfig
 from gsjax.methods.parts.discover import centers_of
-from gsjax.methods.parts.discovery import Discovery, join_parts, weights_of_run
+from gsjax.methods.parts.discovery import Discovery, join_parts, touched_parts, weights_of_run
 from gsjax.methods.parts.pictures import Problem, coarse_frame, with_part_masks
 from gsjax.methods.parts.refine import RefineParams, refine_step
-from gsjax.methods.parts.stream import Canonical, picture_loss, posed
+from gsjax.methods.parts.stream import posed
 from gsjax.methods.parts.trajectory import BACKGROUND, PartScene, Trajectory, trajectory_of
-from gsjax.optim.compiler import host_options
 from gsjax.optim.method import Run
 from gsjax.optim.step import copied
 from gsjax.rasterize.plan import with_room
 from gsjax.scene.frame import Frame, one_camera
 from gsjax.scene.handles import HandlePose
-from gsjax.scene.render import plan_render, render
+from gsjax.scene.render import plan_render
 
 _PICTURES, _CAMERAS = 12, 2  # by which parts are evaluated, and those of a frame at least
-_LEAST_CONTACT = 0.05  # share of a part's neighbours that another part must have to touch it
 _LEAST_WEIGHT = 0.02
 
 
@@ -39,6 +39,9 @@ def begin_refinement(problem: Problem, run: Run, config: PartsConfig) -> Run:
         config: settings.
     """
     discovery = prune_parts(problem, run.kept, np.asarray(weights_of_run(run)), config)
+    if config.absences and not problem.at_once:
+        absent = absences(problem, discovery, config)
+        discovery = discovery if absent is None else with_absences(discovery, absent)
     poses = HandlePose(*jax.device_put((discovery.quats, discovery.translations)))
     canonical = discovery.canonical
     params = copied(RefineParams(canonical.movable, canonical.fixed, poses))
@@ -94,22 +97,6 @@ def moved_weights(weights: Float[np.ndarray, "M P"], part: int, to: int) -> Floa
     return changed
 
 
-def touched_parts(discovery: Discovery, weights: Float[np.ndarray, "M P"], part: int) -> list[int]:
-    """The parts that a part touches, to which at least 5 % of its neighbours belong, and the background.
-
-    Args:
-        discovery: the neighbours of each Gaussian.
-        weights: weights of the movable Gaussians.
-        part: index of the part.
-    """
-    labels = weights.argmax(-1)
-    neighbors = np.asarray(discovery.canonical.neighbors)[labels == part].ravel()
-    all_ = np.concatenate([labels, np.full(discovery.canonical.fixed.num, BACKGROUND)])
-    names, counts = np.unique(all_[neighbors], return_counts=True)
-    near = names[counts >= _LEAST_CONTACT * len(neighbors)]
-    return sorted({BACKGROUND, *near.tolist()} - {part})
-
-
 def _smallest_first(labels: Int[np.ndarray, "M"]) -> list[int]:
     names, counts = np.unique(labels[labels != BACKGROUND], return_counts=True)
     return names[np.argsort(counts, kind="stable")].tolist()
@@ -125,7 +112,7 @@ class _MeanLoss:
         weights: Float[np.ndarray, "M P"],
         config: PartsConfig,
     ):
-        self._loss = _compiled_loss(config.stream)
+        self._loss = loss_of_picture(config.stream)
         self._canonical, self._headroom = discovery.canonical, 2 * config.headroom
         done, count = np.flatnonzero(discovery.done), problem.sequence.num_cameras
         most = min(_PICTURES // _CAMERAS, len(done))
@@ -150,16 +137,6 @@ class _MeanLoss:
             loss, self._plan = with_room(draw, self._plan, self._headroom)
             losses.append(float(loss))
         return float(np.mean(losses))
-
-
-@lru_cache(maxsize=2)
-def _compiled_loss(config: StreamConfig):
-    @partial(jax.jit, static_argnames="plan", compiler_options=host_options())
-    def loss(canonical: Canonical, weights, pose, frame, plan):
-        drawn = render(posed(canonical, weights, pose, config.blend), frame.cameras, plan, roi=frame.masks)
-        return picture_loss(drawn, frame, config), drawn.meta
-
-    return loss
 
 
 def scene_and_trajectory(
@@ -189,7 +166,11 @@ def scene_and_trajectory(
     everything = jax.tree.map(lambda a, b: np.concatenate([a, b]), canonical.movable, canonical.fixed)
     gaussians = jax.tree.map(lambda a: a[np.argsort(discovery.order)], everything)
     scene = PartScene(*jax.device_put((gaussians, full, after)))
-    return scene, trajectory_of(jax.device_put(np.asarray(times, poses.quats.dtype)), poses)
+    trajectory = trajectory_of(jax.device_put(np.asarray(times, poses.quats.dtype)), poses)
+    if discovery.absent is not None:
+        shown = jnp.asarray(~discovery.absent[:, kept], trajectory.opacities.dtype)
+        trajectory = eqx.tree_at(lambda t: t.opacities, trajectory, shown)
+    return scene, trajectory
 
 
 @jax.jit

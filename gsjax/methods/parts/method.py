@@ -7,6 +7,7 @@ import numpy as np
 
 from gsjax.geometry.cameras import on_device, resized
 from gsjax.losses.extra import ExtraLosses, named_losses
+from gsjax.methods.parts.absence import with_absences
 from gsjax.methods.parts.config import PartsConfig
 from gsjax.methods.parts.discover import Start
 from gsjax.methods.parts.discovery import (
@@ -156,6 +157,8 @@ class Parts:
                 quats=np.asarray(poses.quats),
                 translations=np.asarray(poses.translations),
             )
+            if discovery.absent is not None:
+                discovery = with_absences(discovery, discovery.absent)
         settled = isinstance(run.params, RefineParams) or not discovery.is_between_frames
         weights = np.asarray(discovery.weights if settled else weights_of_run(run))
         scene, trajectory = scene_and_trajectory(discovery, weights, problem.sequence.times)
@@ -197,6 +200,7 @@ class Parts:
             i / self.steps_of_refinement(problem),
             run.plans[plan],
             problem.at_once,  # surfaces in space tell poses better than pictures do
+            None if discovery.absent is None else jnp.asarray(~discovery.absent[t], jnp.float32),
         )
         return batch, (plan,)
 

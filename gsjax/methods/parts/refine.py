@@ -60,6 +60,7 @@ class RefineBatch(NamedTuple):
         t: index of the frame.
         anchor: index of the canonical frame, at which all handles are at rest.
         held: whether all poses stay as they are.
+        shown: 1 for each part that is there in the frame, else 0; None if all are.
         progress: share of the refinement that is done, 0 to 1, over which learning rates fall.
         plan: the render plan.
     """
@@ -72,6 +73,7 @@ class RefineBatch(NamedTuple):
     progress: Float[Array, ""] | float
     plan: Plan
     held: Bool[Array, ""] | bool = False
+    shown: Float[Array, "P"] | None = None
 
 
 def refine_step(config: PartsConfig, extra_losses: ExtraLosses = ()) -> Step:
@@ -104,7 +106,7 @@ def refine_step(config: PartsConfig, extra_losses: ExtraLosses = ()) -> Step:
 
         def loss(gaussians, pose):
             canonical = batch.canonical._replace(movable=gaussians[0], fixed=gaussians[1])
-            moved = posed(canonical, batch.weights, pose, config.stream.blend)
+            moved = posed(canonical, batch.weights, pose, config.stream.blend, opacities=batch.shown)
             drawn = render(moved, batch.frame.cameras, batch.plan)
             info: dict[str, Any] = {"overflow": drawn.meta.overflow.any(), "needed": drawn.meta.needed.max()}
             value = picture_loss(drawn, batch.frame, config.stream)
@@ -127,6 +129,7 @@ def refine_step(config: PartsConfig, extra_losses: ExtraLosses = ()) -> Step:
         moves, pose_state = poses.update(slope[1], pose_state)
         stays = (batch.t == batch.anchor) | batch.held
         far = jnp.where(stays, 0.0, config.refine.pose_rate * fall * pixel)
+        far = far if batch.shown is None else far * batch.shown[:, None]
         pose = pose_after(pose, moves, batch.canonical, far, far)
         everywhere = jax.tree.map(
             lambda every, one: every.at[batch.t].set(one), (params.poses, state[1]), (pose, pose_state)

@@ -64,8 +64,9 @@ class PartsResult(NamedTuple):
         return gaussians_at(self.scene, moment(self.trajectory, t), self.blend)
 
     def joints(self) -> dict[int, FittedJoint]:
-        """The joint that explains the motion of each part best, by part, over the frames that were found."""
-        motions = motions_in_world(self.scene, self.trajectory)[self.done]
+        """The joint that explains the motion of each part best, by part, over the frames that were found and
+        in which it is there."""
+        motions, there = motions_in_world(self.scene, self.trajectory), np.asarray(self.trajectory.opacities)
         labels, means = np.asarray(self.scene.labels), np.asarray(self.scene.gaussians.means, np.float64)
         joints = {}
         for part in range(BACKGROUND + 1, self.scene.num_parts):
@@ -73,7 +74,12 @@ class PartsResult(NamedTuple):
             distances = np.linalg.norm(points - np.median(points, axis=0), axis=1)
             points = points[distances <= _FAR * np.median(distances)]
             points = points[:: max(1, len(points) // _POINTS)]
-            joints[part] = fit_joint(motions[:, part], points, noise_m=self.pixel, tolerance=_OFF_JOINT)
+            joints[part] = fit_joint(
+                motions[self.done & (there[:, part] > 0), part],
+                points,
+                noise_m=self.pixel,
+                tolerance=_OFF_JOINT,
+            )
         return joints
 
 

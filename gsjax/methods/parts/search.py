@@ -7,24 +7,26 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from gsjax.geometry.cameras import Camera, project
 from gsjax.geometry.spherical_harmonics import SH_C0
-from gsjax.methods.parts.discovery import Discovery
-from gsjax.methods.parts.finish import touched_parts
+from gsjax.methods.parts.discovery import Discovery, touched_parts
 from gsjax.methods.parts.trajectory import BACKGROUND
 from gsjax.optim.compiler import host_jit
 from gsjax.scene.frame import Frame
+from gsjax.scene.gaussians import Gaussians
 from gsjax.scene.handles import Blend, HandlePose, skin
 
-_POINTS = 64  # Gaussians by which a group of parts is recognised
+POINTS = 64
+"""Gaussians by which a part, or a group of them, is recognised."""
 _MOST = 0.3  # difference of colours, 0 to 1, that counts as entirely wrong
 _ASTRAY = 1.25, 0.02  # a group is looked for if its difference is so much larger than at the anchor
 _LEFT = 0.3  # share of what it differs by beyond the anchor's difference that a better place may leave
 _GRIDS = (6.0, 1.0), (1.0, 0.5), (0.5, 0.25)  # reach and spacing of the places, in radii of the group
+_NOWHERE = np.zeros((1, 3), np.float32)
 _INSIDE = 0.5  # share of the points that a place must keep in the pictures
 
 
@@ -56,13 +58,48 @@ def groups_of(discovery: Discovery) -> list[Group]:
     touching = [np.isin(parts, touched_parts(discovery, weights, part)) for part in parts.tolist()]
     count, group_of = connected_components(coo_array(touching), directed=False)
     means = np.asarray(canonical.movable.means)
-    sizes = np.asarray(canonical.movable.opacities) * np.sort(canonical.movable.scales, -1)[:, 1:].prod(-1)
     groups = []
     for members in (parts[group_of == i] for i in range(count)):
-        rows = np.flatnonzero(np.isin(labels, members))
+        mine = np.isin(labels, members)
+        rows = np.flatnonzero(mine)
         radius = float(np.quantile(np.linalg.norm(means[rows] - means[rows].mean(0), axis=-1), 0.95))
-        groups.append(Group(members, rows[np.argsort(-sizes[rows])[:_POINTS]], radius))
+        groups.append(Group(members, most_visible(canonical.movable, mine), radius))
     return groups
+
+
+def most_visible(gaussians: Gaussians, mine: Bool[np.ndarray, "M"]) -> Int[np.ndarray, "n"]:
+    """The rows of those of some Gaussians that show most, `POINTS` of them or fewer.
+
+    Args:
+        gaussians: M Gaussians.
+        mine: the ones to choose from.
+    """
+    rows = np.flatnonzero(mine)
+    sizes = np.asarray(gaussians.opacities) * np.sort(gaussians.scales, -1)[:, 1:].prod(-1)
+    return rows[np.argsort(-sizes[rows])[:POINTS]]
+
+
+def colors_of(gaussians: Gaussians) -> Float[np.ndarray, "M 3"]:
+    """Their colours, the same from all sides."""
+    return 0.5 + SH_C0 * np.asarray(gaussians.sh0)[:, 0]
+
+
+def color_differences(
+    frame: Frame,
+    points: Float[np.ndarray, "n 3"],
+    colors: Float[np.ndarray, "n 3"],
+    shifts: Float[np.ndarray, "K 3"] = _NOWHERE,
+) -> Float[np.ndarray, "K"]:
+    """The mean difference between the colours of points and of the pixels that show their places; see
+    `_costs`.
+
+    Args:
+        frame: all cameras.
+        points: their places, metres.
+        colors: their colours.
+        shifts: places to try, relative to theirs, metres (default: theirs alone).
+    """
+    return np.asarray(_costs(frame.images, frame.cameras, points, colors, shifts))
 
 
 def searched(discovery: Discovery, now: Frame, anchor: Frame, blend: Blend) -> HandlePose:
@@ -77,21 +114,17 @@ def searched(discovery: Discovery, now: Frame, anchor: Frame, blend: Blend) -> H
     canonical, predicted = discovery.canonical, discovery.predicted
     moved = skin(canonical.movable, discovery.weights, canonical.centers, predicted, blend)
     moved, means = np.asarray(moved.means), np.asarray(canonical.movable.means)
-    colors = 0.5 + SH_C0 * np.asarray(canonical.movable.sh0)[:, 0]
-    nowhere, shifts = np.zeros((1, 3), np.float32), {}
+    colors, shifts = colors_of(canonical.movable), {}
     for group in groups_of(discovery):
-        rows = np.resize(group.rows, _POINTS)
-
-        def costs(points, frame, places, rows=rows):
-            return np.asarray(_costs(frame.images, frame.cameras, points[rows], colors[rows], places))
-
-        usual, here = costs(means, anchor, nowhere)[0], costs(moved, now, nowhere)[0]
+        rows = np.resize(group.rows, POINTS)
+        usual = color_differences(anchor, means[rows], colors[rows])[0]
+        here = color_differences(now, moved[rows], colors[rows])[0]
         if here <= _ASTRAY[0] * usual + _ASTRAY[1]:
             continue
-        best, there = nowhere, here
+        best, there = _NOWHERE, here
         for reach, spacing in _GRIDS:
             places = best + np.float32(group.radius) * _grid(reach, spacing)
-            at = costs(moved, now, places)
+            at = color_differences(now, moved[rows], colors[rows], places)
             best, there = places[at.argmin()][None], at.min()
         if there <= usual + _LEFT * (here - usual):  # what hides some of it is part of what is usual
             shifts |= dict.fromkeys(group.parts.tolist(), best[0])

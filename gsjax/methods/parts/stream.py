@@ -17,7 +17,7 @@ from gsjax.geometry.rotations import normalize_quats
 from gsjax.losses.extra import ExtraLosses, extra_terms, named_losses
 from gsjax.losses.photometric import l1_loss, ssim, weighted_mean
 from gsjax.methods.parts.config import StreamConfig
-from gsjax.methods.parts.trajectory import BACKGROUND
+from gsjax.methods.parts.trajectory import BACKGROUND, faded
 from gsjax.methods.parts.weights import Field, SimplexTable, weights_of
 from gsjax.optim.constrained import simplex_descent
 from gsjax.optim.step import Step, all_finite, keep_if, steady_adam
@@ -125,6 +125,7 @@ def posed(
     pose: HandlePose,
     blend: Blend = "quaternion",
     nudges: Float[Array, "M 3"] | None = None,
+    opacities: Float[Array, "P"] | None = None,
 ) -> Gaussians:
     """The whole scene with its handles at a pose, movable Gaussians first.
 
@@ -134,10 +135,14 @@ def posed(
         pose: poses of the handles.
         blend: how rotations are blended.
         nudges: offsets of the movable means, metres.
+        opacities: factors on the opacities of each part's Gaussians, 0 to 1.
     """
     moved = skin(canonical.movable, weights, canonical.centers, pose, blend)
     if nudges is not None:
         moved = eqx.tree_at(lambda g: g.means, moved, moved.means + nudges)
+    if opacities is not None:
+        logits = faded(moved.logit_opacities, weights @ (1 - opacities))
+        moved = eqx.tree_at(lambda g: g.logit_opacities, moved, logits)
     return jax.tree.map(lambda a, b: jnp.concatenate([a, b]), moved, canonical.fixed)
 
 

@@ -117,7 +117,16 @@ def _scaled_and_faded(
     larger = now.scales - 1
     growth = (weights @ larger)[:, None]
     means = gaussians.means + growth * gaussians.means - weights @ (larger[:, None] * scene.centers)
-    hidden = weights @ (1 - now.opacities)
-    logits = jnp.minimum(gaussians.logit_opacities, _OPAQUE)
-    shown = jnp.log(jnp.maximum(1 - hidden, _FAINTEST)) - jnp.log1p(hidden * jnp.exp(logits))
-    return means, gaussians.log_scales + jnp.log1p(growth), logits + shown
+    logits = faded(gaussians.logit_opacities, weights @ (1 - now.opacities))
+    return means, gaussians.log_scales + jnp.log1p(growth), logits
+
+
+def faded(logits: Float[Array, "N"], hidden: Float[Array, "N"]) -> Float[Array, "N"]:
+    """Logits of opacities times 1 - `hidden`, or times 1e-9 where that is 0.
+
+    Args:
+        logits: of the opacities.
+        hidden: the share that is taken away, 0 to 1.
+    """
+    logits = jnp.minimum(logits, _OPAQUE)
+    return logits + (jnp.log(jnp.maximum(1 - hidden, _FAINTEST)) - jnp.log1p(hidden * jnp.exp(logits)))

@@ -119,3 +119,16 @@ def test_how_rotations_were_blended_is_known_without_the_recording(run):
     assert blend_of(run) == "quaternion"
     config.unlink()
     assert blend_of(run) == "quaternion"
+
+
+def test_parts_that_are_not_there_are_read_again(run):
+    arrays = dict(np.load(run / "parts.npz"))
+    shown = np.ones((4, 3), np.float32)
+    shown[2:, 1] = 0
+    np.savez(run / "parts.npz", **arrays, opacities=shown)
+    layer, *_ = read_parts(run)
+    np.testing.assert_array_equal(layer.trajectory.opacities, shown)
+    np.savez(run / "parts.npz", **arrays, opacities=-shown)
+    assert said_of(run) == "parts.npz: opacities: expected numbers from 0 to 1, found others"
+    np.savez(run / "parts.npz", **arrays, opacities=shown[:2])
+    assert said_of(run) == "parts.npz: opacities: expected the shape [4,3], found [2,3]"
