@@ -60,6 +60,8 @@ def entry() -> None:
     # What is wrong with a picture or a video is said by gsjax, which knows the file.
     os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # FFmpeg's quiet
+    # XLA's alarm of a slow compilation asks for a bug report; that it compiles is said by gsjax.
+    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
     keep_streams_open()
     try:
         code = main()

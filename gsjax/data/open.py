@@ -57,7 +57,7 @@ _LAYOUTS = {
 }
 _RECORDINGS = {mark: layout for mark, (layout, _) in _LAYOUTS.items()} | {LEFT: "EndoVis"}
 _RECORDINGS |= {"poses_bounds.npy and depth or masks": "EndoNeRF", "poses_bounds.npy and cam*.mp4": "DyNeRF"}
-_RECORDINGS |= {"rgb and depth/*.exr": "Record3D"}
+_RECORDINGS |= {"rgb and depth/*.exr": "Record3D", "color, depth and a trajectory (.log)": "Open3D"}
 
 # Option -> what it is about, and whether data that were read have that.
 _ABOUT = {

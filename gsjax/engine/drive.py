@@ -62,6 +62,7 @@ class Tick:
 
     def __repr__(self) -> str:
         known = {name: np.asarray(self.info[name]) for name in ("loss", "psnr") if name in self.info}
+        known |= {name: np.asarray(value) for name, value in (self.info.get("extra") or {}).items()}
         numbers = {
             name: value for name, value in known.items() if value.shape == () and value.dtype.kind == "f"
         }

@@ -48,8 +48,8 @@ def show(scene: Any, *, up: str | Sequence[float] | None = None, height: int = 4
 
     Args:
         scene: Gaussians, or a list of them, one for each moment, with the same Gaussian in the same row; the
-            result of `gsjax.track`, `parts` or `deform`; what `gsjax.open_scene` opened, or the path that it
-            takes.
+            result of `gsjax.track`, `parts` or `deform`; a film of edited parts, layers in a tuple; what
+            `gsjax.open_scene` opened, or the path that it takes.
         up: the up direction, [3], or by its name: "z", "-y" (default: that of a run's photographs; for a path
             of files -y, as in most; else +z).
         height: of the cell's frame, pixels.
@@ -134,6 +134,7 @@ def _moments(scene: Any) -> list[Gaussians]:
     """
     from gsjax.methods.deform import DeformResult
     from gsjax.methods.parts import PartsResult
+    from gsjax.methods.parts.film import Layer, film_gaussians
     from gsjax.methods.track import Tracked
 
     if isinstance(scene, Gaussians):
@@ -144,12 +145,15 @@ def _moments(scene: Any) -> list[Gaussians]:
         return [scene.at(int(t)) for t in np.flatnonzero(scene.done)]
     if isinstance(scene, DeformResult):
         return [scene.at(time) for time in scene.timeline.times.tolist()]
+    if isinstance(scene, tuple) and scene and isinstance(scene[0], Layer):
+        return [film_gaussians(scene, t) for t in range(len(scene[0].trajectory.times))]
     moments = list(scene) if isinstance(scene, Iterable) else [scene]
     others = [type(one).__name__ for one in moments if not isinstance(one, Gaussians)]
     if others:
         raise TypeError(
-            "scene: expected Gaussians, a list of them, the result of gsjax.track, parts or deform, what "
-            f"gsjax.open_scene opened, or a path; found {type(scene).__name__} of {others[0]}"
+            "scene: expected Gaussians, a list of them, the result of gsjax.track, parts or deform, a film "
+            f"of edited parts, what gsjax.open_scene opened, or a path; found {type(scene).__name__}"
+            + (f" with {others[0]}" if others[0] != type(scene).__name__ else "")
         )
     return moments
 

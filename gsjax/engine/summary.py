@@ -143,6 +143,7 @@ class Summary:
         machine: metrics.json's description of the machine, the last of the notes; None for none.
         hints: (label, command): what to do next.
         complete: False for a run that was stopped.
+        resumable: False for a stopped run that saved nothing to go on from.
     """
 
     title: str
@@ -157,6 +158,7 @@ class Summary:
     machine: Mapping[str, Any] | None = None
     hints: Sequence[tuple[str, str]] = ()
     complete: bool = True
+    resumable: bool = True
 
     @property
     def all_notes(self) -> list[str]:

@@ -40,7 +40,8 @@ def print_summary(
     for note in summary.all_notes if notes else ():
         console.print(Text(note, style="dim"), soft_wrap=not console.is_terminal)
     if not summary.complete:
-        console.print("[bold yellow]partial run[/]; the same command with --resume continues it")
+        how = "--resume continues it" if summary.resumable else "--overwrite starts again: nothing was saved"
+        console.print(f"[bold yellow]partial run[/]; the same command with {how}")
     lines = [*summary.hints, *([] if report is None else [("report", str(report))])]
     for label, text in lines:
         console.print(Text.assemble((label, "bold"), "  ", text), soft_wrap=True)

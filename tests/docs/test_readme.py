@@ -3,9 +3,7 @@
 import re
 
 import jax.numpy as jnp
-import pytest
 
-from gsjax.cli import main
 from tests.docs.blocks import ROOT, programs
 
 
@@ -20,12 +18,14 @@ def test_it_is_short_and_its_picture_is_there():
         assert 0 < (ROOT / picture).stat().st_size < 400_000
 
 
-@pytest.mark.slow
-def test_its_derivative_runs(tmp_path, monkeypatch):
+def test_its_programs_run_one_after_the_other(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    quick = ("--frames", "0:1", "--track.start.iterations", "1")
-    assert main(["track", "simulated:tabletop", "--cameras", "0", "--out", "runs/demo", *quick]) == 0
+    first, second = (program.text for program in programs("README.md"))
     names: dict = {}
-    exec(compile(programs("README.md")[-1].text, "README.md", "exec"), names)
+    exec(
+        compile(first.replace("steps=500, cap=5000", "steps=4, cap=300, coarse_until=0.0"), "fit", "exec"),
+        names,
+    )
+    exec(compile(second, "README.md", "exec"), names)
     assert jnp.isfinite(names["by_gaussians"].means).all()
     assert jnp.isfinite(names["by_cameras"].viewmat).all()

@@ -270,6 +270,46 @@ class TestLook:
         np.testing.assert_allclose(copy.opacities[:, 1], expected, rtol=1e-6)
 
 
+SLOPES = {
+    "speed": lambda t, x: edits.speed(t, [1], x),
+    "backwards": lambda t, x: edits.speed(t, [1], -x),
+    "begin": lambda t, x: edits.speed(t, [1], 0.5, begin=0.3 * x),
+    "end": lambda t, x: edits.speed(t, [1], 2.0, begin=0.1, end=0.8 * x),
+    "freeze": lambda t, x: edits.freeze(t, [1], at=0.55 * x),
+    "move": lambda t, x: edits.move(t, [1], x * jnp.array([0.1, 0.3, -0.2])),
+    "rotate": lambda t, x: edits.rotate(t, [1], x * np.asarray(TURN, float), jnp.asarray(ARM, float)),
+    "redirect": lambda t, x: edits.redirect(t, [1], x * np.asarray(TURN, float)),
+    "amplify": lambda t, x: edits.amplify(t, [1], x),
+    "scale": lambda t, x: edits.scale(t, [1, 2], x),
+    "fade": lambda t, x: edits.fade(t, [1], 0.3 * x),
+    "ghost": lambda t, x: edits.ghost(t, [1], 0.3 * x),
+    "echo": lambda t, x: edits.echo(t, [1], 0.21 * x, 0.5),
+    "share": lambda t, x: edits.scale(t, [1], 2.0, share=edits.during(t.times, 0.2 * x, 0.9, 0.15)),
+}
+
+
+@pytest.mark.usefixtures("x64")
+@pytest.mark.parametrize("edit", SLOPES.values(), ids=SLOPES)
+def test_each_number_of_an_edit_has_its_slope_under_jit(edit):
+    """The gradient of fade, ghost and scale was an error, and those of speed and scale under jit."""
+    one, scene = trajectory(0), scene_of(0, parts=4)
+    one, scene = jax.tree.map(lambda leaf: jnp.asarray(leaf, float), (one, scene))
+    to = jax.random.normal(jax.random.key(0), (9, 7, 7))
+
+    @jax.jit
+    def seen_of(x):
+        def at(t):
+            gaussians = gaussians_at(scene, moment(edit(one, x), t))
+            columns = (gaussians.means, gaussians.scales, gaussians.opacities[:, None])
+            return jnp.concatenate(columns, axis=1)
+
+        return jnp.vdot(to, jax.vmap(at)(jnp.arange(9))[:, :7])
+
+    slope, h = jax.jit(jax.grad(seen_of))(0.9), 1e-6
+    np.testing.assert_allclose(slope, (seen_of(0.9 + h) - seen_of(0.9 - h)) / (2 * h), rtol=1e-4, atol=1e-7)
+    assert abs(slope) > 1e-6
+
+
 def test_edits_compose_and_differentiate_as_one_function():
     """What a user writes: half the speed, twice as far, fainter and elsewhere, for a while."""
     scene = scene_of(0, parts=4)

@@ -1,7 +1,7 @@
 """Files of a tracked recording: trajectory, scene and plots."""
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from gsjax.engine.files import write_scene
 from gsjax.engine.folder import RunFolder
@@ -10,6 +10,7 @@ from gsjax.engine.scores import Scores
 from gsjax.engine.summary import Media
 from gsjax.engine.track.loop import Tracking
 from gsjax.io.pictures import write_png
+from gsjax.metrics.pose import fitted_poses
 from gsjax.metrics.tracking import ObjectScore, relative_motion
 from gsjax.scene.origin import in_world
 from gsjax.viz import plots
@@ -36,12 +37,28 @@ def write_tracking(
         normals=np.asarray(tracking.scene.normals, np.float32),
         labels=labels,
         label_ids=label_ids.astype(np.int32),
+        poses=_poses_of(tracking, labels, origin),
         lost=_of_objects(tracking.lost, label_of),
         turn_known=~_of_objects([~known for known in tracking.turn_known], label_of),
         times=times[: tracking.num_frames],
         update_s=np.asarray(tracking.update_s),
     )
     write_scene(folder.scene, tracking.scene.gaussians, labels, origin=origin)
+
+
+def _poses_of(
+    tracking: Tracking, labels: Int[np.ndarray, "N"], origin: Float[np.ndarray, "3"] | None
+) -> Float[np.ndarray, "T K 4 4"]:
+    """The rigid motion of each object since the first frame, in the world; of one without Gaussians, none."""
+    means, count = tracking.means().astype(np.float64), len(np.unique(tracking.scene.label_ids)) - 1
+    poses = np.tile(np.eye(4), (len(means), count, 1, 1))
+    for k in range(count):
+        mine = labels == k + 1
+        if mine.any():
+            poses[:, k] = fitted_poses(means[:, mine], np.eye(4))
+    if origin is not None:  # x -> R (x - o) + t + o
+        poses[..., :3, 3] += origin - poses[..., :3, :3] @ origin
+    return poses
 
 
 def _of_objects(flags: list[np.ndarray], label_of: np.ndarray) -> Bool[np.ndarray, "T K"]:

@@ -107,6 +107,7 @@ def summarize(folder: RunFolder, found: Metrics, plots: Sequence[Media], images:
     """
     return Summary(
         title=in_title(found["dataset"]),
+        resumable=(folder.resume / "state.npz").is_file(),
         subtitle=_subtitle(found),
         cards=cards_of(SCORES, found),
         tables=[

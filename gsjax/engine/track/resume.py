@@ -62,7 +62,10 @@ def load(folder: Path, config: TrackConfig) -> Tracking:
     """
     path = folder / "state.npz"
     if not path.is_file():
-        raise ValueError(f"--resume: {folder.parent} was stopped before its state was saved; leave it out")
+        raise ValueError(
+            f"--resume: {folder.parent} was stopped before its first update, so nothing was saved; start "
+            "again with --overwrite in place of it"
+        )
     tree, found = load_checkpoint(path)
     scene, run = tree["scene"], tree["run"]
     chosen = run.kept.chosen

@@ -70,9 +70,9 @@ def retime(trajectory: Trajectory, parts: Sequence[int], sources: Float[Array, "
 def speed(
     trajectory: Trajectory,
     parts: Sequence[int],
-    factor: float,
-    begin: float | None = None,
-    end: float | None = None,
+    factor: Scalar,
+    begin: Scalar | None = None,
+    end: Scalar | None = None,
     stay: bool = False,
 ) -> Trajectory:
     """Plays the motion from `begin` to `end` `factor` times as fast; backwards if negative.
@@ -87,23 +87,22 @@ def speed(
     Raises:
         ValueError: `factor` is 0 (use `freeze`), or the interval is empty.
     """
-    if factor == 0:
+    if _is_known(factor) and factor == 0:
         raise ValueError("factor: expected a number other than 0, found 0; to stop a part, freeze it")
     start, stop = _interval(trajectory, begin, end)
-    past, takes = trajectory.times - start, (stop - start) / abs(factor)
+    past, takes, back = trajectory.times - start, (stop - start) / abs(factor), factor < 0
     sources = trajectory.times + (abs(factor) - 1) * jnp.clip(past, 0.0, takes)
-    if factor < 0:
-        sources = jnp.where((past < 0) | (past > takes), sources, start + stop - sources)
+    sources = jnp.where(back & (past >= 0) & (past <= takes), start + stop - sources, sources)
     if stay or end is None:
-        sources = jnp.where(past > takes, start if factor < 0 else stop, sources)
+        sources = jnp.where(past > takes, jnp.where(back, start, stop), sources)
     return retime(trajectory, parts, sources)
 
 
 def loop(
     trajectory: Trajectory,
     parts: Sequence[int],
-    begin: float | None = None,
-    end: float | None = None,
+    begin: Scalar | None = None,
+    end: Scalar | None = None,
     times: int | None = None,
     bounce: bool = False,
     stay: bool = False,
@@ -137,9 +136,9 @@ def loop(
 def freeze(
     trajectory: Trajectory,
     parts: Sequence[int],
-    at: float | None = None,
-    begin: float | None = None,
-    end: float | None = None,
+    at: Scalar | None = None,
+    begin: Scalar | None = None,
+    end: Scalar | None = None,
 ) -> Trajectory:
     """Holds parts from `begin` to `end` as they were at `at`; then they continue from there.
 
@@ -160,9 +159,9 @@ def freeze(
 def isolate(
     trajectory: Trajectory,
     parts: Sequence[int],
-    at: float | None = None,
-    begin: float | None = None,
-    end: float | None = None,
+    at: Scalar | None = None,
+    begin: Scalar | None = None,
+    end: Scalar | None = None,
 ) -> Trajectory:
     """Freezes all other parts. To hide them, use `ghost`.
 
@@ -174,7 +173,7 @@ def isolate(
 
 
 def during(
-    times: Float[Array, "T"], begin: float | None = None, end: float | None = None, ease: float = 0.0
+    times: Float[Array, "T"], begin: Scalar | None = None, end: Scalar | None = None, ease: Scalar = 0.0
 ) -> Float[Array, "T"]:
     """A share for edits of pose and appearance: 1 from `begin` until `end`, 0 before and after.
 
@@ -225,7 +224,7 @@ def redirect(
     parts: Sequence[int],
     turn: Float[Array, "3"],
     arm: Float[Array, "*parts 3"] | None = None,
-    at: float | None = None,
+    at: Scalar | None = None,
     share: Share = 1.0,
 ) -> Trajectory:
     """Rotates the captured motion instead of the part.
@@ -248,7 +247,7 @@ def amplify(
     trajectory: Trajectory,
     parts: Sequence[int],
     factor: Scalar,
-    at: float | None = None,
+    at: Scalar | None = None,
     share: Share = 1.0,
 ) -> Trajectory:
     """Moves parts `factor` times as far along the screw to each moment, and so about their hinges.
@@ -265,7 +264,7 @@ def amplify(
     return _moved(trajectory, parts, further @ first, by != 1)
 
 
-def scale(trajectory: Trajectory, parts: Sequence[int], factor: float, share: Share = 1.0) -> Trajectory:
+def scale(trajectory: Trajectory, parts: Sequence[int], factor: Scalar, share: Share = 1.0) -> Trajectory:
     """Scales parts by `factor` about their handles.
 
     Args:
@@ -275,10 +274,10 @@ def scale(trajectory: Trajectory, parts: Sequence[int], factor: float, share: Sh
     Raises:
         ValueError: `factor` is not more than 0.
     """
-    if not factor > 0:
+    if _is_known(factor) and not factor > 0:
         raise ValueError(f"factor: expected more than 0, found {factor}; to hide a part, fade it")
     by = factor ** _over_time(trajectory, share)
-    scales = trajectory.scales.at[:, _checked(trajectory, parts)].multiply(by)
+    scales = trajectory.scales.at[:, _checked(trajectory, parts)].multiply(by, unique_indices=True)
     return eqx.tree_at(lambda t: t.scales, trajectory, scales)
 
 
@@ -292,7 +291,7 @@ def fade(
         share: how far the edit is applied, 0 to 1.
     """
     by = 1 + _over_time(trajectory, share) * (opacity - 1)
-    opacities = trajectory.opacities.at[:, _checked(trajectory, parts)].multiply(by)
+    opacities = trajectory.opacities.at[:, _checked(trajectory, parts)].multiply(by, unique_indices=True)
     return eqx.tree_at(lambda t: t.opacities, trajectory, opacities)
 
 
@@ -303,7 +302,7 @@ def ghost(
     return fade(trajectory, others(trajectory, parts), opacity, share)
 
 
-def echo(trajectory: Trajectory, parts: Sequence[int], delay: float, opacity: Scalar = 1.0) -> Trajectory:
+def echo(trajectory: Trajectory, parts: Sequence[int], delay: Scalar, opacity: Scalar = 1.0) -> Trajectory:
     """A copy of parts that repeats their motion `delay` seconds later; earlier if negative.
 
     It is rendered beside the original, as another `Layer`: all other parts are hidden in it, and it is hidden
@@ -333,12 +332,17 @@ def _checked(trajectory: Trajectory, parts: Sequence[int]) -> Integer[np.ndarray
     return np.array(list(dict.fromkeys(parts)), int)
 
 
-def _interval(trajectory: Trajectory, begin: float | None, end: float | None) -> tuple[Scalar, Scalar]:
+def _interval(trajectory: Trajectory, begin: Scalar | None, end: Scalar | None) -> tuple[Scalar, Scalar]:
     """Both ends of an interval; default: those of the trajectory."""
-    if begin is not None and end is not None and not begin < end:
+    if begin is not None and end is not None and _is_known(begin, end) and not begin < end:
         raise ValueError(f"end: expected a time after begin, {begin:g} s, found {end:g}")
     begin = trajectory.times[0] if begin is None else begin
     return begin, jnp.maximum(begin, trajectory.times[-1]) if end is None else end
+
+
+def _is_known(*numbers: Scalar) -> bool:
+    """Whether numbers have values that can be checked, as they have not while a function is traced."""
+    return not any(isinstance(number, jax.core.Tracer) for number in numbers)
 
 
 def _state(trajectory: Trajectory) -> tuple[HandlePose, Float[Array, "T P"], Float[Array, "T P"]]:
@@ -381,7 +385,7 @@ def _moved(
 
 
 def _relative(
-    trajectory: Trajectory, parts: Sequence[int], at: float | None
+    trajectory: Trajectory, parts: Sequence[int], at: Scalar | None
 ) -> tuple[jaxlie.SE3, jaxlie.SE3]:
     """The motions of parts relative to their pose at a time, and that pose."""
     chosen = _only(trajectory, parts)

@@ -244,7 +244,13 @@ class Viewable:
         return tuple(known)
 
     def at(self, frame: int) -> Gaussians:
-        """The Gaussians in a frame, without features, which are not drawn."""
+        """The Gaussians in a frame, without features, which are not drawn.
+
+        Raises:
+            IndexError: there is no such frame.
+        """
+        if not 0 <= frame < self.num_frames:
+            raise IndexError(f"{self.title}: expected a frame from 0 to {self.num_frames - 1}, found {frame}")
         gaussians = self.gaussians if self.motion is None else self.motion.at(frame)
         return eqx.tree_at(lambda g: g.features, gaussians, None, is_leaf=lambda leaf: leaf is None)
 

@@ -67,7 +67,7 @@ def test_other_options_are_no_resuming(pristine, gsjax_track, still, tmp_path):
     assert "was started with frames '0:2', now it is '0:3'" in " ".join(said.split())
     code, said = gsjax_track(pristine, "--cameras", "0", "--frames", "0:2", "--resume")
     assert code == 2
-    assert "was stopped before its state was saved" in " ".join(said.split())
+    assert "was stopped before its first update, so nothing was saved; start again" in " ".join(said.split())
 
 
 def test_a_full_disk_is_said_and_tracking_goes_on(pristine, gsjax_track, still, monkeypatch):

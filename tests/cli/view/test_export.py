@@ -164,6 +164,12 @@ def test_a_run_far_from_0_keeps_its_places_in_each_frame(export, tracked, tmp_pa
     write_tracking(far, read_tracking(tracked)[0], np.arange(4) / 10, origin)
     for name in ("config.yml", "metrics.json"):
         shutil.copy(tracked / name, far.path)
+    with np.load(far.path / "trajectory.npz") as run:
+        assert run["poses"].shape == (4, 2, 4, 4)
+        for k in (1, 2):  # the motion of each object, in the world, takes its Gaussians along
+            mine = run["means"][:, run["labels"] == k]
+            moved = mine[0] @ run["poses"][3, k - 1, :3, :3].T + run["poses"][3, k - 1, :3, 3]
+            np.testing.assert_allclose(moved, mine[3], rtol=0, atol=1e-6)
     assert export(far.path, tmp_path / "#.ply", "--frames=2:3")[0] == 0
     back, report = read_gaussians(tmp_path / "2.ply")
     wanted = np.asarray(some().means) + origin
