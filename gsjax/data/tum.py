@@ -59,7 +59,7 @@ def read_tum(
     distortion: Numbers[float] = (),
     *,
     max_skew: float = MAX_SKEW_S,
-    depth_unit_m: float = DEPTH_UNIT_M,
+    depth_unit_m: float | None = None,
 ) -> Sequence:
     """The sequence in a folder of this layout: one camera, 0, whose frames are the colour images.
 
@@ -79,7 +79,8 @@ def read_tum(
             published for freiburg1, 2 or 3, chosen by the folder's name.
         distortion: OpenCV distortion coefficients that belong to a given K: none, 4, 5 or 8.
         max_skew: largest time between colour, depth and pose, seconds.
-        depth_unit_m: metres per depth step.
+        depth_unit_m: metres per depth step; default: 1/5000, as in the benchmark, with a warning for a camera
+            of one's own.
 
     Raises:
         DataError: a file is missing or has malformed lines, the folder's name does not identify the camera,
@@ -96,6 +97,14 @@ def read_tum(
     width, height = image_size(images[0])
     if K is None:
         K, distortion = _published(root, images[0], (width, height))
+    elif depth_unit_m is None:
+        warnings.warn(
+            f"{root}: depth is read in the benchmark's unit, 5000 steps a metre, as none is given for this "
+            "camera; if it measures millimetres, set depth_unit_m (--read.depth-unit-m) to 0.001",
+            DataWarning,
+            stacklevel=2,
+        )
+    depth_unit_m = DEPTH_UNIT_M if depth_unit_m is None else depth_unit_m
     K = intrinsics_matrix(K)
     lens = _Lens(K, distortion, width, height)
     frames = len(times)
@@ -213,7 +222,7 @@ def _published(
     camera = re.search(r"(?:freiburg|fr)([123])(?!\d)", name.lower())
     if camera is None:
         expected = "a folder name with freiburg1, freiburg2 or freiburg3, which identifies the camera"
-        advice = f"Give {_INTRINSICS}; or rename the folder, if it is one of the benchmark"
+        advice = f"Give {_INTRINSICS} A folder of the benchmark has it in its name"
         raise DataError(root, expected, repr(name), advice)
     if size != _SIZE:
         expected = f"{_SIZE[0]}x{_SIZE[1]} pixels, for which freiburg{camera[1]} is calibrated"

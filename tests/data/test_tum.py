@@ -193,7 +193,7 @@ def test_missing_and_empty_lists(folder, name):
 def test_a_folder_whose_name_does_not_identify_the_camera(tmp_path):
     folder = Folder(tmp_path / "desk", size=(64, 48))
     with pytest.raises(
-        DataError, match=r"freiburg1, freiburg2 or .*found 'desk'.*or give the camera's intrinsics as K \("
+        DataError, match=r"freiburg1, freiburg2 or .*found 'desk'.*Give the camera's intrinsics as K \("
     ):
         folder.read()
 
@@ -203,6 +203,10 @@ def test_a_recording_by_ones_own_camera(tmp_path, name):
     folder = Folder(tmp_path / name, size=(64, 48))
     folder.write()
     K = np.array([[50.0, 0, 32], [0, 51, 24], [0, 0, 1]])
+    with pytest.warns(
+        DataWarning, match="5000 steps a metre, as none is given for this camera; if it measures"
+    ):
+        assert (folder.read(K=K).depth(0, 0) == 1).all()
     for sequence in (
         folder.read(K=K, depth_unit_m=0.001),
         open_sequence(folder.root, ReadOptions(K=(50, 51, 32, 24), depth_unit_m=0.001)),
