@@ -16,7 +16,7 @@ from gsjax.data.duplicates import without_duplicates
 from gsjax.data.endonerf import is_endonerf, is_unambiguous_endonerf, read_endonerf
 from gsjax.data.endovis import LEFT, is_endovis, read_endovis
 from gsjax.data.errors import COMPLETE, DataError
-from gsjax.data.open3d_rgbd import is_open3d, read_open3d
+from gsjax.data.open3d_rgbd import is_open3d, read_open3d, without_poses
 from gsjax.data.panoptic import read_panoptic
 from gsjax.data.paris import Split, read_paris
 from gsjax.data.photographs import Photographs, photographs_of
@@ -348,6 +348,8 @@ def _unknown(root: Path, marks: dict[str, str], options: ReadOptions) -> DataErr
     if scenes:
         advice = "Give a file, or a folder of nothing but numbered ones, to gsjax view, info or export."
         return DataError(root, "a dataset", scenes_in_words(scenes), advice)
+    if (lacking := without_poses(root)) is not None:
+        return lacking
     by_layout: dict[str, list[str]] = {}
     for mark, layout in marks.items():
         by_layout.setdefault(layout, []).append(mark)

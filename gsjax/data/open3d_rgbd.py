@@ -37,11 +37,22 @@ _TRAJECTORIES = (
 
 def is_open3d(root: Path) -> bool:
     """Whether a folder has this layout."""
-    return (
-        (root / "depth").is_dir()
-        and _first(root, _IMAGES) is not None
-        and _first(root, _TRAJECTORIES) is not None
+    return _has_pictures(root) and _first(root, _TRAJECTORIES) is not None
+
+
+def without_poses(root: Path) -> DataError | None:
+    """What a folder of this layout lacks, if it is that of poses alone."""
+    if not _has_pictures(root):
+        return None
+    advice = (
+        "Of a camera that stands still all are the same: five lines for each frame, its number three times, "
+        "and the rows 1 0 0 0, 0 1 0 0, 0 0 1 0 and 0 0 0 1"
     )
+    return DataError(root, "the camera's poses in trajectory.log", "colour and depth without poses", advice)
+
+
+def _has_pictures(root: Path) -> bool:
+    return (root / "depth").is_dir() and _first(root, _IMAGES) is not None
 
 
 @near_origin

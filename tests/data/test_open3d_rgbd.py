@@ -81,6 +81,19 @@ def test_intrinsics_are_a_matrix_or_four_numbers(folder):
             read_open3d(folder.root, (bad, *INTRINSICS[1:]))
 
 
+def test_poses_that_stand_still_can_be_written_as_the_message_says(folder):
+    (folder.root / "test_scene/trajectory.log").unlink()
+    with pytest.raises(
+        DataError, match=r"expected the camera's poses in trajectory\.log, found colour"
+    ) as error:
+        open_sequence(folder.root, ReadOptions(K=(50, 50, 32, 24)))
+    rows = "\n".join(error.value.args[0].split("the rows ")[1].replace(" and ", ", ").rstrip(".").split(", "))
+    numbers = sorted(int(path.stem) for path in (folder.root / "depth").iterdir())
+    (folder.root / "trajectory.log").write_text("\n".join(f"{n} {n} {n}\n{rows}" for n in numbers) + "\n")
+    sequence = open_sequence(folder.root, ReadOptions(K=(50, 50, 32, 24)))
+    np.testing.assert_array_equal(sequence.viewmats, np.broadcast_to(np.eye(4), sequence.viewmats.shape))
+
+
 @pytest.mark.parametrize("images", ["color", "rgb"])
 @pytest.mark.parametrize("where", ["trajectory.log", "scene/trajectory.log", "fragments/trajectory.log"])
 def test_places(folder, images, where):
