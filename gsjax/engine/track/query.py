@@ -81,6 +81,7 @@ def ask_for_object(options: ObjectQuery, console: Console, folder: Path, *, pict
         saved, answer = ask(options, console, notes)
         recording = saved.seen_by(options.camera)
         camera = recording.tracked.camera_ids[0]
+        means = in_world(saved.tracking.means()[:, answer.rows], saved.recording.tracked.origin)
         with replaced_folder(folder, OF_QUERY) as new:
             write_npz(
                 new / "selection.npz",
@@ -88,7 +89,7 @@ def ask_for_object(options: ObjectQuery, console: Console, folder: Path, *, pict
                     "indices": answer.rows,
                     "scores": np.array(list(answer.scores.values()), np.float32),
                     "names": np.array(list(answer.scores)),
-                    "means": in_world(saved.tracking.means()[:, answer.rows], saved.recording.tracked.origin),
+                    "means": means,
                     "times": recording.tracked.times[: saved.tracking.num_frames],
                 },
             )
@@ -101,6 +102,9 @@ def ask_for_object(options: ObjectQuery, console: Console, folder: Path, *, pict
     unseen = f"; camera {camera} does not see it in {hidden} of {len(pixels or ())} frames" if hidden else ""
     score = f"cosine {answer.scores[answer.name]:.2f}, and {answer.min_score:.2f} is required"
     print(f"{answer.name}: {len(answer.rows)} Gaussians ({score}){unseen}")
+    last = recording.tracked.frame_ids[len(means) - 1]
+    for at, frame in ((0, recording.tracked.frame_ids[0]), (-1, last))[: len(means)]:
+        print("where   " + ", ".join(f"{x:.3f}" for x in means[at].mean(0)) + f" m in frame {frame}")
     print(f"query   {folder}")
 
 

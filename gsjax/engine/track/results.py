@@ -17,6 +17,7 @@ from gsjax.engine.summary import (
     in_title,
     time_table,
 )
+from gsjax.viz.colors import label_color
 
 MOVED_MM = 30.0
 """An object that moved less is no test of a tracker."""
@@ -59,6 +60,7 @@ SCORES = (
 )
 _OBJECTS = (
     Column("object", "name"),
+    Column("label", "label", wide=True),
     Column("centroid error", "centroid_error_mm", "mm", 2),
     Column("point error", "point_error_mm", "mm", 2),
     Column("median", "median_point_error_mm", "mm", 2),
@@ -74,7 +76,8 @@ _OBJECTS = (
     Column("Gaussians", "gaussians", wide=True),
 )
 _OBJECT_NOTE = (
-    "Errors are means over frames and Gaussians, against where the true motion would have carried each. IoU "
+    "Colours and labels are those of the videos. Errors are means over frames and Gaussians, against where "
+    "the true motion would have carried each. IoU "
     "pools pixels over frames and cameras. 'Moved' is the truth's, 'travelled' the tracker's. "
     "Pixels are those of the first mask. 'ADD-S AUC' (up to 10 cm) and 'within 5 cm 5°' (of frames) are "
     "scores of pose benchmarks, from the true pose of the first frame on."
@@ -105,13 +108,15 @@ def summarize(folder: RunFolder, found: Metrics, plots: Sequence[Media], images:
         found: its metrics.json.
         plots, images: those that it has written.
     """
+    rows = _object_rows(found)
+    colors = [label_color(row["label"]) for row in rows]
     return Summary(
         title=in_title(found["dataset"]),
         resumable=(folder.resume / "state.npz").is_file(),
         subtitle=_subtitle(found),
         cards=cards_of(SCORES, found),
         tables=[
-            Table("Objects", _OBJECTS, _object_rows(found), _OBJECT_NOTE, brief=True),
+            Table("Objects", _OBJECTS, rows, _OBJECT_NOTE, colors=colors, brief=True),
             Table("Cameras", CAMERA_COLUMNS, camera_rows(found), f"{CAMERA_NOTE} {_HOLES}", brief=True),
             time_table(_TIMES, found["seconds"]),
         ],

@@ -45,6 +45,9 @@ def test_an_answer_elsewhere_and_without_pictures(gsjax, run, tmp_path):
     code, said = gsjax("query", run, "the blue can", "--no-pictures", "--out", out)
     assert code == 0, said
     assert f"query {out}" in said
+    with np.load(out / "selection.npz") as found:
+        where = ", ".join(f"{x:.3f}" for x in found["means"][-1].mean(0))
+    assert f"where {where} m in frame 3" in said
     assert {file.name for file in out.iterdir()} == {"query.json", "selection.npz"}
     assert not (run / "query").exists()
 
