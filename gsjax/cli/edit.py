@@ -1,5 +1,6 @@
 """`gsjax edit`: change when, where and how the parts of a run move, and film it."""
 
+import shlex
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -15,7 +16,10 @@ from gsjax.engine.locks import lock, releasing_locks
 from gsjax.engine.messages import Notes, counted, stage
 from gsjax.engine.options import Common, Overwriting
 from gsjax.engine.parts.films import VIDEO, Shot, edited, new_folder, telling_camera, write_film
+from gsjax.engine.parts.results import table_of_parts
 from gsjax.engine.parts.saved import open_parts_run
+from gsjax.engine.terminal import print_table
+from gsjax.io.parsed import parse_json
 from gsjax.methods.parts.operation import Edit
 from gsjax.methods.parts.operations import OPERATIONS, Composite
 from gsjax.methods.parts.timeline import Names, Script, parse_op, parse_script
@@ -53,10 +57,13 @@ class Options(Common, Overwriting):
 @releasing_locks()
 def run(options: Options) -> int:
     """Edit a run, and film the result; returns the exit code. A film that Ctrl-C stops can be watched so far.
+    Without edits, say which parts there are.
 
     Raises:
         ValueError, OSError: there is no such run or part, or the edits cannot be read or applied.
     """
+    if options.script is None and not options.op:
+        return _list_parts(options.run)
     console = Console(stderr=True, highlight=False)
     with Notes(console) as notes:
         script = read_script(options)
@@ -86,6 +93,19 @@ def run(options: Options) -> int:
     return 130 if stopped else 0
 
 
+def _list_parts(run: Path) -> int:
+    """Say which parts there are to edit."""
+    with Notes(Console(stderr=True, highlight=False)):
+        saved = open_parts_run(run)
+    found = parse_json((run / "metrics.json").read_text(encoding="utf-8"))
+    print_table(table_of_parts(found))
+    largest = max(found["parts"], key=lambda row: row.get("gaussians", 0), default={"part": 0})
+    camera, part = saved.camera(None), largest["part"]
+    print(f"where   {run / f'video_{camera}.mp4'}, and those of other cameras, in these colours")
+    print(f'edit    gsjax edit {shlex.quote(str(run))} --op "speed:parts={part},factor=2"')
+    return 0
+
+
 def _described(edit: Edit, names: Names) -> str:
     """An edit in short, "freeze: drawer (2)"; parts of another run as in the script."""
     if isinstance(edit, Composite):
@@ -100,13 +120,9 @@ def read_script(options: Options) -> Script:
     """The edits of the options.
 
     Raises:
-        ValueError: there are none, or one is invalid; the message names the file or option.
+        ValueError: one is invalid; the message names the file or option.
         OSError: the script cannot be read.
     """
-    if options.script is None and not options.op:
-        raise ValueError(
-            'SCRIPT: expected a YAML file of edits, or --op "speed:parts=1,factor=2"; found neither'
-        )
     script = Script()
     if options.script is not None:
         try:

@@ -50,7 +50,10 @@ def test_it_was_run_in_full_and_shows_what_came_out(name):
     assert "/" + "work/" not in text  # no path of a machine
 
 
-@pytest.mark.parametrize("name", SHORTER)
+@pytest.mark.parametrize(
+    "name",
+    ["fit", "track", pytest.param("parts", marks=pytest.mark.slow)],  # the verb runs in test_programs.py
+)
 def test_it_runs(name, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(first_fit, "TrackConfig", lambda: TRACK)

@@ -37,7 +37,7 @@ def found(views, anchor=0, **changes):
     return following.result, int(np.bincount(labels[views.bodies == 2]).argmax())
 
 
-@pytest.mark.parametrize(("anchor", "gone"), [(0, GONE), (6, (0, 1, 2))])
+@pytest.mark.parametrize(("anchor", "gone"), [(0, GONE), pytest.param(6, (0, 1, 2), marks=pytest.mark.slow)])
 def test_a_part_that_leaves_or_is_yet_to_come_is_hidden(anchor, gone):
     views = boxes(gone, anchor)
     result, box = found(views, anchor)
@@ -62,6 +62,7 @@ def test_where_all_parts_are_there_none_is_hidden():
     np.testing.assert_array_equal(result.trajectory.opacities, 1)
 
 
+@pytest.mark.slow
 def test_it_can_be_left_alone():
     result, _ = found(boxes(GONE), absences=False)
     np.testing.assert_array_equal(result.trajectory.opacities, 1)

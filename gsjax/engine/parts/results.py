@@ -44,7 +44,7 @@ SCORES = (
 _PARTS = (
     Column("part", "name"),
     Column("true part", "true_name"),
-    Column("Gaussians", "gaussians", wide=True),
+    Column("Gaussians", "gaussians"),
     Column("moved", "moved_mm", "mm", 0),
     Column("joint", "kind"),
     Column("opens", "range", "° or mm", 0),
@@ -77,8 +77,7 @@ _PART_NOTE = (
 
 def summarize(folder: RunFolder, found: Metrics) -> Summary:
     """The summary of a run of `gsjax parts`."""
-    rows = [{**row, "kind": _JOINTS[row["kind"]]} for row in found["parts"]]
-    colors, frames, image = [label_color(row["part"]) for row in rows], found["frames"], found["image"]
+    frames, image = found["frames"], found["image"]
     cameras = camera_rows(found, "observed")
     return Summary(
         title=in_title(found["dataset"]),
@@ -90,7 +89,7 @@ def summarize(folder: RunFolder, found: Metrics) -> Summary:
         ),
         cards=cards_of(SCORES, found),
         tables=[
-            Table("Parts", _PARTS, rows, _PART_NOTE, colors=colors, brief=True),
+            table_of_parts(found),
             Table("Cameras", CAMERA_COLUMNS, cameras, CAMERA_NOTE),
             time_table(_TIMES, found["seconds"]),
         ],
@@ -102,12 +101,19 @@ def summarize(folder: RunFolder, found: Metrics) -> Summary:
     )
 
 
+def table_of_parts(found: Metrics) -> Table:
+    """The parts of a run of `gsjax parts`, in the colours of its videos."""
+    rows = [{**row, "kind": _JOINTS.get(row.get("kind"))} for row in found["parts"]]
+    colors = [label_color(row["part"]) for row in rows]
+    return Table("Parts", _PARTS, rows, _PART_NOTE, colors=colors, brief=True)
+
+
 def _next_steps(folder: RunFolder, found: Metrics) -> list[tuple[str, str]]:
     """What can be done with the parts that were found."""
     if not found["parts"] or found["frames"]["followed"] < 2:
         return []
     run = shlex.quote(str(folder.path))
-    part = max(found["parts"], key=lambda row: row["moved_mm"])["part"]
+    part = max(found["parts"], key=lambda row: row["gaussians"] * row["moved_mm"])["part"]
     fps = " --fps 15" if found["frames"]["followed"] == 2 else ""  # of two states nothing is seen in between
     return [
         ("view it, and edits of it", f"gsjax view {run}"),

@@ -293,13 +293,22 @@ def test_a_partial_run_is_said(gsjax, tmp_path):
     assert "is a partial run: only 2 of its frames are there" in said
 
 
+def test_without_edits_it_says_which_parts_there_are(gsjax, run):
+    code, said = gsjax("edit", run)
+    assert code == 0
+    assert "Parts" in said
+    assert "Drawer" in said
+    assert f"where {run}/video_2.mp4, and those of other cameras" in said
+    assert f'gsjax edit {run} --op "speed:parts=1,factor=2"' in said
+    assert not (run / "edit").exists()
+
+
 SPEED = ("--op", "speed:parts=drawer,factor=2")
 
 
 @pytest.mark.parametrize(
     ("options", "says"),
     [
-        ((), "SCRIPT: expected a YAML file of edits, or --op"),
         (("gone.yaml",), "gone.yaml: no such file or directory"),
         (
             ("--op", "speed:parts=cup,factor=2"),
