@@ -16,7 +16,7 @@ from gsjax.engine.locks import lock, releasing_locks
 from gsjax.engine.messages import Notes, counted, stage
 from gsjax.engine.options import Common, Overwriting
 from gsjax.engine.parts.films import VIDEO, Shot, edited, new_folder, telling_camera, write_film
-from gsjax.engine.parts.results import table_of_parts
+from gsjax.engine.parts.results import example_edit, table_of_parts
 from gsjax.engine.parts.saved import open_parts_run
 from gsjax.engine.terminal import print_table
 from gsjax.io.parsed import parse_json
@@ -99,10 +99,9 @@ def _list_parts(run: Path) -> int:
         saved = open_parts_run(run)
     found = parse_json((run / "metrics.json").read_text(encoding="utf-8"))
     print_table(table_of_parts(found))
-    largest = max(found["parts"], key=lambda row: row.get("gaussians", 0), default={"part": 0})
-    camera, part = saved.camera(None), largest["part"]
-    print(f"where   {run / f'video_{camera}.mp4'}, and those of other cameras, in these colours")
-    print(f'edit    gsjax edit {shlex.quote(str(run))} --op "speed:parts={part},factor=2"')
+    print(f"where   {run / f'video_{saved.camera(None)}.mp4'}, and those of other cameras, in these colours")
+    if found["parts"]:
+        print(f"edit    {example_edit(shlex.quote(str(run)), found)}")
     return 0
 
 

@@ -75,11 +75,11 @@ def run(options: Options) -> int:
         look: dict[str, Any] = {"antialiased": scene.antialiased, "origin": scene.origin}
         look["labels"] = None if scene.labels is None else np.asarray(scene.labels)
         if "up" in written.options:
-            look |= page_options(scene, rows, options.path)
+            shown = rows[:1] if numbered else rows  # a page for each frame shows that alone
+            look |= page_options(scene, shown, options.path)
             if options.up != "auto":
                 look["up"] = UP[options.up].tolist()
         if numbered:
-            look.pop("film", None)  # each page shows its own frame
             return _write_frames(options, scene, rows, look, notes, console)
         moves, plays = len(rows) > 1 and scene.num_moving > 0, "film" in look
         if moves and not plays:

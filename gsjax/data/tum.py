@@ -222,7 +222,7 @@ def _published(
     camera = re.search(r"(?:freiburg|fr)([123])(?!\d)", name.lower())
     if camera is None:
         expected = "a folder name with freiburg1, freiburg2 or freiburg3, which identifies the camera"
-        advice = f"Give {_INTRINSICS} A folder of the benchmark has it in its name"
+        advice = f"Give {_INTRINSICS} Folders of the benchmark have the camera in their names"
         raise DataError(root, expected, repr(name), advice)
     if size != _SIZE:
         expected = f"{_SIZE[0]}x{_SIZE[1]} pixels, for which freiburg{camera[1]} is calibrated"

@@ -131,7 +131,7 @@ def check_depth(depth: Float[np.ndarray, "height width"], what: str) -> Float[np
         expected = f"depth in metres with a median from {NEAREST_MEDIAN_M} to {FARTHEST_MEDIAN_M}"
         advice = (
             "The unit is likely wrong: set depth_unit_m (--read.depth-unit-m), the metres per step of the "
+            "depth image; 0.001 for millimetres."
         )
-        advice += "depth image; 0.001 for millimetres."
         raise DataError(what, expected, f"a median of {median:.4g} m", advice)
     return depth

@@ -113,9 +113,19 @@ def _next_steps(folder: RunFolder, found: Metrics) -> list[tuple[str, str]]:
     if not found["parts"] or found["frames"]["followed"] < 2:
         return []
     run = shlex.quote(str(folder.path))
-    part = max(found["parts"], key=lambda row: row["gaussians"] * row["moved_mm"])["part"]
-    fps = " --fps 15" if found["frames"]["followed"] == 2 else ""  # of two states nothing is seen in between
     return [
         ("view it, and edits of it", f"gsjax view {run}"),
-        ("a film of an edit", f'gsjax edit {run} --op "speed:parts={part},factor=2"{fps}'),
+        ("a film of an edit", example_edit(run, found)),
     ]
+
+
+def example_edit(run: str, found: Metrics) -> str:
+    """A command that edits the part of a run whose motion shows most.
+
+    Args:
+        run: its folder, as a shell reads it.
+        found: its metrics, with parts.
+    """
+    part = max(found["parts"], key=lambda row: row.get("gaussians", 0) * row.get("moved_mm", 0))["part"]
+    fps = " --fps 15" if found["frames"]["followed"] == 2 else ""  # of two states nothing is seen in between
+    return f'gsjax edit {run} --op "speed:parts={part},factor=2"{fps}'

@@ -5,7 +5,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import equinox as eqx
 import jax.numpy as jnp
 import jaxlie
 import numpy as np
@@ -140,11 +139,8 @@ def _read(path: Path) -> tuple[Layer, dict[str, int], bool, Float[np.ndarray, "3
     weights, centers = (jnp.asarray(arrays[name], float) for name in ("weights", "centres"))
     poses = HandlePose(jaxlie.SO3.from_matrix(R).wxyz, t)
     names = {name: part for name, part in names.items() if part < parts}
-    trajectory = trajectory_of(times, poses)
-    if "opacities" in arrays:
-        shown = jnp.asarray(arrays["opacities"][done], float)
-        trajectory = eqx.tree_at(lambda t: t.opacities, trajectory, shown)
-    layer = Layer(PartScene(gaussians, weights, centers), trajectory)
+    shown = jnp.asarray(arrays["opacities"][done], float) if "opacities" in arrays else None
+    layer = Layer(PartScene(gaussians, weights, centers), trajectory_of(times, poses, shown))
     return layer, names, len(done) == frames, origin
 
 

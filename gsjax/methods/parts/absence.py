@@ -99,12 +99,7 @@ def with_absences(discovery: Discovery, absent: Bool[np.ndarray, "T P"]) -> Disc
 class _Explained:
     """Whether pictures are explained better without a part."""
 
-    def __init__(
-        self,
-        problem: Problem,
-        discovery: Discovery,
-        config: PartsConfig,
-    ):
+    def __init__(self, problem: Problem, discovery: Discovery, config: PartsConfig):
         self._discovery, self._weights, self._blend = discovery, discovery.weights, config.stream.blend
         self._loss, self._headroom = loss_of_picture(config.stream), 2 * config.headroom
         self._plan: Plan | None = None

@@ -173,7 +173,7 @@ def isolate(
 
 
 def during(
-    times: Float[Array, "T"], begin: Scalar | None = None, end: Scalar | None = None, ease: Scalar = 0.0
+    times: Float[Array, "T"], begin: Scalar | None = None, end: Scalar | None = None, ease: float = 0.0
 ) -> Float[Array, "T"]:
     """A share for edits of pose and appearance: 1 from `begin` until `end`, 0 before and after.
 

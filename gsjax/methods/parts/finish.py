@@ -3,7 +3,6 @@ poses is set up, and the scene and its trajectory are assembled for edits."""
 
 from functools import partial
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -166,11 +165,9 @@ def scene_and_trajectory(
     everything = jax.tree.map(lambda a, b: np.concatenate([a, b]), canonical.movable, canonical.fixed)
     gaussians = jax.tree.map(lambda a: a[np.argsort(discovery.order)], everything)
     scene = PartScene(*jax.device_put((gaussians, full, after)))
-    trajectory = trajectory_of(jax.device_put(np.asarray(times, poses.quats.dtype)), poses)
-    if discovery.absent is not None:
-        shown = jnp.asarray(~discovery.absent[:, kept], trajectory.opacities.dtype)
-        trajectory = eqx.tree_at(lambda t: t.opacities, trajectory, shown)
-    return scene, trajectory
+    absent, dtype = discovery.absent, poses.quats.dtype
+    shown = None if absent is None else jnp.asarray(~absent[:, kept], dtype)
+    return scene, trajectory_of(jax.device_put(np.asarray(times, dtype)), poses, shown)
 
 
 @jax.jit

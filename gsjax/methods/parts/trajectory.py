@@ -62,10 +62,18 @@ class Trajectory(eqx.Module):
         return self.opacities.shape[1]
 
 
-def trajectory_of(times: Float[Array, "T"], poses: HandlePose) -> Trajectory:
-    """The trajectory with these poses, with all parts visible at their own size."""
+def trajectory_of(
+    times: Float[Array, "T"], poses: HandlePose, opacities: Float[Array, "T P"] | None = None
+) -> Trajectory:
+    """The trajectory with these poses, with all parts at their own size.
+
+    Args:
+        times: seconds, increasing.
+        poses: poses of P handles at T moments.
+        opacities: factors on the opacities of each part's Gaussians, 0 to 1 (default: all are visible).
+    """
     ones = jnp.ones(poses.translations.shape[:2], poses.translations.dtype)
-    return Trajectory(times, poses, ones, ones)
+    return Trajectory(times, poses, ones if opacities is None else opacities, ones)
 
 
 def still(num_parts: int, times: Float[Array, "T"]) -> Trajectory:
