@@ -11,7 +11,8 @@ from jaxtyping import Float, Int
 from rich.console import Console
 
 from gsjax.data import Sequence
-from gsjax.engine.recording import FirstMask, Recording, draw_ahead, first_mask, open_recording
+from gsjax.engine.first_mask import FirstMask, first_mask
+from gsjax.engine.recording import Recording, draw_ahead, open_recording
 from gsjax.engine.scores import Scores
 from gsjax.engine.track.loop import Tracking, begin, follow
 from gsjax.engine.track.results import MOVED_MM

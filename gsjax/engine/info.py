@@ -179,7 +179,7 @@ def describe_sequence(sequence: Sequence, masks: dict[int, np.ndarray]) -> dict[
         "frames": f"{sequence.num_frames}, numbered {sequence.frame_ids[0]} to {sequence.frame_ids[-1]}",
         "times": times,
         "depth": _depth(sequence),
-        "masks": f"{_cameras(masks, sequence)}, labels {labels} in the first frame" if masks else "none",
+        "masks": _masks(masks, labels, sequence),
         "flow": "yes" if sequence.has_flow else "none",
         "truth": _truth(sequence),
         "shapes": ", ".join(f"{m.name} ({len(m.means):,} Gaussians)" for m in sequence.models) or "none",
@@ -237,6 +237,14 @@ def _depth(sequence: Sequence) -> str:
     found = _range(np.concatenate([depth[depth > 0] for depth in known.values()]))
     what = "but no pixel of the first frame is valid" if found is None else f"{found} m in the first frame"
     return f"{_cameras(known, sequence)}, {what}"
+
+
+def _masks(masks: dict[int, np.ndarray], labels: str, sequence: Sequence) -> str:
+    if masks:
+        return f"{_cameras(masks, sequence)}, labels {labels} in the first frame"
+    return "none" + (
+        " (gsjax track finds objects itself, or takes --masks PICTURE)" if sequence.has_depth else ""
+    )
 
 
 def _range(values: Float[np.ndarray, "n"]) -> str | None:

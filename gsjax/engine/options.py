@@ -108,8 +108,9 @@ class FirstMasks:
 
     mask_camera: Annotated[int | None, tyro.conf.arg(metavar="ID")] = None
     """Id of the tracked camera whose first mask names the objects; default: the first that has masks."""
-    masks: Literal["auto", "files", "segment"] = "auto"
-    """Source of the first mask: the files, a segmenter without weights, or (auto) the first available."""
+    masks: Literal["auto", "files", "segment"] | Path = "auto"
+    """Source of the first mask: the files, a segmenter without weights, or (auto) the first available; or a
+    picture of your own with one label per pixel, 0 for the background, of the first frame of that camera."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -21,20 +21,14 @@ from gsjax.data.realsense_camera import open_realsense
 from gsjax.data.stream import Arrival, NewestSnapshots, Snapshot, replay
 from gsjax.engine.drive import Tick
 from gsjax.engine.ending import ended, exit_code
+from gsjax.engine.first_mask import first_mask, label_names
 from gsjax.engine.folder import RunFolder
 from gsjax.engine.locks import releasing_locks
 from gsjax.engine.machine import describe as describe_machine
 from gsjax.engine.machine import resident_mb
 from gsjax.engine.messages import FITTING, MEASURING, Notes, counted, stage
 from gsjax.engine.options import Common, FirstMasks, Overwriting, Selection, checked, expect_positive
-from gsjax.engine.recording import (
-    Recording,
-    draw_ahead,
-    drawing_ahead,
-    first_mask,
-    label_names,
-    open_recording,
-)
+from gsjax.engine.recording import Recording, draw_ahead, drawing_ahead, open_recording
 from gsjax.engine.terminal import print_facts
 from gsjax.engine.track.rehearsal import Rehearsal
 from gsjax.engine.track.scoring import budget_metrics

@@ -4,8 +4,9 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from gsjax.engine.files import write_scene
+from gsjax.engine.first_mask import FirstMask
 from gsjax.engine.folder import RunFolder
-from gsjax.engine.recording import FirstMask, Recording
+from gsjax.engine.recording import Recording
 from gsjax.engine.scores import Scores
 from gsjax.engine.summary import Media
 from gsjax.engine.track.loop import Tracking

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, field, replace
 from functools import partial
+from pathlib import Path
 from time import perf_counter
 from typing import Any, Literal
 
@@ -9,6 +10,7 @@ import numpy as np
 from rich.console import Console
 
 from gsjax.engine.ending import ended, exit_code, finish
+from gsjax.engine.first_mask import FirstMask, first_mask, warn_of_missing
 from gsjax.engine.folder import RunFolder, expect_dataset
 from gsjax.engine.locks import releasing_locks
 from gsjax.engine.machine import describe as describe_machine
@@ -22,16 +24,7 @@ from gsjax.engine.options import (
     preset_options,
 )
 from gsjax.engine.pictures import Film
-from gsjax.engine.recording import (
-    FirstMask,
-    Recording,
-    chosen_recording,
-    draw_ahead,
-    drawing_ahead,
-    first_mask,
-    located,
-    warn_of_missing,
-)
+from gsjax.engine.recording import Recording, chosen_recording, draw_ahead, drawing_ahead, located
 from gsjax.engine.scores import Scores
 from gsjax.engine.streams import say_error
 from gsjax.engine.summary import Media, format_number
@@ -88,7 +81,10 @@ def run(options: Options) -> int:
         expect_dataset(options.dataset)
         recording = chosen_recording(options)
         folder = RunFolder.locked(options.out, overwrite=options.overwrite, resume=options.resume)
-        settings = replace(options, dataset=located(options.dataset), cameras=recording.tracked.camera_ids)
+        masks = options.masks.resolve() if isinstance(options.masks, Path) else options.masks
+        settings = replace(
+            options, dataset=located(options.dataset), cameras=recording.tracked.camera_ids, masks=masks
+        )
         if options.resume:
             folder.check_config(settings, but=RESUME_MAY_CHANGE)
         mask = first_mask(recording.tracked, options.mask_camera, options.masks)
@@ -138,10 +134,10 @@ def _start(
     seconds = perf_counter() - begun
     objects = len(set(scene.label_ids) - {0})
     parts = f" ({scene.num_objects} rigid parts)" if scene.num_objects > objects else ""
-    made_by = "the file" if mask.source == "files" else "the weight-free segmenter"
-    origin = f"labels from {made_by} in camera {mask.camera}"
-    if mask.source == "shapes":
-        origin = "objects are the shapes that come with the recording"
+    made_by = {"files": "the file", "picture": "your picture", "segment": "the weight-free segmenter"}
+    origin = "objects are the shapes that come with the recording"
+    if mask.labels is not None:
+        origin = f"labels from {made_by[mask.source]} in camera {mask.camera}"
     console.print(
         f"[bold]scene[/]     {format_number(scene.gaussians.num)} Gaussians, "
         f"{format_number(scene.num_moving)} of them in {objects} objects{parts}, in {seconds:.1f} s; "

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from gsjax.engine.files import about_scene, chosen_camera, read_arrays, read_scene, reopen
+from gsjax.engine.first_mask import OWN_MASKS
 from gsjax.engine.folder import expect_run
 from gsjax.engine.recording import Recording
 from gsjax.engine.track.loop import Tracking
@@ -111,6 +112,6 @@ def _read_metrics(file: Path, scene: TrackedScene) -> tuple[int | None, dict[int
         known = {found["label"]: name for name, found in metrics["objects"].items()}
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise ValueError(f"{file}: expected a run's scores, found something else; {_AGAIN}") from error
-    if source == "segment":
+    if source not in OWN_MASKS:
         known = {}
     return camera, {k: known.get(scene.label_ids[k], f"object {k}") for k in range(1, scene.num_objects + 1)}

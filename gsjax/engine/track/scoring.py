@@ -5,7 +5,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Int
 
-from gsjax.engine.recording import FirstMask, Recording, label_names
+from gsjax.engine.first_mask import FirstMask, label_names
+from gsjax.engine.recording import Recording
 from gsjax.engine.scores import Scores, camera_metrics, motion_metrics, true_labels_at
 from gsjax.engine.track.loop import Tracking
 from gsjax.engine.track.poses import pose_metrics
@@ -16,10 +17,10 @@ from gsjax.metrics.tracking import ObjectScore, score_tracks
 def group_values(tracking: Tracking, mask: FirstMask, recording: Recording) -> np.ndarray | None:
     """The mask value in the data's files that each group stands for, [K+1]; None if there are no files.
 
-    A group of the segmenter stands for the value that most of its pixels have in the file's first mask.
+    A group of another mask stands for the value that most of its pixels have in the file's first mask.
     """
     values = np.asarray(tracking.scene.label_ids)
-    if mask.source != "segment":
+    if mask.is_own:
         return values
     files = recording.tracked.mask(0, recording.tracked.camera_ids.index(mask.camera))
     if files is None or mask.labels is None:

@@ -1,0 +1,145 @@
+"""The mask of the first frame, which names the objects that are followed."""
+
+from pathlib import Path
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from jaxtyping import Int
+
+from gsjax.data import Sequence
+from gsjax.data.errors import DataError
+from gsjax.data.files import picture_size
+from gsjax.data.masks import read_mask
+from gsjax.engine.messages import Notes
+from gsjax.engine.recording import Recording
+
+
+class FirstMask(NamedTuple):
+    """Labels of one camera's first image, the only ones that a tracker is given.
+
+    Attributes:
+        labels: [H, W]; 0 is background. None if objects are given as shapes.
+        camera: id of the camera, or None.
+        source: "files", "picture", "segment" or "shapes".
+    """
+
+    labels: Int[np.ndarray, "height width"] | None
+    camera: int | None
+    source: str
+
+    @property
+    def is_own(self) -> bool:
+        """Whether the values are those of the recording, which may have names and true poses for them."""
+        return self.source in OWN_MASKS
+
+
+OWN_MASKS = ("files", "shapes")  # sources whose values are the recording's
+
+
+def first_mask(tracked: Sequence, camera: int | None, source: str | Path) -> FirstMask:
+    """The mask of the first frame: from the recording, a picture, or the weight-free segmenter.
+
+    Args:
+        tracked: the tracked cameras.
+        camera: id of the mask's camera; None takes the first that has masks.
+        source: "files", "segment", or "auto": files, else the shapes of the recording, else the segmenter; or
+            the path of a picture of labels.
+
+    Raises:
+        ValueError: the camera is not tracked, or has no mask; or the picture does not fit.
+    """
+    if camera is not None and camera not in tracked.camera_ids:
+        raise ValueError(
+            f"--mask-camera: camera {camera} is not tracked; the tracked ones are {list(tracked.camera_ids)}."
+        )
+    if isinstance(source, Path):
+        return _from_picture(tracked, camera, source)
+    if source in ("auto", "files") and tracked.has_masks:
+        for c, name in enumerate(tracked.camera_ids):
+            labels = tracked.mask(0, c) if camera in (None, name) else None
+            if labels is not None:
+                _check_not_empty(labels, tracked, c)
+                return FirstMask(labels, name, "files")
+        if camera is not None and source == "auto":
+            raise ValueError(
+                f"--mask-camera: camera {camera} has no masks. Name another, or --masks segment."
+            )
+    if source == "files":
+        other = "auto, which takes the shapes of this recording" if tracked.models else "segment"
+        raise ValueError(f"--masks files: {tracked.name} has none for these cameras; use --masks {other}.")
+    if source == "auto" and not tracked.has_depth and tracked.models:
+        return FirstMask(None, None, "shapes")
+    from gsjax.perception.segmenters import PlaneOrRegionSegmenter
+
+    name = tracked.camera_ids[0] if camera is None else camera
+    c = tracked.camera_ids.index(name)
+    labels = PlaneOrRegionSegmenter()(tracked.image(0, c), tracked.depth(0, c), tracked.Ks[0, c])
+    return FirstMask(labels.astype(np.int32), name, "segment")
+
+
+def _from_picture(tracked: Sequence, camera: int | None, path: Path) -> FirstMask:
+    """What a user gives: labels of the pictures' size, or larger, where those are read at a smaller scale."""
+    if not path.exists():
+        raise ValueError(f"--masks: expected auto, files, segment or a picture of labels, found no {path}")
+    width, height = picture_size(path)
+    labels = read_mask(path, width, height)
+    name = tracked.camera_ids[0] if camera is None else camera
+    enlarged = width / tracked.width
+    if enlarged < 1 or abs(height - enlarged * tracked.height) > enlarged:
+        size = f"{tracked.width}x{tracked.height} pixels, as the pictures of camera {name}"
+        raise DataError(path, size, f"{width}x{height}", "Give labels of its first picture.")
+    labels = cv2.resize(labels, (tracked.width, tracked.height), interpolation=cv2.INTER_NEAREST_EXACT)
+    if not labels.any():
+        raise DataError(path, "at least one object", "background only", "Give each object a value above 0.")
+    return FirstMask(labels, name, "picture")
+
+
+def _check_not_empty(labels: np.ndarray, tracked: Sequence, c: int) -> None:
+    """Raises DataError if a first mask is all background, naming a camera whose mask is not."""
+    if labels.any():
+        return
+    masks = {name: tracked.mask(0, i) for i, name in enumerate(tracked.camera_ids)}
+    better = [name for name, mask in masks.items() if mask is not None and mask.any()]
+    advice = f"Use --mask-camera {better[0]}" if better else "Choose other --frames"
+    what = tracked.where("mask", 0, c)
+    raise DataError(what, "at least one object", "background only", f"{advice}, or --masks segment.")
+
+
+def label_names(recording: Recording, source: str) -> dict[int, str]:
+    """The name of each mask value that has one; only the recording's own do."""
+    names = {0: "background"}
+    if source not in OWN_MASKS:
+        return names
+    names |= {model.label: model.name for model in recording.tracked.models if model.label}
+    truth = recording.tracked.truth
+    if truth is not None:
+        names |= {int(label): name for label, name in zip(truth.label_ids, truth.names, strict=True)}
+        names |= {} if truth.robot is None else {truth.robot: "robot"}
+    return names
+
+
+def warn_of_missing(recording: Recording, mask: FirstMask, scene_ids: tuple[int, ...], notes: Notes) -> None:
+    """Warn of objects that will not be tracked: true objects without a label in the mask, and labels without
+    Gaussians.
+
+    Args:
+        recording: the recording, with or without ground truth.
+        mask: the first mask.
+        scene_ids: labels that the scene has.
+        notes: collects the warnings.
+    """
+    if mask.labels is None:
+        return
+    names, there = label_names(recording, mask.source), set(np.unique(mask.labels).tolist())
+    if mask.source == "files":
+        for value in sorted(set(names) - there - {0}):
+            notes.warn(
+                f"{names[value]} (label {value}) has no pixel in the first mask of camera {mask.camera}: "
+                "it is not tracked; another --mask-camera may see it"
+            )
+    for value in sorted(there - set(scene_ids) - {0}):
+        pixels = int((mask.labels == value).sum())
+        notes.warn(
+            f"label {value} has {pixels} pixels in the first mask but none with depth: it is not tracked"
+        )

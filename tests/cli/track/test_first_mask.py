@@ -1,0 +1,91 @@
+"""`gsjax track --masks PICTURE`: objects that a user names, in a recording without masks or with others."""
+
+import json
+import shutil
+
+import cv2
+import numpy as np
+import pytest
+
+from gsjax.io.pictures import write_png
+
+
+@pytest.fixture
+def unmasked(pristine, tmp_path):
+    """The recording of three cameras without its masks, and its first masks by camera."""
+    folder = tmp_path / "table"
+    shutil.copytree(pristine, folder)
+    first = {
+        c: cv2.imread(str(min((folder / "seg" / str(c)).iterdir())), cv2.IMREAD_UNCHANGED) for c in range(3)
+    }
+    shutil.rmtree(folder / "seg")
+    return folder, first
+
+
+def test_a_picture_names_the_objects(unmasked, tmp_path, gsjax_track, still):
+    folder, first = unmasked
+    labels = np.where(first[1] == 3, 7, 0).astype(np.uint8)  # the can alone, by another value
+    write_png(tmp_path / "can.png", labels)
+    code, said = gsjax_track(
+        folder, "--cameras", "0", "1", "--mask-camera", "1", "--masks", str(tmp_path / "can.png")
+    )
+    assert code == 0, said
+    assert "labels from your picture in camera 1" in " ".join(said.split())
+    run = tmp_path / "run"
+    found = json.loads((run / "metrics.json").read_text())
+    assert found["mask"] == {"source": "picture", "camera": 1}
+    assert list(found["objects"]) == ["object 7"]
+    assert found["objects"]["object 7"]["mask_pixels"] == (first[1] == 3).sum()
+    assert "segmenter" not in " ".join(found["notes"])
+
+
+def test_of_pictures_read_smaller_the_mask_is_too(unmasked, tmp_path, gsjax_track, still):
+    folder, first = unmasked
+    write_png(tmp_path / "mask.png", first[0].astype(np.uint8))
+    said = gsjax_track(folder, "--cameras", "0", "--scale", "0.5", "--masks", str(tmp_path / "mask.png"))
+    assert said[0] == 0, said
+    found = json.loads((tmp_path / "run" / "metrics.json").read_text())
+    pixels = [scored["mask_pixels"] for scored in found["objects"].values()]
+    assert sum(pixels) == pytest.approx((first[0] > 0).sum() / 4, rel=0.1)
+
+
+def test_where_the_recording_has_masks_the_objects_are_scored_by_them(pristine, tmp_path, gsjax_track, still):
+    labels = cv2.imread(str(min((pristine / "seg" / "1").iterdir())), cv2.IMREAD_UNCHANGED)
+    write_png(tmp_path / "mine.png", np.where(labels == 3, 1, 0).astype(np.uint8))
+    code, said = gsjax_track(pristine, "--cameras", "1", "--masks", str(tmp_path / "mine.png"))
+    assert code == 0, said
+    found = json.loads((tmp_path / "run" / "metrics.json").read_text())
+    assert found["objects"]["can"]["point_error_mm"] is not None
+    assert found["objects"]["carton"]["gaussians"] == 0
+
+
+@pytest.mark.parametrize(
+    ("mask", "wants"),
+    [
+        (None, ("--masks", "expected auto, files, segment or a picture of labels, found no")),
+        (np.zeros((60, 80), np.uint8), ("mask.png", "expected at least one object, found background only")),
+        (np.ones((60, 60), np.uint8), ("mask.png", "80x60 pixels, as the pictures of camera 0", "60x60")),
+        (np.ones((30, 40), np.uint8), ("mask.png", "80x60 pixels", "40x30")),
+        (np.eye(60, 80, dtype=np.uint8)[..., None] * [9, 5, 7], ("mask.png", "one label per pixel")),
+    ],
+)
+def test_a_picture_that_names_nothing_is_refused_before_any_work(
+    mask, wants, unmasked, tmp_path, gsjax_track
+):
+    folder, _ = unmasked
+    if mask is not None:
+        cv2.imwrite(str(tmp_path / "mask.png"), mask)
+    code, said = gsjax_track(folder, "--cameras", "0", "1", "--masks", str(tmp_path / "mask.png"))
+    assert code == 2, said
+    for want in wants:
+        assert want in " ".join(said.split())
+    assert not (tmp_path / "run" / "config.yml").exists()
+
+
+def test_a_run_goes_on_with_its_picture(unmasked, tmp_path, gsjax_track, still):
+    folder, first = unmasked
+    write_png(tmp_path / "mask.png", first[0].astype(np.uint8))
+    code, said = gsjax_track(folder, "--cameras", "0", "--masks", str(tmp_path / "mask.png"))
+    assert code == 0, said
+    config = (tmp_path / "run" / "config.yml").read_text()
+    assert str(tmp_path / "mask.png") in config  # whatever the directory is from which it is resumed
