@@ -20,6 +20,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from gsjax.rasterize.plan import DEFAULT_LIMITS, FEW_CHANNELS, Limits, Plan
 from gsjax.rasterize.sorting import argsort_keys
+from gsjax.rasterize.tiles import tile_pixels, untile, write_tiles
 
 SATURATION = 1e-6  # relative distance to alpha_max within which an alpha counts as saturated
 CHUNK = 8  # Gaussians whose alphas are stored together
@@ -60,9 +61,10 @@ def in_columns(splats: Splats, limits: Limits) -> Columns:
 
 
 class TileState(NamedTuple):
-    """The state of compositing of P pixels."""
+    """The state of compositing of P pixels. Within loops many channels are the last axis, for products of
+    matrices."""
 
-    values: Float[Array, "*tiles channels pixels"]
+    values: Float[Array, "*tiles channels pixels"] | Float[Array, "*tiles pixels channels"]
     light: Float[Array, "*tiles pixels"]  # the transmittance; its negative once the pixel has ended
 
     @property
@@ -194,17 +196,21 @@ def composite_tile(
     if length == 0:
         return state
     chunk = chunk_length(channels)
-    if length <= chunk:
-        return composite_columns(in_columns(splats, limits), pixels, state, limits)
+    if channels > FEW_CHANNELS:
+        state = state._replace(values=state.values.T)
 
     def padded(a):  # with empty slots
         return jnp.pad(a, [(0, -length % chunk)] + [(0, 0)] * (a.ndim - 1))
 
-    columns = in_columns(jax.tree.map(padded, splats), limits)
-    pieces = jax.tree.map(lambda a: a.reshape(-1, chunk, *a.shape[1:]), columns)
-    return jax.lax.scan(
-        lambda state, piece: (composite_columns(piece, pixels, state, limits), None), state, pieces
-    )[0]
+    if length <= chunk:
+        state = composite_columns(in_columns(splats, limits), pixels, state, limits)
+    else:
+        columns = in_columns(jax.tree.map(padded, splats), limits)
+        pieces = jax.tree.map(lambda a: a.reshape(-1, chunk, *a.shape[1:]), columns)
+        state = jax.lax.scan(
+            lambda state, piece: (composite_columns(piece, pixels, state, limits), None), state, pieces
+        )[0]
+    return state._replace(values=state.values.T) if channels > FEW_CHANNELS else state
 
 
 def composite_columns(columns: Columns, pixels, state: TileState, limits: Limits) -> TileState:
@@ -219,7 +225,7 @@ def composite_columns(columns: Columns, pixels, state: TileState, limits: Limits
     alphas, dtype = splat_alphas(columns, pixels, limits), state.light.dtype
     if not isinstance(columns.values, tuple):
         weights, light = weights_of_many(alphas, state.light, limits)
-        painted = jnp.matmul(columns.values.astype(dtype).T, weights, precision="highest")
+        painted = jnp.matmul(weights.T, columns.values.astype(dtype), precision="highest")
         return TileState(state.values + painted, light)
     # Every channel recomputes the light itself, which is cheaper than storing the weights.
     values, light = state.values, jnp.broadcast_to(state.light, state.values.shape)
@@ -272,13 +278,6 @@ def batch_tiles(lists: Lists, length: Int[Array, "tiles"], channels: int, plan: 
     return Batches(order, corner + plan.tile_size / 2, lists.starts[tile], counts)
 
 
-def tile_pixels(plan: Plan, dtype) -> Float[Array, "pixels 2"]:
-    """Pixel centres relative to the tile's centre: small numbers, whose squares are exact in float32."""
-    offsets = np.arange(plan.tile_size) + 0.5 - plan.tile_size / 2
-    x, y = np.meshgrid(offsets, offsets)
-    return jnp.asarray(np.stack([x.ravel(), y.ravel()], axis=-1), dtype)
-
-
 def read_chunk(columns: Columns, lists: Lists, batch: Batches, first: Int[Array, ""], chunk: int):
     """Ids and columns of entries `first .. first + chunk - 1` of each tile of a batch; means are relative to
     the tile's centre."""
@@ -307,41 +306,42 @@ def still_read(
 
 
 def composite_forward(splats: Splats, lists: Lists, reads: Int[Array, "tiles"] | None, plan: Plan):
-    """Every tile's values [tiles, channels, pixels], transmittance [tiles, pixels], and entries read [tiles].
+    """The image of all tiles [tile rows x edge, tile columns x edge, channels], the transmittance of each
+    tile [tiles, pixels], and the entries read of each list [tiles].
 
     `reads` from an earlier call groups tiles that end equally early; it does not change the result.
     """
     dtype, channels = splats.opacities.dtype, splats.values.shape[1]
-    chunk, pixels = chunk_length(channels), tile_pixels(plan, dtype)
+    chunk, pixels, is_wide = chunk_length(channels), tile_pixels(plan, dtype), channels > FEW_CHANNELS
     length = lists.counts if reads is None else jnp.minimum(lists.counts, reads)
     batches = batch_tiles(lists, length, channels, plan)
     columns = in_columns(splats, plan.limits)
     compose = jax.vmap(partial(composite_columns, limits=plan.limits), in_axes=(0, None, 0))
-    fresh = jax.vmap(lambda _: start_tile(plan.tile_pixels, channels, dtype))
 
-    def one_batch(_, batch: Batches):
+    def start(_):
+        state = start_tile(plan.tile_pixels, channels, dtype)
+        return state._replace(values=state.values.T) if is_wide else state
+
+    def one_batch(image, batch: Batches):
         def step(carry):
             first, state, reading, read = carry
             _, piece = read_chunk(columns, lists, batch, first, chunk)
             first, state = first + chunk, compose(piece, pixels, state)
             return first, state, still_read(batch, first, state.light), jnp.where(reading, first, read)
 
-        start = (jnp.int32(0), fresh(batch.counts), batch.counts > 0, jnp.zeros_like(batch.counts))
-        _, state, _, read = jax.lax.while_loop(lambda carry: jnp.any(carry[2]), step, start)
-        return None, (state.values, state.transmittance, jnp.minimum(read, batch.counts))
+        begin = (jnp.int32(0), jax.vmap(start)(batch.counts), batch.counts > 0, jnp.zeros_like(batch.counts))
+        _, state, _, read = jax.lax.while_loop(lambda carry: jnp.any(carry[2]), step, begin)
+        others = state.transmittance, jnp.minimum(read, batch.counts)
+        if is_wide:
+            return write_tiles(image, batch.tiles, state.values, plan), (None, *others)
+        return None, (state.values, *others)
 
-    _, outputs = jax.lax.scan(one_batch, None, batches)
+    num_tiles = lists.counts.shape[0]
+    edges = num_tiles // plan.tiles_x * plan.tile_size, plan.tiles_x * plan.tile_size
+    # Many channels are written where they belong as soon as they are known: a copy would take as long.
+    image = jnp.zeros((*edges, channels), dtype) if is_wide else None
+    image, outputs = jax.lax.scan(one_batch, image, batches)
     # The position of each tile in the batches; the padding of the last batch, -1, is the largest key.
-    place = argsort_keys(batches.tiles.ravel().astype(jnp.uint32), plan.sort)[: lists.counts.shape[0]]
-    return jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:])[place], outputs)
-
-
-def untile(
-    tiles: Float[Array, "tiles channels pixels"], shape: tuple[int, ...], plan: Plan
-) -> Float[Array, "*shape height width channels"]:
-    """Images of the plan's size, [*shape] of them, assembled from tiles."""
-    channels, edge, y = tiles.shape[1], plan.tile_size, len(shape)
-    image = tiles.reshape(*shape, plan.tiles_y, plan.tiles_x, channels, edge, edge)
-    image = image.transpose(*range(y + 1), y + 3, y + 1, y + 4, y + 2)
-    image = image.reshape(*shape, plan.tiles_y * edge, plan.tiles_x * edge, channels)
-    return image[..., : plan.height, : plan.width, :]
+    place = argsort_keys(batches.tiles.ravel().astype(jnp.uint32), plan.sort)[:num_tiles]
+    values, light, read = jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:])[place], outputs)
+    return untile(values, plan) if image is None else image, light, read

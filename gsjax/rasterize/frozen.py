@@ -17,11 +17,12 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from gsjax.rasterize.binning import bin_gaussians
-from gsjax.rasterize.compositing import Lists, Splats, untile
+from gsjax.rasterize.compositing import Lists, Splats
 from gsjax.rasterize.gradients import composite
 from gsjax.rasterize.plan import Plan
 from gsjax.rasterize.projection import project_gaussians
 from gsjax.rasterize.rasterization import plan as _plan
+from gsjax.rasterize.tiles import of_views, untile
 
 _OF_ROWS = ("rows", "means2d", "conics", "opacities")  # fields with one entry per Gaussian that is shown
 
@@ -143,8 +144,9 @@ def paint_shown(
     view = jax.lax.stop_gradient(view)
     splats = Splats(view.means2d, view.conics, view.opacities, values)
     lists = Lists(view.ids, view.starts, view.counts)
-    tiles, transmittance, _ = composite(splats, lists, None, plan)
-    return untile(tiles, (), plan), 1 - untile(transmittance[:, None], (), plan)[..., 0]
+    image, transmittance, _ = composite(splats, lists, None, plan)
+    alphas = 1 - untile(transmittance[:, None], plan)
+    return of_views(image, (), plan), of_views(alphas, (), plan)[..., 0]
 
 
 def _shown(view: FrozenView) -> FrozenView:

@@ -17,6 +17,7 @@ from gsjax.rasterize.binning import depth_order, doubled, tile_rows, total
 from gsjax.rasterize.compositing import SHAPE, Lists, Splats, chunk_length, in_columns
 from gsjax.rasterize.plan import Plan
 from gsjax.rasterize.projection import Projected
+from gsjax.rasterize.tiles import in_tiles, untile
 
 _GPU_LANES = 32  # threads per tile on a GPU; on a CPU it is 1
 MOST_VALUES = 10  # per pass: with the six numbers of a shape, four times four floats
@@ -37,7 +38,7 @@ def by_platform(in_xla: Callable, in_kernels: Callable, *arguments):
 
 
 def composite_forward(splats: Splats, lists: Lists, plan: Plan, lanes: int):
-    """Every tile's values [tiles, channels, pixels], transmittance [tiles, pixels], and entries read [tiles].
+    """The image of all tiles [high, wide, channels], transmittance [tiles, pixels], and entries read [tiles].
 
     Args:
         splats: the Gaussians of all views.
@@ -58,7 +59,7 @@ def composite_forward(splats: Splats, lists: Lists, plan: Plan, lanes: int):
     nothing = [jnp.ones((tiles, plan.tile_pixels), jnp.float32), jnp.zeros(tiles, jnp.int32)]
     (transmittance, reads), values = jax.lax.scan(one_pass, nothing, passes)
     values = jnp.moveaxis(values, 0, 1).reshape(tiles, -1, plan.tile_pixels)
-    return values[:, :channels], transmittance, reads
+    return untile(values[:, :channels], plan), transmittance, reads
 
 
 def gradients(
@@ -69,11 +70,12 @@ def gradients(
     Args:
         splats, lists, plan, lanes: as for `composite_forward`.
         reads: entries read from each list.
-        image: values and transmittance of all tiles.
+        image: the image, and the transmittance of all tiles.
         cotangents: the gradients with respect to both.
     """
-    (values, transmittance), (d_values, d_transmittance) = image, cotangents
-    behind = _of_passes(values) * _of_passes(d_values)
+    (image, transmittance), (d_image, d_transmittance) = image, cotangents
+    d_values = in_tiles(d_image, plan)
+    behind = _of_passes(in_tiles(image, plan)) * _of_passes(d_values)
     behind = behind.sum(axis=2).at[0].add(d_transmittance * transmittance)
     moments, d_colors = _summed(splats, lists, reads, d_values, behind, plan, lanes)
     sx, sy, sxx, sxy, syy, m = moments.T
@@ -91,12 +93,12 @@ def values_gradients(
     splats: Splats,
     lists: Lists,
     reads: Int[Array, "tiles"],
-    d_values: Float[Array, "tiles channels pixels"],
+    d_image: Float[Array, "high wide channels"],
     plan: Plan,
     lanes: int,
 ) -> Float[Array, "n channels"]:
     """Gradients with respect to the values only. Arguments as for `gradients`."""
-    return _summed(splats, lists, reads, d_values, None, plan, lanes)[1]
+    return _summed(splats, lists, reads, in_tiles(d_image, plan), None, plan, lanes)[1]
 
 
 def _summed(splats: Splats, lists: Lists, reads, d_values, behind, plan: Plan, lanes: int):

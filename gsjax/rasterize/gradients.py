@@ -35,18 +35,19 @@ from gsjax.rasterize.compositing import (
     read_chunk,
     splat_alphas,
     still_read,
-    tile_pixels,
     weights_of_many,
 )
-from gsjax.rasterize.plan import Limits, Plan
+from gsjax.rasterize.plan import FEW_CHANNELS, Limits, Plan
+from gsjax.rasterize.tiles import in_tiles, read_tiles, tile_pixels
 
 SMALL = 1e-6  # lower bound of 1 - alpha as a divisor
 
 
 def composite(
     splats: Splats, lists: Lists, reads: Int[Array, "tiles"] | None, plan: Plan
-) -> tuple[Float[Array, "tiles channels pixels"], Float[Array, "tiles pixels"], Int[Array, "tiles"]]:
-    """Values of all tiles, the remaining transmittance, and the number of entries read from each list.
+) -> tuple[Float[Array, "high wide channels"], Float[Array, "tiles pixels"], Int[Array, "tiles"]]:
+    """The image of all tiles, the transmittance that each of them lets pass, and the entries that are read of
+    each list.
 
     Differentiable in the plan's mode. `reads` from an earlier, similar call makes this one faster; it does
     not change the result.
@@ -71,38 +72,51 @@ def _composite(splats: Splats, lists: Lists, reads, plan: Plan):
 def _composite_fwd(splats, lists, reads, plan):
     shapes_move = any(leaf.perturbed for leaf in (splats.means2d, splats.conics, splats.opacities))
     splats, lists, reads = jax.tree.map(lambda leaf: leaf.value, (splats, lists, reads))
-    values, transmittance, reads = _forward(splats, lists, reads, plan)
-    image = (values, transmittance) if shapes_move else None
-    return (values, transmittance, reads), (splats, lists, reads, image)
+    image, transmittance, reads = _forward(splats, lists, reads, plan)
+    kept = (image, transmittance) if shapes_move else None
+    return (image, transmittance, reads), (splats, lists, reads, kept)
 
 
 def _composite_bwd(plan: Plan, residuals, cotangents):
-    splats, lists, reads, image = residuals
-    d_values, d_transmittance = (
+    splats, lists, reads, kept = residuals
+    d_image, d_transmittance = (
         jnp.zeros(d.shape, d.dtype) if isinstance(d, SymbolicZero) else d for d in cotangents[:2]
     )
-    if image is None:
+    if kept is None:
         in_xla, in_kernels = (partial(f, plan=plan) for f in (_values_gradients, fused.values_gradients))
-        d_values = fused.by_platform(in_xla, in_kernels, splats, lists, reads, d_values)
+        d_values = fused.by_platform(in_xla, in_kernels, splats, lists, reads, d_image)
         return Splats(None, None, None, d_values), None, None  # type: ignore[arg-type]
     in_xla, in_kernels = (partial(f, plan=plan) for f in (_gradients, fused.gradients))
-    cotangents = (d_values, d_transmittance)
-    return fused.by_platform(in_xla, in_kernels, splats, lists, reads, image, cotangents), None, None
+    cotangents = (d_image, d_transmittance)
+    return fused.by_platform(in_xla, in_kernels, splats, lists, reads, kept, cotangents), None, None
 
 
-def _gradients(splats: Splats, lists: Lists, reads, image, cotangents, plan: Plan) -> Splats:
+def _reader(image: Float[Array, "high wide channels"], plan: Plan):
+    """A function that gives some tiles of an image, in the layout in which they are composited."""
+    if image.shape[-1] > FEW_CHANNELS:
+        return partial(read_tiles, image, plan=plan)
+    tiles = in_tiles(image, plan)
+    return lambda some: tiles[some]
+
+
+def _gradients(splats: Splats, lists: Lists, reads, kept, cotangents, plan: Plan) -> Splats:
     """Gradients with respect to all fields of the splats."""
-    (values, transmittance), (d_values, d_transmittance) = image, cotangents
+    (image, transmittance), (d_image, d_transmittance) = kept, cotangents
     dtype, channels = splats.opacities.dtype, splats.values.shape[1]
     chunk, pixels = chunk_length(channels), tile_pixels(plan, dtype)
-    behind = (values * d_values).sum(axis=1) + d_transmittance * transmittance
+    cotangent_of = _reader(d_image, plan)
+    if channels > FEW_CHANNELS:
+        behind = in_tiles((image * d_image).sum(axis=-1, keepdims=True), plan)[:, 0]
+    else:
+        behind = (in_tiles(image, plan) * in_tiles(d_image, plan)).sum(axis=1)
+    behind += d_transmittance * transmittance
     constants = {"pixels": pixels, "monomials": _monomials(pixels), "limits": plan.limits}
     of_chunk = jax.vmap(partial(_chunk_gradients, **constants))
     columns = in_columns(splats, plan.limits)
 
     def one_batch(total, batch: Batches):
         tile = jnp.maximum(batch.tiles, 0)
-        d_image = d_values[tile]
+        d_tiles = cotangent_of(tile)
 
         def unfinished(carry):
             first, light, *_ = carry
@@ -111,7 +125,7 @@ def _gradients(splats: Splats, lists: Lists, reads, image, cotangents, plan: Pla
         def step(carry):
             first, light, behind, total = carry
             ids, piece = read_chunk(columns, lists, batch, first, chunk)
-            light, behind, rows = of_chunk(piece, d_image, light, behind)
+            light, behind, rows = of_chunk(piece, d_tiles, light, behind)
             total = total.at[ids.ravel()].add(rows.reshape(-1, 6 + channels))
             return first + chunk, light, behind, total
 
@@ -127,25 +141,26 @@ def _gradients(splats: Splats, lists: Lists, reads, image, cotangents, plan: Pla
 
 
 def _values_gradients(
-    splats: Splats, lists: Lists, reads, d_values: Float[Array, "tiles channels pixels"], plan: Plan
+    splats: Splats, lists: Lists, reads, d_image: Float[Array, "high wide channels"], plan: Plan
 ) -> Float[Array, "n channels"]:
     """Gradients with respect to the values only: w^T dL/dI."""
     dtype, channels = splats.opacities.dtype, splats.values.shape[1]
-    chunk, pixels = chunk_length(channels), tile_pixels(plan, dtype)
+    chunk, pixels, cotangent_of = chunk_length(channels), tile_pixels(plan, dtype), _reader(d_image, plan)
     columns = in_columns(splats._replace(values=splats.values[:, :0]), plan.limits)
 
-    def of_chunk(piece: Columns, d_image, light):
+    def of_chunk(piece: Columns, d_tile, light):
         alphas = splat_alphas(piece, pixels, plan.limits)
         weights, light = weights_of_many(alphas, light, plan.limits)
-        return light, jnp.matmul(weights, d_image.T, precision="highest")
+        d_tile = d_tile if channels > FEW_CHANNELS else d_tile.T
+        return light, jnp.matmul(weights, d_tile, precision="highest")
 
     def one_batch(total, batch: Batches):
-        d_image = d_values[jnp.maximum(batch.tiles, 0)]
+        d_tiles = cotangent_of(jnp.maximum(batch.tiles, 0))
 
         def step(carry):
             first, light, total = carry
             ids, piece = read_chunk(columns, lists, batch, first, chunk)
-            light, rows = jax.vmap(of_chunk)(piece, d_image, light)
+            light, rows = jax.vmap(of_chunk)(piece, d_tiles, light)
             return first + chunk, light, total.at[ids.ravel()].add(rows.reshape(-1, channels))
 
         start = (jnp.int32(0), jnp.ones((len(batch.tiles), plan.tile_pixels), dtype), total)
@@ -164,17 +179,18 @@ def _monomials(pixels: Float[Array, "pixels 2"]) -> Float[Array, "pixels 8"]:
     return jnp.stack([jnp.ones_like(x), x, y, x * x, x * y, y * y, 0 * x, 0 * x], axis=-1)
 
 
-def _chunk_gradients(piece: Columns, d_image, light, behind, *, pixels, monomials, limits: Limits):
+def _chunk_gradients(piece: Columns, d_tile, light, behind, *, pixels, monomials, limits: Limits):
     """(light, S) behind one chunk of one tile, and the chunk's rows of gradients: geometry, then values."""
     alphas = splat_alphas(piece, pixels, limits)
     weights, light = weights_of_many(alphas, light, limits)
     if isinstance(piece.values, tuple):
         toward = sum(
-            value.astype(light.dtype)[:, None] * d for value, d in zip(piece.values, d_image, strict=True)
+            value.astype(light.dtype)[:, None] * d for value, d in zip(piece.values, d_tile, strict=True)
         )
+        d_tile = d_tile.T
     else:
-        toward = jnp.matmul(piece.values.astype(light.dtype), d_image, precision="highest")
-    d_values = jnp.matmul(weights, d_image.T, precision="highest")
+        toward = jnp.matmul(piece.values.astype(light.dtype), d_tile.T, precision="highest")
+    d_values = jnp.matmul(weights, d_tile, precision="highest")
     passed = weights * toward
     d_power = []
     for i in range(0, alphas.shape[0], CHUNK):

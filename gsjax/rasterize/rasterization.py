@@ -18,11 +18,12 @@ from gsjax.rasterize import fused
 from gsjax.rasterize.binning import bin_gaussians
 from gsjax.rasterize.capacity import planned_for
 from gsjax.rasterize.checks import check_inputs
-from gsjax.rasterize.compositing import Lists, Splats, untile
+from gsjax.rasterize.compositing import Lists, Splats
 from gsjax.rasterize.gradients import composite
 from gsjax.rasterize.lanes import LANES, slots
 from gsjax.rasterize.plan import HEADROOM, OPTION_NAMES, UNSET, Plan, resolve
 from gsjax.rasterize.projection import Projected, project_gaussians
+from gsjax.rasterize.tiles import of_views, untile
 from gsjax.rasterize.views import Views, usable
 
 
@@ -238,9 +239,9 @@ def _rasterize(views: Views, plan: Plan, batch: tuple[int, ...]):
         return a.reshape(math.prod(shape), *a.shape[2:])
 
     mask, reads = jax.tree.map(merge, (views.tile_mask, views.reads))
-    tiles, transmittance, counts = _draw(jax.tree.map(merge, projected), merge(values), mask, reads, plan)
-    image = untile(tiles, shape, plan)
-    alphas = 1 - untile(transmittance[:, None], shape, plan)
+    image, transmittance, counts = _draw(jax.tree.map(merge, projected), merge(values), mask, reads, plan)
+    alphas = 1 - untile(transmittance[:, None], plan)
+    image, alphas = of_views(image, shape, plan), of_views(alphas, shape, plan)
     return _finish(image, alphas, views, projected, counts, plan, batch)
 
 
@@ -254,18 +255,18 @@ def _draw(projected: Projected, values: Float[Array, "views n channels"], mask, 
         )
     if n == 0:
         zeros = jnp.zeros(num_views, jnp.int32)
-        dtype = projected.depths.dtype
-        tiles = jnp.zeros((num_views * plan.num_tiles, channels, plan.tile_pixels), dtype)
+        light = jnp.ones((num_views * plan.num_tiles, plan.tile_pixels), projected.depths.dtype)
+        image = untile(jnp.zeros((len(light), channels, plan.tile_pixels), light.dtype), plan)
         unread = jnp.zeros((num_views, plan.num_tiles), jnp.int32)
-        return tiles, jnp.ones(tiles.shape[::2], tiles.dtype), _Counts(unread, zeros, zeros > 0, zeros)
+        return image, light, _Counts(unread, zeros, zeros > 0, zeros)
 
     lists, pairs, needed, overflow = _bin_views(projected, mask, plan)
     rows = (projected.means2d, projected.conics, projected.opacities, values)
     splats = Splats(*(a.reshape(num_views * n, *a.shape[2:]) for a in rows))
     reads = None if reads is None else reads.ravel()
-    tiles, transmittance, reads = composite(splats, lists, reads, plan)
+    image, transmittance, reads = composite(splats, lists, reads, plan)
     reads = reads.reshape(num_views, plan.num_tiles)
-    return tiles, transmittance, _Counts(reads, pairs, overflow, needed)
+    return image, transmittance, _Counts(reads, pairs, overflow, needed)
 
 
 def _bin_views(projected: Projected, mask, plan: Plan):
