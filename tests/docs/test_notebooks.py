@@ -52,7 +52,8 @@ def test_it_was_run_in_full_and_shows_what_came_out(name):
 
 @pytest.mark.parametrize(
     "name",
-    ["fit", "track", pytest.param("parts", marks=pytest.mark.slow)],  # the verb runs in test_programs.py
+    ["fit", *(pytest.param(name, marks=pytest.mark.slow) for name in ("track", "parts"))],
+    # whose verbs run in test_programs.py
 )
 def test_it_runs(name, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)

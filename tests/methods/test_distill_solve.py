@@ -30,6 +30,9 @@ GRID = FeatureGridConfig(
 )
 
 
+KINDS = ["both", *(pytest.param(kind, marks=pytest.mark.slow) for kind in ("masks", "maps"))]
+
+
 @pytest.fixture(scope="module")
 def scene():
     return two_balls()
@@ -80,7 +83,7 @@ def dense(gaussians, teacher, config, problem):
     return A + config.solve.smoothness * d.sum() / (d > 1e-12).sum() * L, b, d
 
 
-@pytest.mark.parametrize("kind", ["masks", "maps", "both"])
+@pytest.mark.parametrize("kind", KINDS)
 def test_conjugate_gradients_reach_the_dense_solution_in_float64(scene, kind):
     gaussians, _, masks = scene
     teacher = teacher_with(masks, kind)
@@ -108,7 +111,7 @@ def test_what_is_seen_and_in_no_mask_is_nothing(scene, preset):
 
 
 @pytest.mark.usefixtures("x64")
-@pytest.mark.parametrize("kind", ["masks", "maps", "both"])
+@pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize(("dtype", "error"), [(jnp.float64, 1e-7), (jnp.float32, 2e-5)])
 def test_with_64_bits_they_reach_it_to_seven_digits(kind, dtype, error):
     gaussians, _, masks = two_balls()

@@ -75,6 +75,7 @@ def loss_of(config, params, batch, step=0):
     return distill_loss(config)(params, batch, step=step, key=jax.random.key(0))
 
 
+@pytest.mark.slow
 def test_a_view_keeps_what_it_shows_of_the_codebook_and_that_is_as_good(scene):
     teacher = objects()
     assert max_rows(teacher) == 2

@@ -57,6 +57,7 @@ def test_a_part_that_leaves_or_is_yet_to_come_is_hidden(anchor, gone):
     assert np.median(hidden) < 1e-6
 
 
+@pytest.mark.slow
 def test_where_all_parts_are_there_none_is_hidden():
     result, _ = found(boxes(()))
     np.testing.assert_array_equal(result.trajectory.opacities, 1)

@@ -88,12 +88,14 @@ def worst_gap(found, sequence, anchor=0):
     return max(gaps) / pixel_width(sequence.frame(anchor))
 
 
+@pytest.mark.slow
 def test_backwards_the_motions_are_the_inverse(cabinet):
     """Plates were off by pixels within their plane, until their edges and patterns were registered."""
     found = states_of(cabinet.frame(1), cabinet.frame(0))
     assert worst_gap(found, cabinet, anchor=1) < 1.5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "parts", ["doors=3&drawers=0&width=160&height=120", "doors=0&drawers=2&width=200&height=150"]
 )
@@ -104,6 +106,7 @@ def test_parts_that_look_alike_are_not_mistaken_for_each_other(parts):
     assert worst_gap(found, sequence) < 0.5
 
 
+@pytest.mark.slow
 def test_depth_may_be_noisy(cabinet):
     """By half a percent, a millimetre to three pixels: no part was found."""
     random = np.random.default_rng(0)

@@ -163,6 +163,7 @@ def test_what_shifts_and_turns_miss_is_relocated_in_the_same_frame(jumped):
     assert not jax.jit(follow, static_argnums=4)(*given, jnp.int32(0)).shifted[0]
 
 
+@pytest.mark.slow
 def test_one_group_is_relocated_in_the_time_in_which_two_are_turned(jumped):
     """And the time for one search suffices for a relocation, or nothing would be found."""
     *given, _ = jumped

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gsjax.engine.drive import drive
@@ -210,7 +210,9 @@ def test_thrown_by_the_last_step_of_a_window_it_is_not_thrown_again():
     assert now is good
 
 
-@pytest.mark.parametrize("at", [200, 433, 500, 501, 750])
+@pytest.mark.parametrize(
+    "at", [200, 501, *(pytest.param(at, marks=pytest.mark.slow) for at in (433, 500, 750))]
+)
 def test_a_run_that_is_resumed_is_the_same_to_the_bit(tmp_path, at):
     whole, _ = descended(steep_after=430)
     method = Descent(DescentConfig(steep_after=430))
@@ -267,6 +269,7 @@ def test_long_stretches_of_usual_runs_are_guarded(name):
     np.testing.assert_array_equal(params if settled.is_settled else guard.best.params, good)
 
 
+@settings(max_examples=10)
 @given(seed=st.integers(0, 2**31 - 1), noise=st.sampled_from([0.03, 0.3]))
 def test_noise_alone_is_no_loss(seed, noise):
     """Twenty windows without a trend: the least of twenty means is below the others by chance alone."""
@@ -279,6 +282,7 @@ def test_noise_alone_is_no_loss(seed, noise):
     assert guard.settled(params)[0] is guard
 
 
+@settings(max_examples=8)
 @given(seed=st.integers(0, 2**31 - 1), views=st.sampled_from([7, 150, 300, 500]))
 def test_one_bad_photograph_is_no_loss(seed, views):
     """One that is 35 times as far off as the others, in passes over all, while the others improve."""

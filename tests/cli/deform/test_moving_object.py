@@ -90,6 +90,7 @@ def test_the_data_says_what_is_held_out(sequence):
         read(sequence.select([1, 2]))
 
 
+@pytest.mark.slow
 def test_times_that_are_missing_are_told_of(gsjax, tmp_path):
     """The order of the files, test after train, was taken for time without a word."""
     write_dnerf(tmp_path / "things", SIZE, {"train": 4, "val": 1, "test": 2})
@@ -165,6 +166,7 @@ def test_a_run_is_learned_and_scored_on_white(gsjax, folder, tmp_path):
     assert scene.num_frames == 19
 
 
+@pytest.mark.slow
 def test_opaque_pictures_are_told_of(gsjax, tmp_path):
     """The settings of surst were taken for D-NeRF's layout without a word."""
     write_dnerf(tmp_path / "things", SIZE, {"train": 4, "val": 1, "test": 2})

@@ -207,6 +207,7 @@ def test_files_are_found_by_the_names_of_pictures(tmp_path):
     np.testing.assert_allclose(codes[ids], feature_map(2) / scale @ found.meaning.basis, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_a_run_of_features_goes_on_to_the_same_bits(files, learned, tmp_path, interrupted):
     options = ("--features", files, "--deform.rates.features", 0.03)
     with interrupted(25):

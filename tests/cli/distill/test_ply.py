@@ -102,6 +102,7 @@ def test_a_field_without_descent_takes_passes_over_the_views(gsjax, pristine, sc
     assert gsjax("query", out, "can")[0] == 0
 
 
+@pytest.mark.slow
 def test_the_solution_can_be_asked_while_it_is_trained(gsjax, pristine, scene, tmp_path, monkeypatch):
     write, written = distill_run._write, []
 
@@ -200,6 +201,7 @@ def test_colours_need_no_names_and_answer_to_pictures(gsjax, pristine, scene, tm
     assert np.median(scores[meant]) > np.quantile(scores, 0.9)
 
 
+@pytest.mark.slow
 def test_what_was_encoded_is_not_encoded_again(gsjax, pristine, scene, distilled, tmp_path, cache):
     told = ("distill", scene, *images(pristine), *SMALL, "--distill.iterations", 2)
     assert gsjax(*told, "--out", tmp_path / "a")[0] == 0

@@ -176,6 +176,7 @@ def test_a_cell_that_kills_every_worker_fails_and_the_others_are_done(toy, gsjax
     assert Counter(cell for cell, _ in logged("ended")) == {"0": 1, "1": 1, "2": 1}
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(os.name != "posix", reason="signals")
 def test_ctrl_c_keeps_what_is_done_on_a_cluster_too(toy, gsjax):
     toy(LOGGED.format("time.sleep(60 if options['n'] else 0)"), grid={"n": [0, 1, 2]})

@@ -326,6 +326,7 @@ def test_photographs_that_do_not_fit_into_memory_are_refused_before_anything_is_
     assert (old / "scene.ply").read_text() == "of before"
 
 
+@pytest.mark.slow
 def test_photographs_far_from_0_are_fitted_scored_and_shown_like_others(photographs, tmp_path, capfd):
     shift, far = np.array([500_000.0, 5_000_000.0, 300.0]), tmp_path / "far"
     shutil.copytree(photographs, far)

@@ -3,6 +3,7 @@
 import json
 
 import numpy as np
+import pytest
 
 from gsjax.cli import main
 
@@ -13,6 +14,7 @@ QUICK = (
 )
 
 
+@pytest.mark.slow
 def test_a_door_and_a_drawer_have_their_joints(tmp_path):
     folder = tmp_path / "run"
     assert main(["parts", SCENE, "--out", str(folder), *QUICK]) == 0

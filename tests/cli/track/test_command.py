@@ -158,7 +158,7 @@ def test_ctrl_c_while_scoring_keeps_what_was_scored(pristine, tmp_path, gsjax_tr
 
 
 @pytest.mark.skipif(os.name != "posix", reason="signals")
-@pytest.mark.parametrize("name", ["SIGINT", "SIGTERM", "SIGHUP"])
+@pytest.mark.parametrize("name", ["SIGINT", "SIGTERM", pytest.param("SIGHUP", marks=pytest.mark.slow)])
 def test_a_signal_stops_the_program(pristine, tmp_path, name):
     command = [sys.executable, "-m", "gsjax.cli", "track", str(pristine), "--out", str(tmp_path / "run")]
     process = subprocess.Popen([*command, *QUICK], stderr=subprocess.PIPE, text=True)
