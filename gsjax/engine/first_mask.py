@@ -1,5 +1,6 @@
 """The mask of the first frame, which names the objects that are followed."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -11,8 +12,16 @@ from gsjax.data import Sequence
 from gsjax.data.errors import DataError
 from gsjax.data.files import picture_size
 from gsjax.data.masks import read_mask
+from gsjax.data.pictures import is_picture
 from gsjax.engine.messages import Notes
 from gsjax.engine.recording import Recording
+
+FILE = "mask.png"
+"""Where a run keeps the picture that named its objects."""
+
+PICTURE = "picture"
+OWN_MASKS = ("files", "shapes")  # sources whose values are the recording's
+_MOST_OBJECTS, _LEAST_PIXELS = 100, 10  # of a picture
 
 
 class FirstMask(NamedTuple):
@@ -34,10 +43,7 @@ class FirstMask(NamedTuple):
         return self.source in OWN_MASKS
 
 
-OWN_MASKS = ("files", "shapes")  # sources whose values are the recording's
-
-
-def first_mask(tracked: Sequence, camera: int | None, source: str | Path) -> FirstMask:
+def first_mask(tracked: Sequence, camera: int | None, source: str | Path, scale: float = 1.0) -> FirstMask:
     """The mask of the first frame: from the recording, a picture, or the weight-free segmenter.
 
     Args:
@@ -45,6 +51,7 @@ def first_mask(tracked: Sequence, camera: int | None, source: str | Path) -> Fir
         camera: id of the mask's camera; None takes the first that has masks.
         source: "files", "segment", or "auto": files, else the shapes of the recording, else the segmenter; or
             the path of a picture of labels.
+        scale: size of the tracked pictures relative to the original, which a picture of labels may have.
 
     Raises:
         ValueError: the camera is not tracked, or has no mask; or the picture does not fit.
@@ -54,7 +61,7 @@ def first_mask(tracked: Sequence, camera: int | None, source: str | Path) -> Fir
             f"--mask-camera: camera {camera} is not tracked; the tracked ones are {list(tracked.camera_ids)}."
         )
     if isinstance(source, Path):
-        return _from_picture(tracked, camera, source)
+        return _from_picture(tracked, camera, source, scale)
     if source in ("auto", "files") and tracked.has_masks:
         for c, name in enumerate(tracked.camera_ids):
             labels = tracked.mask(0, c) if camera in (None, name) else None
@@ -67,7 +74,9 @@ def first_mask(tracked: Sequence, camera: int | None, source: str | Path) -> Fir
             )
     if source == "files":
         other = "auto, which takes the shapes of this recording" if tracked.models else "segment"
-        raise ValueError(f"--masks files: {tracked.name} has none for these cameras; use --masks {other}.")
+        raise ValueError(
+            f"--masks files: {tracked.name} has none for these cameras; use --masks {other}, or a picture."
+        )
     if source == "auto" and not tracked.has_depth and tracked.models:
         return FirstMask(None, None, "shapes")
     from gsjax.perception.segmenters import PlaneOrRegionSegmenter
@@ -78,21 +87,53 @@ def first_mask(tracked: Sequence, camera: int | None, source: str | Path) -> Fir
     return FirstMask(labels.astype(np.int32), name, "segment")
 
 
-def _from_picture(tracked: Sequence, camera: int | None, path: Path) -> FirstMask:
-    """What a user gives: labels of the pictures' size, or larger, where those are read at a smaller scale."""
-    if not path.exists():
-        raise ValueError(f"--masks: expected auto, files, segment or a picture of labels, found no {path}")
+def placed(masks: str | Path) -> str | Path:
+    """The source of a first mask, as it is found from any directory."""
+    return masks.expanduser().resolve() if isinstance(masks, Path) else masks
+
+
+def without_truth(recording: Recording) -> Recording:
+    """A recording whose objects are those of a picture: what it knows of its own is left out."""
+    tracked, judged = (
+        replace(sequence, load_mask=None, truth=None) for sequence in (recording.tracked, recording.judged)
+    )
+    return replace(recording, tracked=tracked, judged=judged)
+
+
+def _from_picture(tracked: Sequence, camera: int | None, path: Path, scale: float) -> FirstMask:
+    """What a user gives: labels of the pictures' size, or of their original one."""
+    if not (path.is_file() and is_picture(path)):
+        what = f"the folder {path}" if path.is_dir() else f"{'' if path.exists() else 'no '}{path}"
+        raise ValueError(f"--masks: expected auto, files, segment or a picture of labels (PNG), found {what}")
+    name = tracked.camera_ids[0] if camera is None else camera
+    c = tracked.camera_ids.index(name)
+    depth = tracked.depth(0, c)
+    if depth is None or not np.any(depth > 0):
+        raise ValueError(
+            f"--masks {path}: expected depth of camera {name}, to know where the objects are; "
+            f"{tracked.where('depth', 0, c)} has none"
+        )
     width, height = picture_size(path)
     labels = read_mask(path, width, height)
-    name = tracked.camera_ids[0] if camera is None else camera
-    enlarged = width / tracked.width
-    if enlarged < 1 or abs(height - enlarged * tracked.height) > enlarged:
-        size = f"{tracked.width}x{tracked.height} pixels, as the pictures of camera {name}"
-        raise DataError(path, size, f"{width}x{height}", "Give labels of its first picture.")
+    sizes = {(tracked.width, tracked.height), (round(tracked.width / scale), round(tracked.height / scale))}
+    if not any(abs(width - w) <= 1 and abs(height - h) <= 1 for w, h in sizes):
+        size = " or ".join(f"{w}x{h}" for w, h in sorted(sizes))
+        expected = f"{size} pixels, as the pictures of camera {name}"
+        raise DataError(path, expected, f"{width}x{height}", "Give labels of its first picture.")
+    _check_values(path, labels)
     labels = cv2.resize(labels, (tracked.width, tracked.height), interpolation=cv2.INTER_NEAREST_EXACT)
-    if not labels.any():
+    return FirstMask(labels, name, PICTURE)
+
+
+def _check_values(path: Path, labels: np.ndarray) -> None:
+    """Raises DataError if nothing is an object, or if values are shades rather than labels."""
+    values, counts = np.unique(labels[labels != 0], return_counts=True)
+    if len(values) == 0:
         raise DataError(path, "at least one object", "background only", "Give each object a value above 0.")
-    return FirstMask(labels, name, "picture")
+    if (specks := counts < _LEAST_PIXELS).sum() > len(values) / 2 or len(values) > _MOST_OBJECTS:
+        found = f"{len(values)} values, {specks.sum()} of them in fewer than {_LEAST_PIXELS} pixels"
+        advice = "Paint with a brush without soft edges, and save a PNG: JPEG changes values."
+        raise DataError(path, "one value for each object, and 0", found, advice)
 
 
 def _check_not_empty(labels: np.ndarray, tracked: Sequence, c: int) -> None:

@@ -25,7 +25,7 @@ _WRITTEN = (
     *("config.yml", "metrics.json", "metrics.jsonl", "report.html", "trajectory.npz", "scene.ply"),
     *("cameras.npz", "poses.npz", "parts.npz", "field.npz", DEFORMATION, "video_*.mp4", ".*.partial*"),
     *("canonical", "renders", "plots", "query", "grasp", "eval", "edit", "field", "tensorboard", "test"),
-    *("scene_labels.npz", "resume"),
+    *("scene_labels.npz", "mask.png", "resume"),
 )
 """All that a run, and what is made from it, writes into its folder; `screenshots` are kept."""
 _VALUABLE = ("metrics.json", "trajectory.npz", "scene.ply", "canonical/scene.ply", "field.npz", DEFORMATION)

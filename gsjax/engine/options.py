@@ -107,10 +107,11 @@ class FirstMasks:
     """Options of commands that follow the objects of a first mask."""
 
     mask_camera: Annotated[int | None, tyro.conf.arg(metavar="ID")] = None
-    """Id of the tracked camera whose first mask names the objects; default: the first that has masks."""
+    """Id of the tracked camera whose first mask names the objects; default: the first that has masks (with a
+    picture of your own, the first)."""
     masks: Literal["auto", "files", "segment"] | Path = "auto"
     """Source of the first mask: the files, a segmenter without weights, or (auto) the first available; or a
-    picture of your own with one label per pixel, 0 for the background, of the first frame of that camera."""
+    picture of your own, of that camera's first tracked frame: a label for each pixel, 0 for background."""
 
 
 @dataclass(frozen=True, kw_only=True)

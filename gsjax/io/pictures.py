@@ -35,7 +35,7 @@ def pillow_errors() -> Iterator[None]:
 
 
 def write_png(path: Path, picture: np.ndarray) -> None:
-    """Write an RGB picture [H,W,3] or a grey one [H,W], uint8, as PNG.
+    """Write an RGB picture [H,W,3] or a grey one [H,W], uint8 or uint16, as PNG.
 
     Raises:
         OSError: the file could not be written.

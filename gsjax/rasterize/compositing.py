@@ -61,8 +61,7 @@ def in_columns(splats: Splats, limits: Limits) -> Columns:
 
 
 class TileState(NamedTuple):
-    """The state of compositing of P pixels. Within loops many channels are the last axis, for products of
-    matrices."""
+    """The state of compositing of P pixels. Within loops, more than FEW_CHANNELS are the last axis."""
 
     values: Float[Array, "*tiles channels pixels"] | Float[Array, "*tiles pixels channels"]
     light: Float[Array, "*tiles pixels"]  # the transmittance; its negative once the pixel has ended
@@ -195,21 +194,24 @@ def composite_tile(
         state = start_tile(pixels.shape[0], channels, dtype)
     if length == 0:
         return state
-    chunk = chunk_length(channels)
-    if channels > FEW_CHANNELS:
-        state = state._replace(values=state.values.T)
-
-    def padded(a):  # with empty slots
-        return jnp.pad(a, [(0, -length % chunk)] + [(0, 0)] * (a.ndim - 1))
-
+    chunk, state = chunk_length(channels), _for_loops(state, channels)
     if length <= chunk:
         state = composite_columns(in_columns(splats, limits), pixels, state, limits)
     else:
+
+        def padded(a):  # with empty slots
+            return jnp.pad(a, [(0, -length % chunk)] + [(0, 0)] * (a.ndim - 1))
+
         columns = in_columns(jax.tree.map(padded, splats), limits)
         pieces = jax.tree.map(lambda a: a.reshape(-1, chunk, *a.shape[1:]), columns)
         state = jax.lax.scan(
             lambda state, piece: (composite_columns(piece, pixels, state, limits), None), state, pieces
         )[0]
+    return _for_loops(state, channels)
+
+
+def _for_loops(state: TileState, channels: int) -> TileState:
+    """A state as the loops have it, and back: many channels last, as rows of a matrix product."""
     return state._replace(values=state.values.T) if channels > FEW_CHANNELS else state
 
 
@@ -219,7 +221,7 @@ def composite_columns(columns: Columns, pixels, state: TileState, limits: Limits
     Args:
         columns: the chunk.
         pixels: [P, 2], in the same coordinates as the means in `columns`.
-        state: the state before the chunk.
+        state: the state before the chunk, as the loops have it.
         limits: thresholds of alphas and transmittance.
     """
     alphas, dtype = splat_alphas(columns, pixels, limits), state.light.dtype
@@ -319,10 +321,11 @@ def composite_forward(splats: Splats, lists: Lists, reads: Int[Array, "tiles"] |
     compose = jax.vmap(partial(composite_columns, limits=plan.limits), in_axes=(0, None, 0))
 
     def start(_):
-        state = start_tile(plan.tile_pixels, channels, dtype)
-        return state._replace(values=state.values.T) if is_wide else state
+        return _for_loops(start_tile(plan.tile_pixels, channels, dtype), channels)
 
-    def one_batch(image, batch: Batches):
+    def one_batch(image, at):
+        number, batch = at
+
         def step(carry):
             first, state, reading, read = carry
             _, piece = read_chunk(columns, lists, batch, first, chunk)
@@ -332,16 +335,21 @@ def composite_forward(splats: Splats, lists: Lists, reads: Int[Array, "tiles"] |
         begin = (jnp.int32(0), jax.vmap(start)(batch.counts), batch.counts > 0, jnp.zeros_like(batch.counts))
         _, state, _, read = jax.lax.while_loop(lambda carry: jnp.any(carry[2]), step, begin)
         others = state.transmittance, jnp.minimum(read, batch.counts)
-        if is_wide:
-            return write_tiles(image, batch.tiles, state.values, plan), (None, *others)
-        return None, (state.values, *others)
+        if image is None:
+            return None, (state.values, *others)
+        left = jnp.minimum(batch.tiles.shape[0], num_tiles - number * batch.tiles.shape[0])
+        return write_tiles(image, batch.tiles, state.values, left, plan), (None, *others)
 
     num_tiles = lists.counts.shape[0]
     edges = num_tiles // plan.tiles_x * plan.tile_size, plan.tiles_x * plan.tile_size
-    # Many channels are written where they belong as soon as they are known: a copy would take as long.
-    image = jnp.zeros((*edges, channels), dtype) if is_wide else None
-    image, outputs = jax.lax.scan(one_batch, image, batches)
+    # On a CPU, many channels go where they belong at once: ordering tiles later takes as long as all of this.
+    at_once = is_wide and jax.default_backend() == "cpu"
+    image = jnp.zeros((*edges, channels), dtype) if at_once else None
+    numbers = jnp.arange(batches.tiles.shape[0], dtype=jnp.int32)
+    image, outputs = jax.lax.scan(one_batch, image, (numbers, batches))
     # The position of each tile in the batches; the padding of the last batch, -1, is the largest key.
     place = argsort_keys(batches.tiles.ravel().astype(jnp.uint32), plan.sort)[:num_tiles]
     values, light, read = jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:])[place], outputs)
-    return untile(values, plan) if image is None else image, light, read
+    if image is None:
+        image = untile(values.swapaxes(1, 2) if is_wide else values, plan)
+    return image, light, read

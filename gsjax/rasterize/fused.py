@@ -63,17 +63,17 @@ def composite_forward(splats: Splats, lists: Lists, plan: Plan, lanes: int):
 
 
 def gradients(
-    splats: Splats, lists: Lists, reads: Int[Array, "tiles"], image, cotangents, plan: Plan, lanes: int
+    splats: Splats, lists: Lists, reads: Int[Array, "tiles"], kept, cotangents, plan: Plan, lanes: int
 ) -> Splats:
     """Gradients with respect to all fields of the splats.
 
     Args:
         splats, lists, plan, lanes: as for `composite_forward`.
         reads: entries read from each list.
-        image: the image, and the transmittance of all tiles.
+        kept: the image, and the transmittance of all tiles.
         cotangents: the gradients with respect to both.
     """
-    (image, transmittance), (d_image, d_transmittance) = image, cotangents
+    (image, transmittance), (d_image, d_transmittance) = kept, cotangents
     d_values = in_tiles(d_image, plan)
     behind = _of_passes(in_tiles(image, plan)) * _of_passes(d_values)
     behind = behind.sum(axis=2).at[0].add(d_transmittance * transmittance)

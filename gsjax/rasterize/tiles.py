@@ -23,14 +23,16 @@ def write_tiles(
     image: Float[Array, "high wide channels"],
     tiles: Int[Array, "batch"],
     values: Float[Array, "batch pixels channels"],
+    count: Int[Array, ""] | int,
     plan: Plan,
 ) -> Float[Array, "high wide channels"]:
-    """The image with some of its tiles replaced.
+    """The image with some of its tiles replaced, one after the other: for CPUs.
 
     Args:
         image: the image of all tiles.
-        tiles: which are replaced; -1, for none, after all others.
+        tiles: which are replaced.
         values: their values.
+        count: how many are, from the first on. Under vmap it should be one number, or each tile costs a copy.
         plan: determines the size of a tile.
     """
     edge = plan.tile_size
@@ -39,7 +41,7 @@ def write_tiles(
         tile = values[i].reshape(edge, edge, image.shape[-1])
         return jax.lax.dynamic_update_slice(image, tile, _corner(tiles[i], plan))
 
-    return jax.lax.fori_loop(0, jnp.sum(tiles >= 0), write, image)
+    return jax.lax.fori_loop(0, count, write, image)
 
 
 def read_tiles(

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator
 from contextlib import nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from time import perf_counter
@@ -21,7 +21,7 @@ from gsjax.data.realsense_camera import open_realsense
 from gsjax.data.stream import Arrival, NewestSnapshots, Snapshot, replay
 from gsjax.engine.drive import Tick
 from gsjax.engine.ending import ended, exit_code
-from gsjax.engine.first_mask import first_mask, label_names
+from gsjax.engine.first_mask import first_mask, label_names, placed, warn_of_missing
 from gsjax.engine.folder import RunFolder
 from gsjax.engine.locks import releasing_locks
 from gsjax.engine.machine import describe as describe_machine
@@ -99,8 +99,10 @@ def run(options: Options) -> int:
     console = Console(stderr=True, highlight=False)
     with Notes(console) as notes:
         folder = RunFolder.locked(options.out, overwrite=options.overwrite, resume=None)
-        source = _open(options, console)
-        folder.write_config(options)  # from here on an earlier run is gone
+        source = _open(options, console, notes)
+        folder.write_config(
+            replace(options, masks=placed(options.masks))
+        )  # from here on an earlier run is gone
         log = Log(source.scene.label_ids, source.names)
         stopped = follow(options, source, log, console)
         found = {
@@ -136,7 +138,7 @@ def _camera(source: str) -> str | None:
     return kind if source.startswith(f"{kind}:") and kind in _CAMERAS else None
 
 
-def _open(options: Options, console: Console) -> Source:
+def _open(options: Options, console: Console, notes: Notes) -> Source:
     if kind := _camera(options.source):
         number = options.source.removeprefix(f"{kind}:")
         if not number.isdecimal():
@@ -146,13 +148,13 @@ def _open(options: Options, console: Console) -> Source:
         first, drawing, stream = next(arriving).frame, nullcontext(), lambda: arriving
         image, depth = np.asarray(first.images[0]), np.asarray(first.depths)[0]
         labels = PlaneOrRegionSegmenter()((255 * image).astype(np.uint8), depth, camera.K).astype(np.int32)
-        index, names = 0, {}
+        recording, mask, index, names = None, None, 0, {}
     else:
         recording = open_recording(
             options.source, options.cameras, (), options.frames, options.read, options.scale
         )
         check_recording(recording.judged)
-        mask = first_mask(recording.tracked, options.mask_camera, options.masks)
+        mask = first_mask(recording.tracked, options.mask_camera, options.masks, options.scale)
         if mask.labels is None:
             raise ValueError(
                 f"SOURCE: {options.source} has no depth; gsjax live starts from depth. Use gsjax track."
@@ -164,6 +166,8 @@ def _open(options: Options, console: Console) -> Source:
     rehearsal = Rehearsal(first, CONFIG, budgeted=True)
     with drawing, stage(console, FITTING):
         scene = start_scene(first, labels, index, CONFIG, before_fit=rehearsal.begin)
+    if recording is not None and mask is not None:
+        warn_of_missing(recording, mask, scene.label_ids, notes)
     return Source(first, scene, names, rehearsal, stream())
 
 

@@ -10,7 +10,15 @@ import numpy as np
 from rich.console import Console
 
 from gsjax.engine.ending import ended, exit_code, finish
-from gsjax.engine.first_mask import FirstMask, first_mask, warn_of_missing
+from gsjax.engine.first_mask import (
+    FILE,
+    PICTURE,
+    FirstMask,
+    first_mask,
+    placed,
+    warn_of_missing,
+    without_truth,
+)
 from gsjax.engine.folder import RunFolder, expect_dataset
 from gsjax.engine.locks import releasing_locks
 from gsjax.engine.machine import describe as describe_machine
@@ -45,6 +53,7 @@ from gsjax.engine.track.scoring import (
     turn_unknown_from,
 )
 from gsjax.engine.track.views import views
+from gsjax.io.pictures import write_png
 from gsjax.methods.track import PRESETS, TrackConfig, TrackedScene, scene_from_shapes, start_scene
 
 
@@ -81,14 +90,21 @@ def run(options: Options) -> int:
         expect_dataset(options.dataset)
         recording = chosen_recording(options)
         folder = RunFolder.locked(options.out, overwrite=options.overwrite, resume=options.resume)
-        masks = options.masks.resolve() if isinstance(options.masks, Path) else options.masks
         settings = replace(
-            options, dataset=located(options.dataset), cameras=recording.tracked.camera_ids, masks=masks
+            options,
+            dataset=located(options.dataset),
+            cameras=recording.tracked.camera_ids,
+            masks=placed(options.masks),
         )
         if options.resume:
             folder.check_config(settings, but=RESUME_MAY_CHANGE)
-        mask = first_mask(recording.tracked, options.mask_camera, options.masks)
+        kept, masks = folder.path / FILE, settings.masks
+        masks = kept if options.resume and isinstance(masks, Path) else masks
+        mask = first_mask(recording.tracked, options.mask_camera, masks, options.scale)
         folder.write_config(settings)  # from here on an earlier run is gone
+        if mask.source == PICTURE:
+            recording = without_truth(recording)
+            write_png(kept, mask.labels.astype(np.uint16))
         seconds = {"preparing": perf_counter() - begun}
         first = recording.tracked.frame(0)
         rehearsal = Rehearsal(
@@ -134,7 +150,7 @@ def _start(
     seconds = perf_counter() - begun
     objects = len(set(scene.label_ids) - {0})
     parts = f" ({scene.num_objects} rigid parts)" if scene.num_objects > objects else ""
-    made_by = {"files": "the file", "picture": "your picture", "segment": "the weight-free segmenter"}
+    made_by = {"files": "the file", PICTURE: "your picture", "segment": "the weight-free segmenter"}
     origin = "objects are the shapes that come with the recording"
     if mask.labels is not None:
         origin = f"labels from {made_by[mask.source]} in camera {mask.camera}"
@@ -255,11 +271,13 @@ def _note_what_is_missing(
     sequence = recording.judged
     if mask.source == "segment":
         notes.add("Objects were found by the weight-free segmenter; they are named by size.")
-    if sequence.truth is None:
+    if mask.source == PICTURE:
+        notes.add("Motion and labels were not scored: the objects are those of your picture.")
+    elif sequence.truth is None:
         notes.add("Motion was not scored: the recording has no true poses.")
     elif not (recording.tracked.has_masks and recording.tracked.has_depth):
         notes.add("Motion was not scored: assigning Gaussians to true objects requires masks and depth.")
-    if values is None or not sequence.has_masks:
+    if mask.source != PICTURE and (values is None or not sequence.has_masks):
         notes.add("Labels were not scored: the recording has no masks.")
     if not sequence.has_depth:
         notes.add("Depth was not scored: the recording has none.")

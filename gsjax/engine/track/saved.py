@@ -104,8 +104,8 @@ def read_tracking(path: Path) -> tuple[Tracking, Float[np.ndarray, "3"] | None]:
 
 
 def _read_metrics(file: Path, scene: TrackedScene) -> tuple[int | None, dict[int, str]]:
-    """The camera whose mask named the objects, and the name of each group; labels of the segmenter have no
-    name in the recording."""
+    """The camera whose mask named the objects, and the name of each group; only labels of the recording's own
+    masks have one in it."""
     try:
         metrics = parse_json(file.read_text(encoding="utf-8"))
         camera, source = metrics["mask"]["camera"], metrics["mask"]["source"]
@@ -114,4 +114,7 @@ def _read_metrics(file: Path, scene: TrackedScene) -> tuple[int | None, dict[int
         raise ValueError(f"{file}: expected a run's scores, found something else; {_AGAIN}") from error
     if source not in OWN_MASKS:
         known = {}
-    return camera, {k: known.get(scene.label_ids[k], f"object {k}") for k in range(1, scene.num_objects + 1)}
+    return camera, {
+        k: known.get(scene.label_ids[k], f"object {scene.label_ids[k]}")
+        for k in range(1, scene.num_objects + 1)
+    }

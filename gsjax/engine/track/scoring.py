@@ -33,8 +33,8 @@ def group_values(tracking: Tracking, mask: FirstMask, recording: Recording) -> n
 
 
 def labels_of_groups(tracking: Tracking, values: np.ndarray | None) -> np.ndarray:
-    """The label of each group of a tracking, [K+1]: its value from `group_values`, or if that is None the
-    segmenter's own."""
+    """The label of each group of a tracking, [K+1]: its value from `group_values`, or if that is None that
+    of the first mask."""
     return np.asarray(tracking.scene.label_ids) if values is None else values
 
 
