@@ -102,7 +102,7 @@ def run(options: Options) -> int:
         masks = kept if options.resume and isinstance(masks, Path) else masks
         mask = first_mask(recording.tracked, options.mask_camera, masks, options.scale)
         folder.write_config(settings)  # from here on an earlier run is gone
-        if mask.source == PICTURE:
+        if mask.source == PICTURE and mask.labels is not None:
             recording = without_truth(recording)
             write_png(kept, mask.labels.astype(np.uint16))
         seconds = {"preparing": perf_counter() - begun}
