@@ -262,7 +262,6 @@ def test_cameras_over_four_devices(more_on_four):
     assert more_on_four["cameras"]["part"] == [[1, HEIGHT, WIDTH, 4]] * 4
 
 
-@pytest.mark.slow
 def test_scenes_and_cameras_over_two_by_two_devices(on_four):
     assert_same(on_four["scenes"])
     assert on_four["scenes"]["part"] == [[1, 1, HEIGHT, WIDTH, 4]] * 4
