@@ -4,6 +4,7 @@ All pictures are uint8 RGB `[H,W,3]`; colour inputs are floats in 0 to 1 or uint
 """
 
 from collections.abc import Mapping, Sequence
+from colorsys import hsv_to_rgb
 from typing import NamedTuple
 
 import cv2
@@ -31,11 +32,17 @@ PALETTE = (
     (136, 34, 85),
     (153, 153, 51),
 )
+_GOLDEN = (5**0.5 - 1) / 2
+_SHADES = ((0.9, 0.8), (0.55, 0.7), (0.75, 0.5))  # saturation and value
 
 
 def label_color(label: int) -> tuple[int, int, int]:
-    """The RGB colour, 0 to 255, of `label` in every picture; 0 is grey, and the palette repeats after 10."""
-    return BACKGROUND if label == 0 else PALETTE[(label - 1) % len(PALETTE)]
+    """The RGB colour, 0 to 255, of `label` in every picture; 0 is grey, and after the palette's ten, hues go
+    on by the golden section, so that labels a hundred apart differ too."""
+    if label <= len(PALETTE):
+        return BACKGROUND if label == 0 else PALETTE[label - 1]
+    red, green, blue = hsv_to_rgb(label * _GOLDEN % 1, *_SHADES[label % len(_SHADES)])
+    return round(255 * red), round(255 * green), round(255 * blue)
 
 
 def colorize_labels(mask: Integer[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w 3"]:
