@@ -105,7 +105,10 @@ def _gradients(splats: Splats, lists: Lists, reads, kept, cotangents, plan: Plan
     dtype, channels = splats.opacities.dtype, splats.values.shape[1]
     chunk, pixels = chunk_length(channels), tile_pixels(plan, dtype)
     cotangent_of = _reader(d_image, plan)
-    behind = in_tiles((image * d_image).sum(axis=-1, keepdims=True), plan)[:, 0]
+    if channels > FEW_CHANNELS:
+        behind = in_tiles((image * d_image).sum(axis=-1, keepdims=True), plan)[:, 0]
+    else:  # channel after channel: along the last axis XLA:CPU adds four in another order
+        behind = (in_tiles(image, plan) * in_tiles(d_image, plan)).sum(axis=1)
     behind += d_transmittance * transmittance
     constants = {"pixels": pixels, "monomials": _monomials(pixels), "limits": plan.limits}
     of_chunk = jax.vmap(partial(_chunk_gradients, **constants))
