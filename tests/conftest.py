@@ -22,7 +22,7 @@ if version("jaxlib").startswith("0.10."):  # XLA ends a process that names a fla
     flags += " --xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1"
 os.environ.setdefault("XLA_FLAGS", flags)
 
-# Programs need not name the lines that they come from: it is a tenth of what tracing costs.
+# Programs need not name the lines that they come from, which takes some of the time of tracing.
 os.environ.setdefault("JAX_TRACEBACK_IN_LOCATIONS_LIMIT", "0")
 
 # JAX's traces are many objects that live on; to look through all of them again and again takes a tenth.

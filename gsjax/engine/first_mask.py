@@ -16,7 +16,7 @@ from gsjax.data.pictures import is_picture
 from gsjax.engine.messages import Notes
 from gsjax.engine.recording import Recording
 
-FILE = "mask.png"
+KEPT_MASK = "mask.png"
 """Where a run keeps the picture that named its objects."""
 
 PICTURE = "picture"

@@ -100,9 +100,8 @@ def run(options: Options) -> int:
     with Notes(console) as notes:
         folder = RunFolder.locked(options.out, overwrite=options.overwrite, resume=None)
         source = _open(options, console, notes)
-        folder.write_config(
-            replace(options, masks=placed(options.masks))
-        )  # from here on an earlier run is gone
+        settings = replace(options, masks=placed(options.masks))
+        folder.write_config(settings)  # from here on an earlier run is gone
         log = Log(source.scene.label_ids, source.names)
         stopped = follow(options, source, log, console)
         found = {

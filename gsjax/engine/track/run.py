@@ -11,7 +11,7 @@ from rich.console import Console
 
 from gsjax.engine.ending import ended, exit_code, finish
 from gsjax.engine.first_mask import (
-    FILE,
+    KEPT_MASK,
     PICTURE,
     FirstMask,
     first_mask,
@@ -98,8 +98,8 @@ def run(options: Options) -> int:
         )
         if options.resume:
             folder.check_config(settings, but=RESUME_MAY_CHANGE)
-        kept, masks = folder.path / FILE, settings.masks
-        masks = kept if options.resume and isinstance(masks, Path) else masks
+        kept = folder.path / KEPT_MASK
+        masks = kept if options.resume and isinstance(options.masks, Path) else settings.masks
         mask = first_mask(recording.tracked, options.mask_camera, masks, options.scale)
         folder.write_config(settings)  # from here on an earlier run is gone
         if mask.source == PICTURE and mask.labels is not None:

@@ -114,7 +114,5 @@ def _read_metrics(file: Path, scene: TrackedScene) -> tuple[int | None, dict[int
         raise ValueError(f"{file}: expected a run's scores, found something else; {_AGAIN}") from error
     if source not in OWN_MASKS:
         known = {}
-    return camera, {
-        k: known.get(scene.label_ids[k], f"object {scene.label_ids[k]}")
-        for k in range(1, scene.num_objects + 1)
-    }
+    labels = enumerate(scene.label_ids[1:], 1)
+    return camera, {k: known.get(label, f"object {label}") for k, label in labels}

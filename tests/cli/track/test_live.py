@@ -11,6 +11,7 @@ import pytest
 import gsjax.data.stream
 from gsjax.cli import main
 from gsjax.engine.track import live as engine
+from gsjax.io.pictures import write_png
 from gsjax.methods.track import start_scene
 from tests.cli.conftest import still_tick
 
@@ -122,3 +123,17 @@ def test_a_stream_that_fails_leaves_what_was_followed(pristine, live, monkeypatc
     assert not found["complete"]
     assert "unplugged" in found["stopped"]
     assert (folder / "trajectory.npz").exists()
+
+
+def test_a_picture_names_the_objects_of_a_recording(pristine, live, tmp_path, monkeypatch):
+    labels = np.zeros((60, 80), np.uint8)
+    labels[20:40, 20:60] = 7
+    write_png(tmp_path / "mask.png", labels)
+    monkeypatch.chdir(tmp_path)
+    told = ("--minutes", "0.01", "--hz", "20", "--masks", "mask.png")
+    code, said, folder = live(pristine, *told, "--cameras", "0")
+    assert code == 0, said
+    assert json.loads((folder / "metrics.json").read_text())["objects"] == {"7": "object 7"}
+    assert str(tmp_path / "mask.png") in (folder / "config.yml").read_text()
+    code, said, _ = live("camera:0", *told)
+    assert (code, "--masks: applies to recordings" in said) == (2, True)
