@@ -128,7 +128,7 @@ class ClipWeights:
     """Options of commands that can use CLIP."""
 
     weights: Path | None = None
-    """Folder of CLIP's weights, in the layout of Hugging Face."""
+    """Folder of the weights of CLIP, or of SigLIP, in the layout of Hugging Face."""
 
 
 @dataclass(frozen=True, kw_only=True)

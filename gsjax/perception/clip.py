@@ -1,10 +1,12 @@
-"""CLIP (Radford et al., 2021) through transformers: images and text in one space. Weights are local files.
+"""CLIP (Radford et al., 2021) and SigLIP (Zhai et al., 2023) through transformers: images and text in one
+space. Weights are local files.
 
 Needs the extra `foundation`; torch and transformers are imported when a model is loaded.
 """
 
+import math
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -14,6 +16,8 @@ from gsjax.perception import weights
 from gsjax.perception.pictures import square_crop, to_bytes
 
 _BATCH = 32  # images; SAM finds hundreds of masks in a photograph
+_CLIP, _SIGLIP = "clip", "siglip"  # `model_type` in config.json; SigLIP 2 of fixed resolution is "siglip" too
+_CHANCE = 0.01  # of a match by SigLIP's sigmoid
 
 
 @dataclass(frozen=True)
@@ -26,6 +30,7 @@ class ClipEncoder:
         device: the device that holds the model.
         min_score: a query whose best cosine is lower matches none of the objects. CLIP's cosines lie around
             0.25 to 0.3 for an image and a matching text, and around 0.15 to 0.2 for one that does not match.
+            SigLIP's are lower: `load_clip` takes the one at which its own sigmoid gives a match 1 in 100.
     """
 
     model: Any
@@ -35,6 +40,17 @@ class ClipEncoder:
     device: str = "cpu"
     min_score: float = 0.2
 
+    @property
+    def is_siglip(self) -> bool:
+        """Whether the model is a SigLIP."""
+        return self.model.config.model_type == _SIGLIP
+
+    @property
+    def dimension(self) -> int:
+        """Numbers of a vector."""
+        config = self.model.config
+        return config.vision_config.hidden_size if self.is_siglip else config.projection_dim
+
     def embed_images(self, images: list[np.ndarray]) -> Float[np.ndarray, "n D"]:
         """Unit vectors of RGB images [h,w,3], uint8 or floats 0 to 1; a few images at a time are in the
         model's memory."""
@@ -43,8 +59,8 @@ class ClipEncoder:
             some = [to_bytes(image) for image in images[first : first + _BATCH]]
             pixels = self.processor(some, return_tensors="pt")["pixel_values"]
             with self.torch.inference_mode():
-                seen = self.model.vision_model(pixel_values=pixels.to(self.device)).pooler_output
-                vectors.append(self.model.visual_projection(seen).float().cpu().numpy())
+                seen = self.model.get_image_features(pixel_values=pixels.to(self.device, self.model.dtype))
+                vectors.append(seen.pooler_output.float().cpu().numpy())
         return _unit(np.concatenate(vectors))
 
     def embed_text(self, text: str) -> Float[np.ndarray, "D"]:
@@ -55,10 +71,16 @@ class ClipEncoder:
         """
         if not text.strip():
             raise ValueError("text: expected words that describe an object, found an empty text")
-        tokens = self.tokenizer([text], truncation=True, return_tensors="pt").to(self.device)
+        how: dict[str, Any] = {"truncation": True, "return_tensors": "pt"}
+        if self.is_siglip:  # trained on lower case, padded to full length, with no mask of the padding
+            length = self.model.config.text_config.max_position_embeddings
+            tokens = self.tokenizer([text.lower()], padding="max_length", max_length=length, **how)
+            tokens = {"input_ids": tokens["input_ids"].to(self.device)}
+        else:
+            tokens = self.tokenizer([text], **how).to(self.device)
         with self.torch.inference_mode():
-            read = self.model.text_model(**tokens).pooler_output
-            return _unit(self.model.text_projection(read).float().cpu().numpy())[0]
+            read = self.model.get_text_features(**tokens)
+            return _unit(read.pooler_output.float().cpu().numpy())[0]
 
     def embed_objects(
         self, image: Num[np.ndarray, "H W 3"], labels: Int[np.ndarray, "H W"], count: int
@@ -72,7 +94,7 @@ class ClipEncoder:
             labels: label of each pixel, 0 for background.
             count: the largest label to embed.
         """
-        vectors = np.zeros((count, self.model.config.projection_dim), np.float32)
+        vectors = np.zeros((count, self.dimension), np.float32)
         there = [label for label in range(1, count + 1) if (labels == label).any()]
         if there:
             crops = [square_crop(np.asarray(image), labels == label) for label in there]
@@ -81,20 +103,36 @@ class ClipEncoder:
 
 
 def load_clip(path: str | os.PathLike, device: str = "cpu") -> ClipEncoder:
-    """CLIP from a folder of weights in the layout of Hugging Face.
+    """CLIP or SigLIP (also SigLIP 2 of fixed resolution) from a folder of weights in the layout of Hugging
+    Face.
+
+    Args:
+        path: the folder.
+        device: device of torch, "cpu" or "cuda".
 
     Raises:
         FileNotFoundError: the folder or a file of it is missing.
-        ValueError: the folder points to pickled weights.
+        ValueError: the folder holds another model, or points to pickled weights.
         MissingExtra: torch or transformers is not installed.
     """
-    files = (weights.PROCESSOR, "tokenizer.json|vocab.json")
+    files = (weights.PROCESSOR, "tokenizer.json|vocab.json|spiece.model")
     folder = weights.model_folder(path, "CLIP's weights", files, "openai/clip-vit-large-patch14")
+    kind = weights.model_type(folder)
+    if kind not in (_CLIP, _SIGLIP):
+        raise ValueError(
+            f"{folder / 'config.json'}: expected the model_type clip or siglip, found {kind!r}. Of SigLIP 2 "
+            "take a model of fixed resolution, such as google/siglip2-base-patch16-224"
+        )
     torch, transformers = weights.foundation_modules("CLIP")
-    model = transformers.CLIPModel.from_pretrained(folder, **weights.LOCAL_WEIGHTS).eval().to(device)
+    model = weights.load_model(transformers, "AutoModel", folder, device, half=True)
     processor = weights.image_processor(transformers, folder)
     tokenizer = transformers.AutoTokenizer.from_pretrained(folder, **weights.LOCAL_FILES)
-    return ClipEncoder(model, processor, tokenizer, torch, device)
+    encoder = ClipEncoder(model, processor, tokenizer, torch, device)
+    if not encoder.is_siglip:
+        return encoder
+    logit = math.log(_CHANCE / (1 - _CHANCE))
+    bias, scale = (float(number.detach()) for number in (model.logit_bias, model.logit_scale.exp()))
+    return replace(encoder, min_score=(logit - bias) / scale)
 
 
 def _unit(vectors: np.ndarray) -> np.ndarray:

@@ -37,7 +37,7 @@ class Dinov2Encoder:
         patch = self.model.config.patch_size
         pixels, rows, columns = in_patches(images, self.processor, patch, self.resolution)
         with self.torch.inference_mode():
-            tokens = self.model(pixel_values=pixels.to(self.device)).last_hidden_state
+            tokens = self.model(pixel_values=pixels.to(self.device, self.model.dtype)).last_hidden_state
             # The class token and, in some models, registers precede the patches.
             grid = tokens[:, -rows * columns :].float().unflatten(1, (rows, columns)).permute(0, 3, 1, 2)
             maps = self.torch.nn.functional.interpolate(
@@ -61,5 +61,5 @@ def load_dinov2(path: str | os.PathLike, device: str = "cpu", resolution: int = 
     """
     folder = weights.model_folder(path, "DINOv2's weights", (weights.PROCESSOR,), "facebook/dinov2-base")
     torch, transformers = weights.foundation_modules("DINOv2")
-    model = transformers.AutoModel.from_pretrained(folder, **weights.LOCAL_WEIGHTS).eval().to(device)
+    model = weights.load_model(transformers, "AutoModel", folder, device, half=True)
     return Dinov2Encoder(model, weights.image_processor(transformers, folder), torch, device, resolution)

@@ -121,14 +121,12 @@ def load_grounded_sam(
     masks = weights.model_folder(segmenter, "SAM's weights", (weights.PROCESSOR,), "facebook/sam-vit-base")
     torch, transformers = weights.foundation_modules("Grounded SAM")
     tokenizer = transformers.AutoTokenizer.from_pretrained(boxes, **weights.LOCAL_FILES)
-    dino = transformers.GroundingDinoForObjectDetection.from_pretrained(boxes, **weights.LOCAL_WEIGHTS)
-    sam = transformers.SamModel.from_pretrained(masks, **weights.LOCAL_WEIGHTS)
     return GroundedSam(
-        detector=dino.eval().to(device),
+        detector=weights.load_model(transformers, "GroundingDinoForObjectDetection", boxes, device),
         detector_processor=transformers.GroundingDinoProcessor(
             weights.image_processor(transformers, boxes), tokenizer
         ),
-        segmenter=sam.eval().to(device),
+        segmenter=weights.load_model(transformers, "SamModel", masks, device),
         segmenter_processor=transformers.SamProcessor(weights.image_processor(transformers, masks)),
         torch=torch,
         device=device,

@@ -31,6 +31,13 @@ class MaskClipEncoder:
     clip: ClipEncoder
     resolution: int = 448
 
+    def __post_init__(self):
+        if self.clip.is_siglip:  # it pools by a query of its own, not by a token among the patches
+            raise ValueError(
+                "vectors of patches (maskclip): expected the weights of CLIP, found those of SigLIP, which "
+                "has vectors of whole pictures only; take --features clip without --second"
+            )
+
     @property
     def min_score(self) -> float:
         """A query whose best cosine is lower matches nothing in view; the same as for `ClipEncoder`."""
@@ -43,7 +50,7 @@ class MaskClipEncoder:
         pixels, rows, columns = in_patches(images, self.clip.processor, patch, self.resolution)
         with torch.inference_mode():
             seen = vision(
-                pixel_values=pixels.to(self.clip.device),
+                pixel_values=pixels.to(self.clip.device, self.clip.model.dtype),
                 output_hidden_states=True,
                 interpolate_pos_encoding=True,
             )
@@ -69,5 +76,8 @@ def load_maskclip(path: str | os.PathLike, device: str = "cpu", resolution: int 
     Args:
         path, device: as for `gsjax.perception.clip.load_clip`, with its errors.
         resolution: shorter side of the model's input, pixels.
+
+    Raises:
+        ValueError: the weights are SigLIP's.
     """
     return MaskClipEncoder(load_clip(path, device), resolution)

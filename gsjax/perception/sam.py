@@ -150,7 +150,7 @@ def load_sam(path: str | os.PathLike, device: str = "cpu") -> SamSegmenter:
     """
     folder = weights.model_folder(path, "SAM's weights", (weights.PROCESSOR,), "facebook/sam-vit-base")
     torch, transformers = weights.foundation_modules("SAM")
-    model = transformers.SamModel.from_pretrained(folder, **weights.LOCAL_WEIGHTS).eval()
+    model = weights.load_model(transformers, "SamModel", folder, device)
     pictures = weights.image_processor(transformers, folder)
     pipeline = transformers.pipeline("mask-generation", model=model, image_processor=pictures, device=device)
     return SamSegmenter(pipeline, transformers.SamProcessor(pictures), torch)

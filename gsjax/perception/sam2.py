@@ -101,7 +101,7 @@ def load_sam2(path: str | os.PathLike, device: str = "cpu") -> Sam2Propagator:
     """
     folder = weights.model_folder(path, "SAM2's weights", (weights.PROCESSOR,), "facebook/sam2.1-hiera-tiny")
     torch, transformers = weights.foundation_modules("SAM2")
-    model = transformers.Sam2VideoModel.from_pretrained(folder, **weights.LOCAL_WEIGHTS).eval().to(device)
+    model = weights.load_model(transformers, "Sam2VideoModel", folder, device)
     # SAM2's own processor needs torchvision. ViT's does the same to an image: resize, rescale, normalise.
     processor = transformers.ViTImageProcessorPil.from_pretrained(folder, local_files_only=True)
     return Sam2Propagator(model, processor, transformers.Sam2VideoInferenceSession, torch, device)

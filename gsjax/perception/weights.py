@@ -5,6 +5,8 @@ code when they are read.
 import json
 import os
 import shlex
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -20,8 +22,8 @@ _CONVERT = (
 )
 LOCAL_FILES = {"local_files_only": True, "trust_remote_code": False}
 """Options for transformers to load anything; by default it would ask whether to run code in the folder."""
-LOCAL_WEIGHTS = LOCAL_FILES | {"use_safetensors": True}
-"""Options with which transformers loads a model."""
+LOCAL_WEIGHTS = LOCAL_FILES | {"use_safetensors": True, "dtype": "auto"}
+"""Options with which transformers loads a model, in the precision of its files."""
 PROCESSOR = "preprocessor_config.json|processor_config.json"
 """The file that specifies how images are resized and normalised, under either of its names."""
 
@@ -60,6 +62,39 @@ def model_folder(path: str | os.PathLike, model: str, others: tuple[str, ...], e
         raise FileNotFoundError(f"{folder}: expected {model}; it lacks {lacking}, found {names}. {advice}")
     _check_no_pickles(folder)
     return folder
+
+
+def model_type(folder: Path) -> Any:
+    """The kind of model that a folder's configuration names; None where it names none."""
+    return _read_json(folder / _CONFIG).get("model_type")
+
+
+def load_model(transformers: ModuleType, kind: str, folder: Path, device: str, *, half: bool = False) -> Any:
+    """A model, ready for inference.
+
+    Args:
+        transformers: the module.
+        kind: the name of its class.
+        folder: from `model_folder`.
+        device: device of torch.
+        half: compute with weights of half precision as they are, except on a CPU, which is slower with them;
+            the caller gives inputs of the model's `dtype`. Otherwise in single precision.
+    """
+    with _without_bars(transformers.utils.logging):
+        model = getattr(transformers, kind).from_pretrained(folder, **LOCAL_WEIGHTS).eval()
+    return (model if half and device != "cpu" else model.float()).to(device)
+
+
+@contextmanager
+def _without_bars(logging: Any) -> Iterator[None]:
+    """No progress bars of transformers, which would mix with a command's own."""
+    shown = logging.is_progress_bar_enabled()
+    logging.disable_progress_bar()
+    try:
+        yield
+    finally:
+        if shown:
+            logging.enable_progress_bar()
 
 
 def image_processor(transformers: ModuleType, folder: Path) -> Any:

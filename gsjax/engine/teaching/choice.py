@@ -25,10 +25,10 @@ class TeacherOptions(SamWeights, ClipWeights):
 
     features: str = "auto"
     """Features to learn: classes (a code for each class of the mask files), closed (colour and outline of
-    each mask; no foundation model), clip or maskclip (with --weights), or a folder of feature files
-    (LangSplat's, Feature-3DGS's, LERF's, .npy, .npz; named like the pictures, or by frame number). auto:
-    classes if there are mask files, else closed. gsjax deform also accepts none, and its auto means none if
-    fewer than two mask classes are left to learn (tools are left out by default)."""
+    each mask; no foundation model), clip or maskclip (with --weights; for clip also SigLIP's), or a folder of
+    feature files (LangSplat's, Feature-3DGS's, LERF's, .npy, .npz; named like the pictures, or by frame
+    number). auto: classes if there are mask files, else closed. gsjax deform also accepts none, and its auto
+    means none if fewer than two mask classes are left to learn (tools are left out by default)."""
     masks: Masks = "auto"
     """Source of the masks: the recording's own files, or a segmenter without weights. auto: the
     files, or the segmenter if there are none."""

@@ -14,7 +14,7 @@ KINDS = ("classes", "closed", "clip", "maskclip")
 ABOUT = {
     "classes": "a code for each class: a stand-in for a model of language, which knows the labels' names",
     "closed": "colour and outline of each mask (a closed vocabulary; no foundation model)",
-    "clip": "CLIP's vector of each mask's crop",
+    "clip": "CLIP's, or SigLIP's, vector of each mask's crop",
     "maskclip": "CLIP's vectors of patches (MaskCLIP)",
     "files": "features from files",
 }

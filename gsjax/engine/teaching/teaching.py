@@ -84,6 +84,7 @@ class Teaching:
         self._dimension: int | None = None  # of the features that teach, once they are known
         # What may be missing comes first, and then what takes long.
         clip, weights = (None, "") if choice.weights is None else _clip(choice.weights)
+        self._patches = _patches(clip) if "maskclip" in (choice.features, choice.second) else None
         reads = choice.masks != "segment" and choice.sam is None
         reads &= choice.masks == "files" or choice.features in ("auto", *_OF_OBJECTS)
         files = reads and any(photographs.labels(i) is not None for i in indices)
@@ -231,9 +232,7 @@ class Teaching:
         self, indices: Sequence[int], views: list[list[_View]] | None, console: Console
     ) -> Teacher:
         """MaskCLIP's maps; masks, if any, define which pixels form one object."""
-        from gsjax.perception.maskclip import MaskClipEncoder
-
-        encoder, maps = MaskClipEncoder(self._encoder), []
+        encoder, maps = self._patches, []
         for i in track(indices, "patches", console=console, transient=True):
             image = self._photographs.image(i)
             output = self._cache(
@@ -305,6 +304,13 @@ def _clip(weights: Path) -> tuple[LanguageEncoder, str]:
         return load_clip(weights), folder_digest(weights)
     except OSError as error:
         raise ValueError(f"--weights: {error}") from error
+
+
+def _patches(clip: Any) -> Callable[[np.ndarray], np.ndarray]:
+    """The encoder of patches."""
+    from gsjax.perception.maskclip import MaskClipEncoder
+
+    return MaskClipEncoder(clip)
 
 
 def _segmenter(choice: TeacherChoice, masks: str) -> tuple[Callable[..., np.ndarray] | None, str]:
