@@ -8,7 +8,7 @@ RUN := runs/demo
 DEMO := "simulated:tabletop?width=240&height=180"
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-all test-floors bench gallery notebooks docs lint dist clean
+.PHONY: help demo test test-thorough test-all test-floors bench gallery notebooks docs lint dist clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-11s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -22,10 +22,13 @@ demo: $(VENV)/installed ## track the built-in scene from nothing to a report
 # of its tests compiled serves the next.
 PYTEST := $(BIN)/python -m pytest -n auto --maxprocesses=2 --dist=loadfile --durations=30 --durations-min=5
 
-test: $(VENV)/installed-test ## the tests; slow ones left out
-	$(PYTEST)
+test: $(VENV)/installed-test ## the quick tests, within ten minutes
+	$(PYTEST) -m "not thorough and not slow"
 
-test-all: $(VENV)/installed-test ## every test, the slow ones too
+test-thorough: $(VENV)/installed-test ## what takes seconds a test; with the quick ones, what every change must pass
+	$(PYTEST) -m "thorough and not slow"
+
+test-all: $(VENV)/installed-test ## every test, those of minutes too, on programs that XLA optimises
 	XLA_FLAGS= $(PYTEST) -m "slow or not slow" --cov=gsjax --cov-report=term
 
 # Of the tests those that touch every dependency and are quick. Some floors have no wheel for a newer Python.

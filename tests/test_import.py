@@ -29,12 +29,14 @@ def test_gsjax_alone_loads_nothing_else():
     assert not loaded("import gsjax") & (OPTIONAL | LATE | {"jax", "numpy", "scipy", "cv2", "equinox"})
 
 
+@pytest.mark.thorough
 def test_the_public_names_need_no_extra():
     found = loaded("import gsjax\nfor name in gsjax.__all__: getattr(gsjax, name)")
     assert {"jax", "equinox"} <= found
     assert not found & (OPTIONAL | LATE)
 
 
+@pytest.mark.thorough
 def test_the_rasterizer_needs_no_files_and_no_solver():
     found = loaded("import gsjax\ngsjax.rasterization, gsjax.Gaussians, gsjax.render")
     assert not found & (OPTIONAL | LATE | {"cv2", "optax", "optimistix"})
@@ -70,6 +72,7 @@ jax.distributed.initialize(f"localhost:{port}", 1, 0)
 """
 
 
+@pytest.mark.thorough
 def test_no_module_starts_the_backend_of_jax():
     """What configures it, such as `jax.distributed.initialize`, may follow an import."""
     files = [file.relative_to(ROOT).with_suffix("") for file in (ROOT / "gsjax").rglob("*.py")]
@@ -78,6 +81,7 @@ def test_no_module_starts_the_backend_of_jax():
     assert done.returncode == 0, done.stderr
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("backend", ["module://nowhere.backend_inline", "nonsense", "qtagg", "absent", "AGG"])
 def test_plots_need_no_backend_of_matplotlib(backend, tmp_path):
     """A notebook hands its own to the programs that it starts, and it need not be there."""
@@ -100,6 +104,7 @@ def test_plots_need_no_backend_of_matplotlib(backend, tmp_path):
     assert (used.lower() == backend.lower()) == (backend in there)
 
 
+@pytest.mark.thorough
 def test_what_is_told_to_install_is_there():
     """Each `extras.load(module, extra, ...)` names an extra that asks for the module's package."""
     asked = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]

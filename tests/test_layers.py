@@ -99,6 +99,7 @@ def test_files_import_only_from_layers_above_their_own():
     assert not violations(PACKAGE), "\n" + "\n".join(violations(PACKAGE))
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("folder", BELOW_COMMANDS)
 def test_experiments_and_benchmarks_stand_on_the_engine(folder):
     assert not leaning_on_commands(ROOT / folder), "\n" + "\n".join(leaning_on_commands(ROOT / folder))

@@ -46,6 +46,7 @@ def test_options_of_the_suite_are_not_those_of_starts(options, says, tmp_path, c
     assert says in " ".join(capfd.readouterr().err.split())
 
 
+@pytest.mark.thorough
 def test_a_viewer_ends_with_its_page_and_is_recorded(monkeypatch, tmp_path):
     one = (jnp.zeros((1, 3)), jnp.eye(1, 4), jnp.zeros((1, 3)), jnp.zeros(1), jnp.zeros((1, 1, 3)))
     write_ply(tmp_path / "scene.ply", Gaussians(*one))

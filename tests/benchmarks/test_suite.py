@@ -183,6 +183,7 @@ def test_a_noisy_workload_is_measured_again(measured):
     assert not any(row.noisy for row in measured.rows)
 
 
+@pytest.mark.thorough
 def test_every_program_is_measured(measured):
     rows = {row.program: row for row in measured.rows}
     forward, backward = (rows[name] for name in ("forward", "forward+backward"))
@@ -210,6 +211,7 @@ def forward_only(monkeypatch):
     monkeypatch.setattr(measuring, "make_programs", programs)
 
 
+@pytest.mark.thorough
 @pytest.mark.usefixtures("forward_only")
 def test_what_does_not_fit_into_memory_is_not_run(monkeypatch):
     monkeypatch.setattr(measuring, "available_bytes", lambda: 1)

@@ -70,11 +70,13 @@ def test_folder_of_several_sequences(refused, tmp_path):
     assert "expected the frames of one sequence, found the sequences seq-01. Pass one of them" in said
 
 
+@pytest.mark.thorough
 def test_missing_image(refused, recording):
     (recording / "ims" / "1" / "000002.png").unlink()
     assert "000002.png: expected images of all 3 cameras in frame 2" in refused(recording)
 
 
+@pytest.mark.thorough
 def test_one_mask_is_enough(sound, recording, still):
     for file in (recording / "seg").rglob("*.png"):
         if file.parent.name != "1" or file.stem != "000000":
@@ -177,6 +179,7 @@ def test_out_cannot_be_written(refused, pristine, tmp_path):
     assert str(parent) in refused(pristine, "--out", str(parent / "run"))
 
 
+@pytest.mark.thorough
 def test_a_bad_frame_in_the_middle_keeps_what_came_before(gsjax_track, recording, tmp_path, still):
     (recording / "depth" / "0" / "000002.png").write_bytes(b"nonsense")
     code, said = gsjax_track(recording, "--cameras", "0", "--frames", "0:4")
@@ -222,6 +225,7 @@ def test_pixels_that_are_not_finite(sound, pristine, still, monkeypatch):
     assert found["cameras"]["0"]["psnr"] > 10
 
 
+@pytest.mark.thorough
 def test_one_frame_only(sound, pristine, tmp_path, still):
     said, found = sound(pristine, "--frames", "2:3", "--eval-cameras", "2")
     assert "(1 of 1 requested)" in said
@@ -240,6 +244,7 @@ def test_no_depth_and_no_shapes(refused, recording):
     assert "depth" in refused(recording)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("frame", [0, pytest.param(2, marks=pytest.mark.slow)])
 def test_a_bad_held_out_image_keeps_the_run_and_its_report(gsjax_track, recording, tmp_path, still, frame):
     (recording / "ims" / "2" / f"{frame:06d}.png").write_bytes(b"nonsense")

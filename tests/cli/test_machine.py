@@ -45,6 +45,7 @@ print(cores, len(pool) > 0, all(os.sched_getaffinity(t) == {max(before)} for t i
 """
 
 
+@pytest.mark.thorough
 @needs_affinity
 def test_threads_run_on_the_cores_that_are_kept_to_those_of_jax_too():
     """Importing a command must not have started JAX's yet."""
@@ -52,6 +53,7 @@ def test_threads_run_on_the_cores_that_are_kept_to_those_of_jax_too():
     assert said.stdout.split() == ["1", "True", "True"]
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     "variable", ["JAX_PLATFORMS", pytest.param("JAX_PLATFORM_NAME", marks=pytest.mark.slow)]
 )

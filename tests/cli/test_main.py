@@ -47,6 +47,7 @@ def test_unknown_command(say):
     assert "no command 'xyz'; there are: info, poses, " in say("xyz")[2]
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("arguments", [["--version"], ["track", "--help"]])
 def test_it_ends_quietly_where_nobody_reads(arguments):
     reads, writes = os.pipe()

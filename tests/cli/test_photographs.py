@@ -12,6 +12,7 @@ RECORDING = "simulated:tabletop?width=32&height=24&frames=4"  # cameras 0, 1 and
 NINE = "simulated:tabletop?width=32&height=24&frames=3"
 
 
+@pytest.mark.thorough
 def test_frames_and_cameras_of_a_recording():
     every = choose_photographs(RECORDING)
     assert every.num == 12
@@ -37,6 +38,7 @@ def test_some_of_photographs(photographs):
         choose_photographs(str(photographs), frames="9:")
 
 
+@pytest.mark.thorough
 def test_those_of_a_run_are_found_by_its_settings():
     settings = {"dataset": RECORDING, "scale": 0.5, "read": {"K": None}, "frames": "1:2", "cameras": [2]}
     found = photographs_of_run(settings)
@@ -50,6 +52,7 @@ def test_those_of_a_run_are_found_by_its_settings():
         photographs_of_run({"scale": 1.0})
 
 
+@pytest.mark.thorough
 def test_what_is_held_out_is_as_the_data_says_or_every_so_manieth():
     nine = choose_photographs(NINE)
     chosen, held_out = split(nine, 4)

@@ -47,6 +47,7 @@ def say(capfd):
     return call
 
 
+@pytest.mark.thorough
 def test_cameras_are_where_the_pictures_were_drawn_from(found):
     scene = open_photographs(found)
     assert scene.names == tuple(f"{i}.png" for i in range(COUNT))
@@ -73,6 +74,7 @@ def test_the_report_says_what_was_found_and_what_was_left(found):
     assert len(list((found / "images").iterdir())) == COUNT + 1
 
 
+@pytest.mark.thorough
 def test_again_gives_the_same_bits_and_compares(found, photographs, say, tmp_path):
     """In place this time: the photographs stay where they are."""
     folder = tmp_path / "mine/images"
@@ -112,6 +114,7 @@ def test_a_video(say, tmp_path):
     assert aligned.moved.max() < 0.02 * aligned.extent
 
 
+@pytest.mark.thorough
 def test_pictures_in_formats_that_colmap_lacks(say, photographs, tmp_path):
     """They are read as any other, whatever their extension, and come out as they went in."""
     folder, out = tmp_path / "photos", tmp_path / "out"

@@ -20,6 +20,7 @@ def shell(line: str, **environment: str) -> subprocess.CompletedProcess:
 CLOSED = "<&- >&- 2>&-"
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("streams", [">&-", "2>&-", CLOSED, "1</dev/null", f"{CLOSED}; info '{FEW}'"])
 def test_closed_streams_change_nothing(streams):
     streams, _, command = streams.partition("; ")
@@ -27,11 +28,13 @@ def test_closed_streams_change_nothing(streams):
     assert (done.returncode, done.stderr) == (0, "")
 
 
+@pytest.mark.thorough
 def test_a_reader_may_go_away():
     done = shell(f"{GSJAX} info '{FEW}' | true; echo ${{PIPESTATUS[0]}}")
     assert (done.stdout, done.stderr) == ("0\n", "")
 
 
+@pytest.mark.thorough
 @pytest.mark.skipif(not os.path.exists("/dev/full"), reason="no disk that is always full")
 def test_a_full_disk_is_told_and_ends_nothing():
     done = shell(f"{GSJAX} info '{FEW}' > /dev/full")
@@ -40,6 +43,7 @@ def test_a_full_disk_is_told_and_ends_nothing():
     assert shell(f"{GSJAX} info '{FEW}' 2> /dev/full").returncode == 0
 
 
+@pytest.mark.thorough
 def test_errors_keep_their_exit_code_where_nobody_hears_them():
     assert shell(f"{GSJAX} infoo 2>&-").returncode == 2
     assert shell(f"{GSJAX} info nowhere >&- 2>&-").returncode == 2
@@ -58,6 +62,7 @@ def test_a_file_does_not_get_the_number_of_a_closed_stream():
     assert int(done.stdout) > 2
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     "environment",
     [

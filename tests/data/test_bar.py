@@ -69,6 +69,7 @@ def test_flow_agrees_with_tracks(scene, t, c):
     assert error.max() < 0.15
 
 
+@pytest.mark.thorough
 def test_the_pattern_sticks_to_the_bar(scene):
     """Brightness moves with the flow, which explains it far better than no motion."""
     t, c = 12, 1

@@ -35,6 +35,7 @@ def folder(tmp_path):
     return Folder(tmp_path / "test/000007")
 
 
+@pytest.mark.thorough
 def test_a_scene_is_read_as_it_was_written(folder):
     read, scene = open_sequence(folder.root), simulated()
     assert (read.name, read.camera_ids, read.frame_ids) == ("test_000007", (0,), (0, 1, 2))

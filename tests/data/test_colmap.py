@@ -159,6 +159,7 @@ def test_points_may_be_missing_or_none(tmp_path, form):
         read_colmap(tmp_path)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("name", ["cameras", "images", "points3D"])
 def test_binary_files_that_are_cut_off_anywhere(tmp_path, name):
     build(tmp_path)

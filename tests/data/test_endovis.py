@@ -229,6 +229,7 @@ def test_labels_must_be_instruments_or_parts(folder):
         _find_labels(folder, [], (1, 1), "tools")  # type checkers reject it, as do annotations under test
 
 
+@pytest.mark.thorough
 def test_it_is_recognised_and_a_folder_of_several_is_refused(folder):
     with warnings.catch_warnings():
         warnings.simplefilter("error")

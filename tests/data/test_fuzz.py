@@ -12,6 +12,7 @@ CASES = 100  # of a reader; of slow ones, a share
 SEED = 7
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("name", READERS)
 def test_what_is_damaged_is_read_or_refused_in_a_sentence(name, tmp_path):
     if needs := READERS[name].needs:
@@ -21,6 +22,7 @@ def test_what_is_damaged_is_read_or_refused_in_a_sentence(name, tmp_path):
     assert "refused" in {case.outcome for case in cases}
 
 
+@pytest.mark.thorough
 def test_a_case_is_made_from_its_number_alone():
     content = b'{"a": {"b": [1, 2]}, "c": 3}'
     numbers = range(3000)

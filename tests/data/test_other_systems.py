@@ -31,6 +31,7 @@ def read_silently(read, root):
         read(root)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16", "utf-16-le", "utf-32"])
 def test_text_in_any_encoding_with_any_line_ends(layout, encoding):
     root, read = layout
@@ -41,6 +42,7 @@ def test_text_in_any_encoding_with_any_line_ends(layout, encoding):
     read_silently(read, root)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("trailer", TRAILERS)
 def test_pictures_with_bytes_behind_their_end(layout, trailer):
     root, read = layout
@@ -51,6 +53,7 @@ def test_pictures_with_bytes_behind_their_end(layout, trailer):
     read_silently(read, root)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("layout", ["nerfstudio", "TUM RGB-D", "Panoptic"], indirect=True)
 def test_names_with_backslashes(layout):
     root, read = layout

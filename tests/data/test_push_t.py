@@ -200,6 +200,7 @@ def test_the_recording(recording):
     assert recording.image(0, 2).shape == (270, 480, 3)
 
 
+@pytest.mark.thorough
 def test_seeking_finds_the_same_images_as_reading_on(recording, shared_data):
     in_order = [recording.image(t, 0) for t in range(395, 402)]
     fresh = read_push_t(shared_data / "push_t")
@@ -226,6 +227,7 @@ def test_a_folder_without_models_is_enough(recording, shared_data, tmp_path):
     np.testing.assert_array_equal(sequence.image(3, 1), recording.image(3, 1))
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("changes", "says"),
     [

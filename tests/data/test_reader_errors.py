@@ -155,6 +155,7 @@ def _skip_without_package_of(layout: str) -> None:
         pytest.importorskip(NEEDS[layout])
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("layout", LAYOUTS)
 def test_sound_data_raises_no_warnings(layout):
     _skip_without_package_of(layout)
@@ -163,6 +164,7 @@ def test_sound_data_raises_no_warnings(layout):
         LAYOUTS[layout].read(_sound(layout))
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("layout", "fault"), [pytest.param(*case, id=f"{case[0]}-{case[1].what}") for case in CASES]
 )
@@ -178,6 +180,7 @@ def test_messages_name_the_file_and_say_what_to_do(layout, fault, tmp_path):
         assert "left out" in message or re.search(r"[.;?] .*\b(give|set) ", message), message
 
 
+@pytest.mark.thorough
 def test_the_page_and_the_messages_are_up_to_date(tmp_path):
     for layout in NEEDS:
         _skip_without_package_of(layout)

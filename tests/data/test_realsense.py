@@ -23,6 +23,7 @@ def write(tmp_path):
     return lambda messages: messages.write(tmp_path / "desk.bag")
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("marked", [True, False])
 @pytest.mark.parametrize("compressed", [True, False])
 def test_a_recording_is_read_as_it_was(tmp_path, marked, compressed):
@@ -142,6 +143,7 @@ def encoded(name, encoding, pixel=(1, 2)):
     return lambda m: m.images(name, encoding, [(0.03, np.tile(np.uint8(pixel), (24, 32, 1)))], unit=0.001)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("damage", "says"),
     [
@@ -181,6 +183,7 @@ def test_what_is_missing_or_not_read_is_named(messages, write, damage, says):
         read_realsense(path)
 
 
+@pytest.mark.thorough
 def test_damaged_files_are_refused(messages, write):
     path = write(messages)
     content = path.read_bytes()

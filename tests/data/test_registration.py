@@ -3,6 +3,7 @@
 import tracemalloc
 
 import numpy as np
+import pytest
 
 from gsjax.data import registration
 from gsjax.data.registration import registered
@@ -21,6 +22,7 @@ def test_bands_of_rows_change_nothing(monkeypatch):
     assert (whole > 0).any()
 
 
+@pytest.mark.thorough
 def test_memory_is_bounded_whatever_the_ratio_of_focal_lengths():
     """256 points of each pixel are 31 million points."""
     depth = np.ones((300, 400), np.float32)

@@ -36,6 +36,7 @@ def test_it_is_as_documented(scene):
     assert scene.image(0, 0).std() > 20
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("seed", [0, 1, *(pytest.param(seed, marks=SLOW) for seed in range(2, 8))])
 @pytest.mark.parametrize("option", [None, "hide"])
 def test_objects_move_as_far_as_promised(seed, option):
@@ -156,6 +157,7 @@ def test_the_can_leaves_all_views(seed):
     assert seen == [[True] * 3, [False] * 3]
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=SLOW) for seed in (1, 2))])
 def test_the_can_is_hidden_and_comes_back(seed):
     sequence = tabletop(seed=seed, frames=60, width=160, height=120, hide=True)

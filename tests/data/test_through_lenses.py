@@ -70,6 +70,7 @@ def test_depth_along_the_axis_becomes_distance(folder):
     assert not distances[looks[..., 2] <= 0].any()
 
 
+@pytest.mark.thorough
 def test_points_appear_where_they_were_seen_and_where_the_rasterizer_draws_them(folder):
     """Points from depth return to their pixels, by the host's camera and by the rasterizer's."""
     photographs = open_photographs(folder(), KEPT)

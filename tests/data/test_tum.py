@@ -223,6 +223,7 @@ def test_the_published_intrinsics_hold_for_one_size(tmp_path):
         folder.read()
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(("name", "focal"), [("freiburg1", 517.3), ("freiburg2", 520.9), ("fr1", 517.3)])
 def test_lenses_are_undistorted_as_by_opencv(tmp_path, name, focal):
     folder = Folder(tmp_path / f"rgbd_dataset_{name}_xyz")
@@ -246,6 +247,7 @@ def test_lenses_are_undistorted_as_by_opencv(tmp_path, name, focal):
     assert (sequence.depth(0, 0)[0, 0] == 0) == dark[0, 0]
 
 
+@pytest.mark.thorough
 def test_beyond_the_photograph_is_black_and_without_depth(tmp_path):
     folder = Folder(tmp_path / "own", size=(64, 48))
     for t in range(FRAMES):

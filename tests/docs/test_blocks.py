@@ -58,12 +58,14 @@ PROGRAMS = [
 ]
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("page", PROGRAMS)
 def test_the_programs_of_a_page_run_one_after_another(page, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert run_programs(page)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("page", PAGES)
 def test_what_is_not_python_is_understood(page):
     for block in blocks(page):
@@ -95,6 +97,7 @@ OTHERS = {"--help", "--stride", "--xla", "--no-deps", "--nthreads"}
 """Options of scripts, XLA, pip and Dask that pages name."""
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("page", PAGES)
 def test_options_and_experiments_that_are_named_in_passing_exist(page, flags):
     text = re.sub(r"```.*?```", "", (ROOT / page).read_text(encoding="utf-8"), flags=re.DOTALL)

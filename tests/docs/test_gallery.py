@@ -18,6 +18,7 @@ def gallery():
     return module
 
 
+@pytest.mark.thorough
 def test_what_it_runs_has_options_that_exist(gallery):
     for command in gallery.COMMANDS.values():
         check_command(["gsjax", *shlex.split(command)])
@@ -60,6 +61,7 @@ def test_a_video_becomes_a_film_that_moves(gallery, tmp_path):
         assert (film.n_frames, film.size) == (4, (480, 29))
 
 
+@pytest.mark.thorough
 def test_trades_are_those_of_the_committed_results(gallery, tmp_path):
     for trade, found in zip(gallery.TRADES, gallery.points(), strict=True):
         costs, gains, first = (np.array(column) for column in zip(*found, strict=True))

@@ -50,6 +50,7 @@ def test_it_was_run_in_full_and_shows_what_came_out(name):
     assert "/" + "work/" not in text  # no path of a machine
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     "name",
     ["fit", *(pytest.param(name, marks=pytest.mark.slow) for name in ("track", "parts"))],

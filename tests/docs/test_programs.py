@@ -74,6 +74,7 @@ def test_all_use_the_same_words(verb):
     assert re.search(loop, text, re.MULTILINE), text
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("verb", VERBS)
 def test_it_runs(verb, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)

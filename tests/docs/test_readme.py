@@ -3,6 +3,7 @@
 import re
 
 import jax.numpy as jnp
+import pytest
 
 from tests.docs.blocks import ROOT, programs
 
@@ -18,6 +19,7 @@ def test_it_is_short_and_its_picture_is_there():
         assert 0 < (ROOT / picture).stat().st_size < 400_000
 
 
+@pytest.mark.thorough
 def test_its_programs_run_one_after_the_other(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     first, second = (program.text for program in programs("README.md"))

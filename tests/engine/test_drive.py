@@ -187,6 +187,7 @@ def test_ctrl_c_waits_for_the_end_of_a_step():
     np.testing.assert_array_equal(last.result, list(walked())[-1].result)
 
 
+@pytest.mark.thorough
 def test_a_fit_is_saved_and_loaded_without_a_template(tmp_path):
     method, problem, run = fit_problem(replace(FIT, steps=3, exposure=True, refine_poses=True))
     *_, now = drive(method, problem, run)

@@ -111,6 +111,7 @@ def assert_same(new, old):
     jax.tree.map(lambda a, b: np.testing.assert_array_equal(np.asarray(a), np.asarray(b)), new, old)
 
 
+@pytest.mark.thorough
 def test_params_and_state_keep_their_form_and_info_has_its_names(name):
     case = case_of(name)
     state = state_of(name)
@@ -147,6 +148,7 @@ def test_where_a_plan_is_too_small_nothing_changes_and_what_is_needed_is_told(na
     assert any(jax.tree.leaves(more))
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     "name",
     [pytest.param(name, marks=() if name in ("fit", "track") else pytest.mark.slow) for name in CASES],

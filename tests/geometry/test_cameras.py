@@ -84,6 +84,7 @@ def test_perturbed_cameras_are_rotated_about_their_own_centres_and_shifted():
     np.testing.assert_allclose(found[:, :3, :3], viewmats[:, :3, :3] @ turn.T, atol=1e-12)
 
 
+@pytest.mark.thorough
 @pytest.mark.usefixtures("x64")
 def test_derivatives_of_perturbed_cameras_are_those_of_finite_differences():
     viewmat, K = jnp.asarray(look_at(EYE, TARGET))[None], jnp.asarray(SKEWED, jnp.float64)

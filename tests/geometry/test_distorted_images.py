@@ -159,6 +159,7 @@ def test_a_distorted_image_shows_what_opencv_projects(lens):
     np.testing.assert_allclose(warped, scene(seen), atol=2e-3)
 
 
+@pytest.mark.thorough
 @x64
 def test_derivatives_of_a_distorted_image():
     model, coeffs = lens_of("5")
@@ -201,6 +202,7 @@ def scene_and_plan(means, sigma, seed=0, **options):
     return scene | {"colors": jnp.asarray(np.float32(rng.uniform(size=(n, 3))))}, p
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("lens", ["4", "fisheye"])
 def test_a_gaussian_is_seen_where_opencv_projects_its_centre(lens):
     model, coeffs = lens_of(lens, np.float32)

@@ -59,6 +59,7 @@ def test_zero_coefficients_are_the_identity_to_the_bit(num):
     assert np.asarray(back.valid).all()
 
 
+@pytest.mark.thorough
 @x64
 @pytest.mark.parametrize("lens", ["8", "fisheye"])
 def test_derivatives_of_points(lens):
@@ -69,6 +70,7 @@ def test_derivatives_of_points(lens):
     check_derivatives(lambda p, c: undistort(p, c, model).points, (bent, coeffs))
 
 
+@pytest.mark.thorough
 @x64
 @two_lenses
 def test_the_derivative_of_the_inverse_is_the_inverse_derivative(lens):

@@ -147,6 +147,7 @@ def test_what_hardly_moves_is_fixed():
     assert 0.5 < found.confidence <= 1
 
 
+@pytest.mark.thorough
 @given(seeds)
 def test_what_slides_and_turns_is_free(seed):
     rng = np.random.default_rng(seed)

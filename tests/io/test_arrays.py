@@ -72,6 +72,7 @@ def test_what_is_whole_is_read(tmp_path):
         load_arrays(tmp_path / "none.npy")
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("parse", [parse_json, parse_yaml])
 @pytest.mark.parametrize("text", ["[" * 100_000, "9" * 5000, '{"a": ', '"' + "x" * 100_000])
 def test_text_that_is_too_deep_or_too_long(parse, text):

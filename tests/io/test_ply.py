@@ -44,6 +44,7 @@ def assert_same(a, b):
             np.testing.assert_array_equal(left, right, err_msg=name)
 
 
+@pytest.mark.thorough
 @settings(max_examples=25, deadline=None)
 @given(
     count=st.integers(0, 20), degree=st.integers(0, 3), features=st.integers(0, 4), seed=st.integers(0, 2**31)

@@ -37,6 +37,7 @@ def test_what_is_written_is_read_back(tmp_path, ending, degree):
     assert_alike(scene, back, ROUNDING[ending])
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("ending", READ_BACK)
 @settings(max_examples=8, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(count=st.integers(1, 600), seed=st.integers(0, 99), degree=st.integers(0, 3))

@@ -52,6 +52,7 @@ def test_edges_are_those_of_loops_over_nodes(seed):
     assert listed(across) == alike[1]
 
 
+@pytest.mark.thorough
 @pytest.mark.usefixtures("x64")
 def test_temporal_edges_find_the_order_in_which_nodes_come():
     random = np.random.default_rng(0)
@@ -65,6 +66,7 @@ def test_temporal_edges_find_the_order_in_which_nodes_come():
     assert not edges.valid[0, :, 1].any()  # there is no frame before the first
 
 
+@pytest.mark.thorough
 def test_there_are_fewer_edges_than_requested_if_there_are_fewer_nodes():
     inputs = arrays(case(0))
     few = inputs["positions"][:, :3]
@@ -88,6 +90,7 @@ def test_all_edges_are_all_pairs():
     assert listed(all_edges(jnp.asarray(valid), 1)) == want
 
 
+@pytest.mark.thorough
 @pytest.mark.usefixtures("x64")
 @given(SEEDS)
 def test_weights_and_affinities_are_those_of_each_edge(seed):

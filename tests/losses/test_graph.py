@@ -24,6 +24,7 @@ from tests.losses.graphs import (
 )
 
 
+@pytest.mark.thorough
 @pytest.mark.usefixtures("x64")
 @given(SEEDS)
 def test_losses_are_means_over_nodes_and_edges(seed):
@@ -100,6 +101,7 @@ def test_features_equal_to_the_teachers_have_no_loss_and_teacher_and_graph_no_gr
         np.testing.assert_array_equal(slope, 0)
 
 
+@pytest.mark.thorough
 @pytest.mark.usefixtures("x64")
 @pytest.mark.parametrize("derivative", ["unrolled", "implicit"])
 def test_slopes_are_those_of_central_differences_and_jvp_agrees_with_vjp(derivative):
@@ -166,6 +168,7 @@ def extreme(name: str):
     return inputs
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("name", ["no features", "features all alike", "one node", "no nodes"])
 def test_in_degenerate_cases_losses_are_zero_with_zero_gradient(name):
     inputs = extreme(name)
@@ -227,6 +230,7 @@ def test_a_teachers_projection_is_orthonormal_and_differs_between_keys(channels,
     assert np.abs(one - other).max() > 0.1
 
 
+@pytest.mark.thorough
 def test_a_batch_is_a_loop():
     many = [single(case(i)) for i in (1, 2)]
     stacked = jax.tree.map(lambda *a: np.stack(a), *many)

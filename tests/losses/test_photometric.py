@@ -84,6 +84,7 @@ def test_photometric_loss_mixes_l1_and_dssim():
     np.testing.assert_allclose(photometric_loss(image, target, 0.0), l1_loss(image, target), rtol=1e-5)
 
 
+@pytest.mark.thorough
 @pytest.mark.usefixtures("x64")
 @pytest.mark.parametrize("loss", [l1_loss, ssim, photometric_loss], ids=lambda f: f.__name__)
 def test_gradients_are_those_of_central_differences(loss):
@@ -102,6 +103,7 @@ def test_gradients_are_those_of_central_differences(loss):
         np.testing.assert_allclose(jax.jvp(loss, both, tuple(change))[1], slope, rtol=1e-9, atol=1e-12)
 
 
+@pytest.mark.thorough
 def test_ssim_is_the_same_under_jit_and_vmap():
     image, target = map(jnp.asarray, images(4, (3, 14, 15, 3)))
     together = jax.jit(jax.vmap(ssim))(image[:, None], target[:, None])

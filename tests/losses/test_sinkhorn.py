@@ -158,6 +158,7 @@ EXTREMES = {
 }
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("name", EXTREMES)
 def test_the_matching_and_its_gradients_are_finite_whatever_the_scores(name):
     scores = np.float32(EXTREMES[name])
@@ -227,6 +228,7 @@ def test_slopes_are_those_of_central_differences_and_jvp_agrees_with_vjp(derivat
             assert np.abs(slope).max() > 1e-4
 
 
+@pytest.mark.thorough
 @pytest.mark.usefixtures("x64")
 def test_the_implicit_gradient_is_the_unrolled_one_up_to_the_error_of_row_sums():
     inputs, weights = (scores_of(1), np.array(0.3)), scores_of(2)
@@ -275,6 +277,7 @@ def test_a_batch_is_a_loop(derivative):
 # -- other implementations -----------------------------------------------------------------------------------
 
 
+@pytest.mark.thorough
 @pytest.mark.usefixtures("x64")
 def test_it_agrees_with_ott():
     from ott.geometry.geometry import Geometry
@@ -303,6 +306,7 @@ def test_it_agrees_with_ott():
 # -- mistakes ------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("options", "says"),
     [

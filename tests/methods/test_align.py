@@ -34,6 +34,7 @@ def without_depth(sight):
     return sight._replace(pixels=sight.tones)
 
 
+@pytest.mark.thorough
 def test_a_known_motion_is_found_and_agrees_better(moved):
     points, center, sight, then, _ = moved
     before = error(points, np.asarray(points.means), then)
@@ -97,6 +98,7 @@ def test_gradients_of_residuals_are_those_of_finite_differences(moved, depth):
         assert close.mean() > 0.9
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("depth", [True, False])
 def test_normal_equations_are_those_of_differentiation(moved, depth):
     """J^T W J and J^T W r, put together by hand, against the Jacobian that forward mode has."""
@@ -119,6 +121,7 @@ def test_normal_equations_are_those_of_differentiation(moved, depth):
     np.testing.assert_allclose(fit.gradient, expected, rtol=1e-3, atol=1e-3 * np.abs(expected).max())
 
 
+@pytest.mark.thorough
 def test_many_starts_at_once_are_each_alone(moved):
     points, center, sight, _, _ = moved
     starts = np.float32(0.004 * np.random.default_rng(0).normal(size=(3, 6)))
@@ -134,6 +137,7 @@ def test_a_ball_grid_holds_the_origin_and_nothing_outside():
     assert len(grid) == 123
 
 
+@pytest.mark.thorough
 def test_turn_hypotheses_hold_the_start_and_turns_about_its_own_axes():
     twist = np.float32([0.1, 0.2, 0.3, 0.0, 0.0, 0.4])
     turned = jax.jit(turn_hypotheses, static_argnums=2)

@@ -141,6 +141,7 @@ ids_seen = jax.jit(seen_ids)
 
 
 class TestSeenIds:
+    @pytest.mark.thorough
     def test_they_are_those_of_the_pixels_that_show_a_place(self, small, table):
         sequence, _, _ = table()
         batch = small.batches[0]
@@ -235,6 +236,7 @@ def update_joined(joined):
 
 
 class TestStillAndMoving:
+    @pytest.mark.thorough
     def test_each_part_is_updated_as_by_its_step_alone(self, joined, update_joined):
         page = page_names("together")
         still, moving = (
@@ -252,6 +254,7 @@ class TestStillAndMoving:
             np.testing.assert_allclose(getattr(info["losses"], name), reported["loss"], rtol=1e-5)
         np.testing.assert_allclose(info["loss"], sum(info["losses"]), rtol=1e-6)
 
+    @pytest.mark.thorough
     def test_both_losses_go_down_in_one_compiled_program(self, joined, update_joined):
         params, losses = joined.params, []
         state = joined.step.init(params)
@@ -265,6 +268,7 @@ class TestStillAndMoving:
         assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(params))
         assert update_joined._cache_size() == 1
 
+    @pytest.mark.thorough
     def test_where_one_overflows_neither_is_updated(self, joined):
         params, batch = joined.params, joined.batch(0)
         tight = batch.moving._replace(plan=replace(batch.moving.plan, capacity=16))

@@ -139,6 +139,7 @@ def learned(frames, lesson):
 
 
 class TestLearning:
+    @pytest.mark.thorough
     def test_all_frames_get_better(self, learned):
         problem, run, first, infos = learned
         now = [sight(problem, run, i) for i in range(len(first))]
@@ -159,6 +160,7 @@ class TestLearning:
         assert next(i for i, info in enumerate(infos) if "planes" in info) == 8
         assert next(i for i, info in enumerate(infos) if "node" in info) == 8 + 35
 
+    @pytest.mark.thorough
     def test_depth_that_is_not_finite_is_unknown(self, frames):
         depths = frames[0].depths.copy()
         depths[0, 10, 10], depths[0, 11, 11] = np.nan, np.inf
@@ -168,6 +170,7 @@ class TestLearning:
         assert np.isfinite(info["loss"])
         assert not info["skipped"]
 
+    @pytest.mark.thorough
     def test_rates_decay_over_warm_up_and_joint_steps(self, frames):
         """The optimizer is new with the deformation; its schedule is not."""
         method = Deform(replace(CONFIG, warmup=3, iterations=3, schedule="cosine", warmup_frames="all"))
@@ -225,6 +228,7 @@ class TestLearning:
         with pytest.raises(ValueError, match="gaussians: expected at least one"):
             Deform(CONFIG).start(frames, gaussians=nowhere)
 
+    @pytest.mark.thorough
     def test_half_precision_is_learned_from_in_single(self, frames):
         """Adam divided 0 by 0 there, and every Gaussian was culled without a word."""
         given = start_gaussians(frames, 0, CONFIG.start_pixels)
@@ -248,6 +252,7 @@ def test_the_class_of_a_trained_scene_is_the_teachers(learned):
     assert (np.asarray(found)[:, 0] > 0.9).mean() > 0.8
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("smaller", [1, 2])
 def test_pixels_that_do_not_count_have_no_label(frames, smaller):
     """Else tissue behind a tool would learn the tool's features."""

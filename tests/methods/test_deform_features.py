@@ -117,6 +117,7 @@ class TestGraph:
         assert (np.asarray(slope)[nodes] != 0).any()
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("kind", ["all", "rows", "nodes"])
 @pytest.mark.parametrize("changes", [True, False])
 def test_features_of_some_at_times_are_those_of_the_scene_there(kind, changes):

@@ -46,6 +46,7 @@ def test_a_camera_that_looks_away_sees_none_of_it(frames):
     np.testing.assert_array_equal(with_plane_depths([frames[0], away], 0, 1.0)[1].depths, 0)
 
 
+@pytest.mark.thorough
 def test_a_scene_starts_there_from_the_first_frame_with_pixels_that_count(frames):
     hidden = np.zeros((1, 32, 40), bool)
     part = np.ones((1, 32, 40), bool)

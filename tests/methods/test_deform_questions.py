@@ -261,6 +261,7 @@ def wall():
 
 
 class TestOfAScene:
+    @pytest.mark.thorough
     def test_facts_are_what_is_drawn(self, wall):
         found = scene_facts(wall, [0])
         assert found.gaussians.tolist() == [(WIDTH + 8) * (HEIGHT + 8), 18 * 18]

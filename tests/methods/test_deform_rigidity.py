@@ -36,6 +36,7 @@ def strain_of(begun, run: Run) -> float:
     return float(info["rigid"]) / config.weights.rigidity
 
 
+@pytest.mark.thorough
 def test_a_scene_that_moves_or_grows_as_one_has_none(begun):
     _, run = begun
     bias = np.zeros(len(run.params.field.layers[-1].bias))
@@ -52,6 +53,7 @@ def test_turning_in_place_is_strained_as_neighbours_do_not_follow(begun):
     assert 0.5 < strain_of(begun, with_bias(run, bias)) < 2
 
 
+@pytest.mark.thorough
 def test_without_nodes_or_weight_there_is_no_such_loss(begun):
     problem, run = begun
     for config, kept in ((replace(CONFIG, nodes=0), run.kept._replace(moving=None)), (None, run.kept)):
@@ -61,6 +63,7 @@ def test_without_nodes_or_weight_there_is_no_such_loss(begun):
         assert "rigid" not in info
 
 
+@pytest.mark.thorough
 def test_groups_of_few_have_no_neighbours_in_others():
     gaussians = start_gaussians(tissue()[0], 0, 2.0)
     groups = np.repeat([0, 1], [gaussians.num - 3, 3])

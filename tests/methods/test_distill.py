@@ -73,6 +73,7 @@ def copied(leaf):
     return jnp.array(leaf) if isinstance(leaf, jax.Array) else leaf
 
 
+@pytest.mark.thorough
 def test_rendering_the_hidden_layer_equals_rendering_features(problem):
     given, run = problem
     batch = given.views[0]
@@ -86,6 +87,7 @@ def test_rendering_the_hidden_layer_equals_rendering_features(problem):
     np.testing.assert_allclose(of_hidden, of_features, atol=1e-5)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("kind", ["codebook", "maps"])
 def test_strips_change_neither_the_loss_nor_its_slope(two_balls, kind):
     scene, _, masks = two_balls
@@ -122,6 +124,7 @@ def test_only_active_entries_are_trained_and_the_full_grid_agrees(two_balls):
     np.testing.assert_array_equal(features_now(again, locate(again.encoding, scene.means)), of_all)
 
 
+@pytest.mark.thorough
 def test_it_learns_the_label_of_each_gaussian(two_balls, learned, problem):
     _, labels, _ = two_balls
     cosines = np.asarray(cosines_now(learned, problem[0].views[0].located, BOOK))
@@ -182,6 +185,7 @@ def test_2d_and_3d_agree_and_occluded_objects_are_selected_whole(two_balls, lear
         assert (solid & ~true).sum() < 0.1 * true.sum() + 20
 
 
+@pytest.mark.thorough
 def test_a_vector_for_each_gaussian_learns_too_and_weights_of_zero_cost_nothing(two_balls):
     scene, labels, masks = two_balls
     config = replace(QUICK, encoding="table", weights=DistillWeightsConfig(contrast=0.0, tv=0.0))

@@ -37,6 +37,7 @@ def embeddings_of(teacher, v):
     return teacher.codebook[np.maximum(teacher.ids[v], 0)].reshape(*teacher.ids[v].shape, 2, -1)
 
 
+@pytest.mark.thorough
 def test_other_views_tell_what_a_view_lacks(scene):
     gaussians, _, masks = scene
     given, true = lesson(masks, LACKING), lesson(masks, {})
@@ -75,6 +76,7 @@ def test_many_kinds_are_clustered_and_drawn_a_few_at_a_time(scene, monkeypatch):
             assert (nearest[masks[v] == ball] == ball).mean() > 0.9
 
 
+@pytest.mark.thorough
 def test_a_query_finds_parts_that_some_views_lack(scene):
     gaussians, labels, masks = scene
     given = lesson(masks, LACKING)

@@ -83,6 +83,7 @@ def dense(gaussians, teacher, config, problem):
     return A + config.solve.smoothness * d.sum() / (d > 1e-12).sum() * L, b, d
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("kind", KINDS)
 def test_conjugate_gradients_reach_the_dense_solution_in_float64(scene, kind):
     gaussians, _, masks = scene
@@ -99,6 +100,7 @@ def test_conjugate_gradients_reach_the_dense_solution_in_float64(scene, kind):
     assert not any(info["skipped"] for info in infos)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("preset", ["vote", "solve"])
 def test_what_is_seen_and_in_no_mask_is_nothing(scene, preset):
     """Not what lies beside it: one ball has masks, the other and the background have none."""
@@ -110,6 +112,7 @@ def test_what_is_seen_and_in_no_mask_is_nothing(scene, preset):
     assert (cosines[labels == 2] == 0).mean() > 0.8  # but for those at the outline of the first
 
 
+@pytest.mark.thorough
 @pytest.mark.usefixtures("x64")
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize(("dtype", "error"), [(jnp.float64, 1e-7), (jnp.float32, 2e-5)])
@@ -127,6 +130,7 @@ def test_with_64_bits_they_reach_it_to_seven_digits(kind, dtype, error):
     assert np.abs(found - wanted).max() < error * np.abs(wanted).max()
 
 
+@pytest.mark.thorough
 def test_a_vote_is_the_mean_of_the_pixels_that_show_a_gaussian(scene):
     gaussians, labels, masks = scene
     teacher = teacher_with(masks)
@@ -145,6 +149,7 @@ def test_a_vote_is_the_mean_of_the_pixels_that_show_a_gaussian(scene):
     ).all()
 
 
+@pytest.mark.thorough
 def test_strips_change_nothing(scene):
     gaussians, _, masks = scene
     teacher = teacher_with(masks, "both")
@@ -154,6 +159,7 @@ def test_strips_change_nothing(scene):
     np.testing.assert_allclose(whole.result.field.encoding, strips.result.field.encoding, atol=2e-5)
 
 
+@pytest.mark.thorough
 def test_what_no_pixel_shows_has_the_vector_of_its_neighbours(scene):
     gaussians, _labels, masks = scene
     inside = np.array([[0.0, -0.5, 0.0], [0.0, 0.5, 0.0]], np.float32)  # of the balls, hidden by their shells
@@ -167,6 +173,7 @@ def test_what_no_pixel_shows_has_the_vector_of_its_neighbours(scene):
     assert np.isfinite(cosines).all()
 
 
+@pytest.mark.thorough
 def test_a_descent_begins_where_the_solution_ended(scene):
     gaussians, labels, masks = scene
     config = DistillConfig(
@@ -185,6 +192,7 @@ def test_a_descent_begins_where_the_solution_ended(scene):
     assert len(table.result.field.encoding) == 160
 
 
+@pytest.mark.thorough
 def test_a_resumed_solution_is_the_same_to_the_bit(scene):
     gaussians, _, masks = scene
     config = DistillConfig(
@@ -239,6 +247,7 @@ def test_no_steps_at_all_are_refused():
         DistillConfig(iterations=0)
 
 
+@pytest.mark.thorough
 def test_many_views_of_which_the_last_show_more_end_with_their_vote(scene):
     """The energy of what is to be voted for rises with them, which is no divergence."""
     gaussians, _, masks = scene

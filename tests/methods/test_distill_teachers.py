@@ -103,6 +103,7 @@ def test_views_that_show_all_or_nothing_of_the_codebook():
     assert not book.any()
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("weight", [0.0, 0.5, 2.0])
 def test_masks_with_maps_give_the_weighted_mean_of_both_losses(scene, weight):
     weights = DistillWeightsConfig(map=weight, contrast=0.0, tv=0.0)
@@ -146,6 +147,7 @@ def test_maps_are_stretched_as_opencv_does(scene, size):
     np.testing.assert_allclose(compiled(features, 8, 4, plan), want[8:12], atol=1e-4)
 
 
+@pytest.mark.thorough
 def test_the_length_of_an_encoders_vectors_does_not_matter(scene):
     found = []
     for factor in (1.0, 1e6, 1e-6):
@@ -159,6 +161,7 @@ def test_the_length_of_an_encoders_vectors_does_not_matter(scene):
     np.testing.assert_allclose(long.maps[0], maps().maps[0], rtol=1e-5)
 
 
+@pytest.mark.thorough
 def test_it_learns_from_maps(scene):
     """Maps of three stripes on the scene itself."""
     labels = np.digitize(np.asarray(scene.means)[:, 2], [-0.25, 0.25])
@@ -175,6 +178,7 @@ def test_it_learns_from_maps(scene):
     assert (cosines.argmax(1) == labels)[shown].mean() > 0.85
 
 
+@pytest.mark.thorough
 def test_the_contrast_counts_from_its_step_on(scene):
     config = replace(QUICK, iterations=10, contrast_after=0.5)
     problem, run = Distill(config).start(scene, cameras(3), objects())
@@ -206,6 +210,7 @@ def test_a_few_gaussians_far_out_do_not_make_cells_coarse():
     assert np.isfinite(located.weights).all()
 
 
+@pytest.mark.thorough
 @pytest.mark.usefixtures("x64")
 @pytest.mark.parametrize("megabytes", [256.0, 0.1])
 def test_gradients_are_those_of_central_differences(scene, megabytes):
@@ -268,6 +273,7 @@ def test_objects_with_equal_embeddings_are_one_object_and_a_view_without_masks_i
     assert len(teacher.codebook) == 2
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("maps", "message"),
     [

@@ -105,6 +105,7 @@ def refined():
 
 
 class TestInRefinement:
+    @pytest.mark.thorough
     @pytest.mark.usefixtures("x64")
     @pytest.mark.parametrize("loss", [upwards, brighter])
     def test_its_derivative_is_that_of_differences(self, loss):
@@ -130,6 +131,7 @@ class TestInRefinement:
         assert abs(expected) > 1e-3
         np.testing.assert_allclose(value, told[loss.__name__], rtol=1e-6)
 
+    @pytest.mark.thorough
     def test_it_pulls_and_its_value_is_told(self, refined):
         plain, _, info = refined()
         pulled, _, told = refined(upwards, nothing)
@@ -137,6 +139,7 @@ class TestInRefinement:
         assert told["extra"].keys() == {"upwards", "nothing"}
         assert "extra" not in info
 
+    @pytest.mark.thorough
     def test_a_gradient_that_is_no_number_is_culled_and_counted(self, refined):
         def root(scene, rendered, frame):
             return jnp.mean(jnp.sqrt(0.0 * scene.gaussians.means))
@@ -191,6 +194,7 @@ def over_time(photographs):
 class TestOtherMethods:
     """The same function of three arguments beside the losses of a fit, of parts and of a deforming scene."""
 
+    @pytest.mark.thorough
     def test_of_a_fit(self, photographs):
         method = Fit(FIT)
         problem, run = method.start(photographs)
@@ -236,6 +240,7 @@ class TestOtherMethods:
         np.testing.assert_allclose(added.gaussians.means, uphill(scene.gaussians.means), atol=1e-4)
         assert np.any(added.field.layers[-1].weight)  # through the deformation
 
+    @pytest.mark.thorough
     def test_loops_hand_them_on_and_compile_once(self, photographs):
         method, calls = Fit(FIT, (height,)), []
         CALLS.clear()
@@ -269,6 +274,7 @@ class TestMistakes:
         with pytest.raises(ValueError, match=f"extra_losses: .*{said}"):
             extra_terms(losses, None, None, None)
 
+    @pytest.mark.thorough
     @pytest.mark.usefixtures("as_users_run")
     def test_a_list_is_refused_by_methods(self, table, started, config):
         _, frames, _ = table()
@@ -281,6 +287,7 @@ class TestMistakes:
             with pytest.raises(ValueError, match="extra_losses: expected a tuple of functions"):
                 refuse()
 
+    @pytest.mark.thorough
     def test_a_tracker_that_refines_nothing_has_no_use_for_one(self, table, started, config):
         _, frames, _ = table()
         without = replace(config, refine=replace(config.refine, iterations=0))

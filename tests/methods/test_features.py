@@ -63,6 +63,7 @@ def maps():
     return np.stack([view, 0.9 * view + 0.1]).astype(np.float32)
 
 
+@pytest.mark.thorough
 def test_projection_is_the_mean_of_the_pixels_that_show_a_gaussian(little, weights, maps):
     features = project_features(*little, maps)
     seen = weights.sum(0) >= 0.1
@@ -83,6 +84,7 @@ def test_unseen_ones_take_what_the_nearest_of_their_label_has(little, weights, m
     assert not project_features(alone, frame, maps)[17].any()
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("ways", [project_features, distill_features])
 def test_a_constant_map_gives_that_constant_on_all_gaussians(little, ways):
     constant = np.array([0.3, -2.0, 40.0], np.float32)
@@ -133,6 +135,7 @@ def test_pixels_that_are_not_finite_do_not_count(little, maps):
         assert np.abs(ways(*little, patched)).max() > 5
 
 
+@pytest.mark.thorough
 def test_many_channels_are_done_a_few_at_a_time(little, maps, monkeypatch):
     monkeypatch.setattr(gsjax.methods.track.features, "_CHANNELS", 3)
     mixed = (maps @ np.random.default_rng(1).normal(size=(3, 7))).astype(np.float32)
@@ -141,6 +144,7 @@ def test_many_channels_are_done_a_few_at_a_time(little, maps, monkeypatch):
     np.testing.assert_allclose(many[:, 4:7], distill_features(*little, mixed[..., 4:7]), atol=2e-4)
 
 
+@pytest.mark.thorough
 def test_the_transpose_is_exact_and_the_step_is_pure(little, maps):
     scene, frame = little
     plan = plan_render(scene.gaussians, frame.cameras)

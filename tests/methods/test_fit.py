@@ -185,6 +185,7 @@ def moved(view: Frame, twists, number: int, radius: float) -> np.ndarray:
     return np.asarray(refined(viewmat, twists, jnp.int32(number), radius))
 
 
+@pytest.mark.thorough
 def test_a_turned_camera_stays_where_it_is_and_twists_of_all_move_none(views):
     viewmats = np.concatenate([v.cameras.viewmat for v in views[:2]]).astype(np.float32)
     twists = np.array([[0.1, -0.2, 0.3, 0, 0, 0], [-0.1, 0.2, -0.3, 0, 0, 0]], np.float32)
@@ -207,6 +208,7 @@ def test_slots_fill_up_to_the_cap_and_no_further(views):
     assert max(counts) == config.cap
 
 
+@pytest.mark.thorough
 def test_what_a_mask_leaves_out_has_no_slope_and_costs_nothing(views):
     view, method = views[0], Fit(QUICK)
     model = method.start([view])[1].params
@@ -231,6 +233,7 @@ def test_what_a_mask_leaves_out_has_no_slope_and_costs_nothing(views):
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-6), other_slope, slope)
 
 
+@pytest.mark.thorough
 def test_more_coefficients_and_slots_draw_the_same_and_keep_what_adam_knows(views):
     *_, now = fitted_to(views, replace(QUICK, coarse_until=0.0), lambda i: i / 3)
     model, optimizer = now.run.params, now.run.state
@@ -343,6 +346,7 @@ def test_depth_that_knows_nothing_is_no_start(views):
         start_points(blind, None, StartConfig(source="depth"), 0)
 
 
+@pytest.mark.thorough
 def test_photographs_with_and_without_masks_and_depth_share_one_program(views):
     ones = np.ones((1, HEIGHT, WIDTH), bool)
     holed = ones.copy()

@@ -73,6 +73,7 @@ def test_what_is_padded_does_not_count():
     assert (same, none) == ([frame, frame], None)
 
 
+@pytest.mark.thorough
 def test_a_padded_photograph_gives_the_steps_of_the_photograph():
     """Its loss, PSNR and Gaussians are those without padding."""
     frame, method = photograph(32, 24), Fit(CONFIG)
@@ -103,6 +104,7 @@ def test_padding_does_not_pull_gaussians_apart():
     np.testing.assert_allclose(theirs, ours, rtol=1e-3, atol=1e-3 * float(ours.max()))
 
 
+@pytest.mark.thorough
 def test_many_sizes_share_the_programs_of_one():
     frames = [photograph(32 - i % 2, 24 - i % 3 // 2, i) for i in range(6)]
     problem, run = Fit(CONFIG).start(frames)

@@ -52,6 +52,7 @@ def grasp(cloud, obstacles=NOTHING, samples=512, key=KEY, **options):
     return grasp_jit(key, points, normals, valid, *obstacles, PANDA, samples, **options)
 
 
+@pytest.mark.thorough
 def test_a_box_is_grasped_across_its_only_narrow_side():
     found = grasp(box((0.20, 0.05, 0.15)))
     assert found.feasible
@@ -86,12 +87,14 @@ def test_what_is_wider_than_the_gripper_has_no_feasible_grasp(cloud):
     assert not grasp(cloud).feasible
 
 
+@pytest.mark.thorough
 def test_nothing_at_all_has_no_grasp_and_no_nan():
     found = grasp_jit(KEY, np.zeros((5, 3)), np.zeros((5, 3)), np.zeros(5, bool), *NOTHING, PANDA, 8)
     assert not found.feasible
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(found))
 
 
+@pytest.mark.thorough
 def test_approaches_stay_within_the_angle():
     down = np.array([0.0, 0.0, -1.0], np.float32)
     for seed in range(5):
@@ -100,6 +103,7 @@ def test_approaches_stay_within_the_angle():
         assert np.asarray(found.pose)[2, 2] <= -np.cos(0.3)
 
 
+@pytest.mark.thorough
 def test_a_table_below_is_not_hit_and_a_wall_forbids_the_side_grasp():
     cloud = cylinder(0.03, 0.12)
     rng = np.random.default_rng(1)
@@ -124,6 +128,7 @@ def swept(found, points):
     return (x < PANDA.finger_depth / 2 - 1e-6) & (y > inner + 1e-6) & (y < outer - 1e-6) & along
 
 
+@pytest.mark.thorough
 @given(seed=st.integers(0, 1000), size=st.tuples(*[st.floats(0.02, 0.12)] * 3))
 def test_feasible_means_that_it_fits_and_hits_nothing(seed, size):
     obstacles = np.random.default_rng(seed).uniform(-0.15, 0.15, (40, 3)).astype(np.float32)
@@ -136,6 +141,7 @@ def test_feasible_means_that_it_fits_and_hits_nothing(seed, size):
         assert np.linalg.det(rotation) > 0
 
 
+@pytest.mark.thorough
 @pytest.mark.usefixtures("x64")
 @given(seed=st.integers(0, 1000), log=st.tuples(*[st.floats(-2, 2)] * 6))
 def test_what_moves_rigidly_is_grasped_alike(seed, log):
@@ -165,6 +171,7 @@ def test_a_feasible_grasp_scored_again_is_itself(seed):
         np.testing.assert_allclose(again.pose, found.pose, atol=1e-5)
 
 
+@pytest.mark.thorough
 def test_rows_that_are_not_finite_or_not_valid_change_nothing():
     points, normals = cylinder(0.03, 0.12, 500)
     bad = np.full((3, 3), np.nan, np.float32)

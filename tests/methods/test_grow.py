@@ -104,6 +104,7 @@ def test_the_nearest_is_that_of_all_distances(started, none_taken):
         np.testing.assert_array_equal(label, np.asarray(scene.labels)[all_distances.argmin(0)])
 
 
+@pytest.mark.thorough
 def test_slots_draw_nothing_and_belong_to_nobody(table, started, plan):
     frame = table()[1][0]
     slotted = with_slots(started, 256)
@@ -117,6 +118,7 @@ def test_slots_draw_nothing_and_belong_to_nobody(table, started, plan):
     assert labels.shape[-1] == started.num_objects + 1
 
 
+@pytest.mark.thorough
 def test_what_is_missing_joins_the_object_that_it_continues(table, torn, plan):
     sequence, frames, _ = table()
     scene, pose = grown(with_slots(torn, 256), frames[0], plan, steps=6)
@@ -143,6 +145,7 @@ def test_a_scene_that_explains_all_grows_little(table, started, plan):
     assert 256 - int(empty_slots(scene).sum()) <= 32
 
 
+@pytest.mark.thorough
 def test_full_slots_overwrite_nothing(table, torn, plan):
     frame = table()[1][0]
     few = with_slots(torn, 3)
@@ -156,6 +159,7 @@ def test_full_slots_overwrite_nothing(table, torn, plan):
     assert np.isfinite(pose.means).all()
 
 
+@pytest.mark.thorough
 def test_no_distance_and_no_gap_so_wide_grow_nothing(table, torn, plan):
     frame = table()[1][0]
     for config in (replace(CONFIG, distance=1e-6), replace(CONFIG, min_gap=10.0)):

@@ -49,6 +49,7 @@ def both(table, started, plans):
     return whole, shown, backdrop
 
 
+@pytest.mark.thorough
 def test_layers_show_what_the_whole_scene_shows(both, started):
     whole, shown, _ = both
     assert set(np.unique(whole.labels)) == set(range(started.num_objects + 1))
@@ -59,6 +60,7 @@ def test_layers_show_what_the_whole_scene_shows(both, started):
     assert np.median(np.abs(whole.depths - shown.depths)[inside]) < 2e-3
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("more", [0.0, 2.5, 9.0])
 def test_what_the_plan_leaves_out_changes_hardly_a_label(both, started, more):
     """As fitted, and as opaque as 0.99 and 1: a single Gaussian that hides all else must still be drawn."""
@@ -78,6 +80,7 @@ def test_what_the_plan_leaves_out_changes_hardly_a_label(both, started, more):
     assert np.quantile(apart, 0.9) < 5e-3  # half a pixel of this small table
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("opacity", [0.5, 0.9, 0.99, 1.0])
 def test_a_single_gaussian_in_front_of_another_is_drawn_at_almost_its_depth(opacity):
     means = jnp.array([[0.0, 0.0, 0.6], [0.0, 0.0, 0.9]])
@@ -117,6 +120,7 @@ def test_what_stands_in_front_hides_what_moves(both, started, plans):
     assert hidden.covered.all()
 
 
+@pytest.mark.thorough
 def test_the_backdrop_is_drawn_again_only_when_a_camera_moves(both, started, plans, table):
     _, _, backdrop = both
     cameras = table()[1][0].cameras

@@ -74,6 +74,7 @@ def with_depth(images, depths):
     return images._replace(pixels=pixels)
 
 
+@pytest.mark.thorough
 def test_a_group_agrees_in_its_place_and_nowhere_else(carton):
     images, points = carton
     here = confidence(points, images, GAP)
@@ -206,6 +207,7 @@ def strangers_of(images, strange) -> Points:
     return jax.tree.map(lambda a: np.asarray(a)[0], found)
 
 
+@pytest.mark.thorough
 def test_guesses_bring_points_to_unexplained_pixels(one):
     reference, center, images, shown = one
     config = PRESETS["accurate"].align
@@ -228,6 +230,7 @@ def test_guesses_bring_points_to_unexplained_pixels(one):
     np.testing.assert_array_equal(draw(0, config=replace(config, max_turn=0.0))[:, 3:], 0)
 
 
+@pytest.mark.thorough
 def test_a_lost_group_is_recovered_over_frames_but_not_at_another_object(one):
     """From 15 cm and 57 degrees off; each frame continues from the guess of the last."""
     reference, center, images, shown = one
@@ -306,6 +309,7 @@ def test_depths_of_others_are_those_of_groups_not_in_doubt(carton):
     np.testing.assert_allclose(np.asarray(found)[0, 0, :3], [0.0, 0.7, 0.0])
 
 
+@pytest.mark.thorough
 def test_groups_in_doubt_take_turns_of_two_frames_in_a_row():
     turns = np.array([in_search_round(jnp.int32(count), 3) for count in range(8)])
     np.testing.assert_array_equal(turns[:, 0], [True, True, False, False] * 2)

@@ -40,6 +40,7 @@ def patches():
     return template, rng.uniform(size=(8, 8)) * (rng.uniform(size=(8, 8)) > 0.3), search
 
 
+@pytest.mark.thorough
 def test_the_score_is_the_formula(patches):
     np.testing.assert_allclose(correlation(*patches), slow_correlation(*patches), atol=2e-3)
     assert np.unravel_index(correlation(*patches).argmax(), (8, 8)) == (3, 5)
@@ -80,6 +81,7 @@ def frame(images=None, depths=None, count=1) -> Frame:
     return Frame(images, None if depths is None else jnp.asarray(depths, jnp.float32), cameras(count))
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("shift", [(0.0, 0.0), (3.3, -2.4), (-5.25, 4.5)])
 def test_the_peak_of_a_shifted_blob_is_sub_pixel(shift):
     start = np.array([31.0, 25.0])
@@ -103,6 +105,7 @@ def test_the_peak_of_a_shifted_blob_is_sub_pixel(shift):
     assert match.score[0, 0] > 0.98
 
 
+@pytest.mark.thorough
 def test_an_object_that_no_pixel_shows_is_not_found():
     color, _ = blob((30.0, 20.0))
     nothing = jnp.zeros((1, HEIGHT, WIDTH, 1))
@@ -144,6 +147,7 @@ def seen_to_move(moves, measured: bool, score=0.9) -> tuple[TemplateMatch, Frame
 MOVE = np.array([0.02, 0.03, -0.015])
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(("count", "measured"), [(1, True), (2, True), (2, False)])
 def test_one_camera_with_depth_or_two_without_fix_the_translation(count, measured):
     move, found = lift(*seen_to_move([MOVE] * count, measured), CONFIG)
@@ -182,6 +186,7 @@ def test_a_camera_that_does_not_see_the_object_does_not_spoil_the_others(blind):
     np.testing.assert_allclose(move[0], MOVE, atol=1e-3)
 
 
+@pytest.mark.thorough
 def test_what_the_picture_does_not_show_of_a_template_does_not_count():
     """A blob at the border has moved along it; repeated border pixels would say that it stood still."""
     start, shift = np.array([1.0, 20.0]), np.array([0.0, 5.0])

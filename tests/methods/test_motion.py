@@ -115,6 +115,7 @@ def test_place_moves_what_can_move_and_nothing_else(pose):
     np.testing.assert_array_equal(placed.logit_opacities, scene.gaussians.logit_opacities)
 
 
+@pytest.mark.thorough
 def test_a_surface_shows_its_front_and_hides_its_back(pose):
     axes = np.asarray(quats_to_matrices(pose.quats))
     normals = np.tile([0.0, 0.0, 1.0], (COUNT, 1))

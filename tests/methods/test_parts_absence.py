@@ -37,6 +37,7 @@ def found(views, anchor=0, **changes):
     return following.result, int(np.bincount(labels[views.bodies == 2]).argmax())
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(("anchor", "gone"), [(0, GONE), pytest.param(6, (0, 1, 2), marks=pytest.mark.slow)])
 def test_a_part_that_leaves_or_is_yet_to_come_is_hidden(anchor, gone):
     views = boxes(gone, anchor)

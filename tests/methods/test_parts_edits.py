@@ -59,6 +59,7 @@ EDITS = TIME_EDITS | LOOK_EDITS
 
 @pytest.mark.parametrize("edit", EDITS.values(), ids=EDITS)
 class TestEveryEdit:
+    @pytest.mark.thorough
     def test_changes_its_parts_and_leaves_the_others_to_the_bit(self, edit):
         before = trajectory(1)
         after = edit(before, [1, 3])
@@ -74,6 +75,7 @@ class TestEveryEdit:
         before = trajectory(3)
         assert_same(edit(before, [3, 1]), edit(edit(before, [1]), [3]), atol=1e-6)
 
+    @pytest.mark.thorough
     def test_gives_the_same_under_jit_and_vmap(self, edit):
         both = [trajectory(4), trajectory(5)]
         stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *both)
@@ -83,6 +85,7 @@ class TestEveryEdit:
                 jax.tree.map(lambda leaf, i=i: np.asarray(leaf)[i], found), edit(one, [1, 2]), atol=2e-5
             )
 
+    @pytest.mark.thorough
     def test_gradients_are_finite_also_where_nothing_moves(self, edit):
         slopes = jax.jit(jax.grad(lambda one: sum(x.sum() for x in jax.tree.leaves(edit(one, [1])))))
         for start in (trajectory(6), still(4, jnp.asarray(TIMES))):
@@ -93,6 +96,7 @@ class TestEveryEdit:
             edit(trajectory(7), [1, 4])
 
 
+@pytest.mark.thorough
 @given(seeds, st.permutations(sorted(EDITS)))
 def test_edits_of_different_parts_commute_to_the_bit(seed, order):
     steps = [(EDITS[name], [part]) for name, part in zip(order, (1, 2, 3), strict=False)]
@@ -144,6 +148,7 @@ class TestPlace:
         before, after = (seen(scene, t, 5) for t in (trajectory(seed), edited))
         np.testing.assert_allclose(after.means, before.means + shift, atol=1e-5)
 
+    @pytest.mark.thorough
     @pytest.mark.usefixtures("x64")
     @given(seeds)
     def test_rotate_turns_what_is_seen_about_the_handle_or_another_point_of_the_part(self, seed):
@@ -194,6 +199,7 @@ class TestPlace:
         expected = Joint("prismatic", np.array([1.0, 0.0, 0.0]), np.zeros(3), DRAWER.values).motions()
         np.testing.assert_allclose(motions(edited, CENTERS, 2), expected, atol=1e-6)
 
+    @pytest.mark.thorough
     @pytest.mark.usefixtures("x64")
     @given(seeds, st.integers(0, 8))
     def test_redirect_and_amplify_leave_the_part_where_it_is_at_one_time(self, seed, index):
@@ -208,6 +214,7 @@ class TestPlace:
             expected = one.poses.translations[index, 1]
             np.testing.assert_allclose(edited.poses.translations[index, 1], expected, atol=1e-6)
 
+    @pytest.mark.thorough
     @pytest.mark.parametrize("factor", [0.0, 0.3, 1.7, -1.0])
     def test_amplify_stays_on_hinges_and_rails(self, room, factor):
         edited = edits.amplify(room, [1, 2], factor)
@@ -288,6 +295,7 @@ SLOPES = {
 }
 
 
+@pytest.mark.thorough
 @pytest.mark.usefixtures("x64")
 @pytest.mark.parametrize("edit", SLOPES.values(), ids=SLOPES)
 def test_each_number_of_an_edit_has_its_slope_under_jit(edit):
@@ -310,6 +318,7 @@ def test_each_number_of_an_edit_has_its_slope_under_jit(edit):
     assert abs(slope) > 1e-6
 
 
+@pytest.mark.thorough
 def test_edits_compose_and_differentiate_as_one_function():
     """What a user writes: half the speed, twice as far, fainter and elsewhere, for a while."""
     scene = scene_of(0, parts=4)

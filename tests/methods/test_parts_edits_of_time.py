@@ -114,6 +114,7 @@ class TestTime:
         back = edits.speed(there, ALL, -1.0, 0.25, 0.75)
         assert_same(rows(back, ALL, range(9)), rows(trajectory(seed), ALL, range(9)))
 
+    @pytest.mark.thorough
     @pytest.mark.usefixtures("x64")
     @given(st.floats(0.2, 3.0), st.floats(0.2, 3.0))
     def test_speeds_multiply(self, a, b):
@@ -141,6 +142,7 @@ class TestTime:
         first = rows(looped, [1], range(start, 9 - period))
         assert_same(rows(looped, [1], range(start + period, 9)), first)
 
+    @pytest.mark.thorough
     def test_rounding_of_times_does_not_show_the_wrong_side_of_a_seam(self):
         """Thirtieths of seconds are told inexactly; a loop of 7 frames shows 7 frames all the same."""
         times = jnp.arange(200.0) / 30
@@ -150,6 +152,7 @@ class TestTime:
         expected = [0, 1, 2, *(3 + (i % 7) for i in range(197))]
         np.testing.assert_allclose(shown, expected, atol=0.01)
 
+    @pytest.mark.thorough
     @given(seeds, st.integers(0, 8), st.integers(0, 8))
     def test_freezing_twice_is_freezing_at_the_earlier(self, seed, a, b):
         once = edits.freeze(trajectory(seed), [1, 2], at=min(a, b) * STEP)
@@ -166,6 +169,7 @@ class TestTime:
         edited = edits.isolate(trajectory(9), [1], begin=0.25, end=0.5)
         plays(edited, 9, [0, 1, 2, 2, 2, 3, 4, 5, 6], parts=(0, 2, 3))
 
+    @pytest.mark.thorough
     @pytest.mark.parametrize(
         ("edit", "message"),
         [

@@ -25,6 +25,7 @@ def layer_of(seed, parts=4, num=7, moments=9):
     return Layer(scene_of(seed, num, parts), trajectory(seed, moments, parts))
 
 
+@pytest.mark.thorough
 def test_a_film_is_its_layers_one_after_the_other():
     film = (layer_of(0), layer_of(1, parts=2, num=5))
     expected = concatenate([gaussians_at(one.scene, moment(one.trajectory, 3)) for one in film])
@@ -52,6 +53,7 @@ class TestTrimmed:
         np.testing.assert_array_equal(np.asarray(film[0].scene.weights)[:, 2], weights[peak >= 1 / 255])
         assert_same(film[1], layer)
 
+    @pytest.mark.thorough
     @given(seeds)
     def test_what_is_left_is_drawn_as_it_was(self, seed):
         layer = layer_of(seed)
@@ -84,6 +86,7 @@ class TestTrimmed:
 
 
 class TestPlaced:
+    @pytest.mark.thorough
     @pytest.mark.usefixtures("x64")
     @pytest.mark.parametrize("blend", ["quaternion", "dual"])
     @given(seed=seeds)
@@ -122,6 +125,7 @@ def test_composite_shows_only_these_parts_at_the_times_of_the_film():
     assert film_gaussians(both, 5).num == 14
 
 
+@pytest.mark.thorough
 def test_an_echo_of_the_film_is_the_part_as_it_was_before():
     layer = layer_of(2)
     layer = eqx.tree_at(

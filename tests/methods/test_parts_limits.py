@@ -33,6 +33,7 @@ def retimed(trajectory):
     return edits.scale(edits.fade(edits.freeze(edited, [3], at=0.3), [1, 3], 0.2), [2], 4.0)
 
 
+@pytest.mark.thorough
 @given(st.integers(0, 10_000))
 def test_edits_of_time_stay_within_the_limits(seed):
     """Also between the moments that were captured."""

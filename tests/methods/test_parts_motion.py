@@ -48,6 +48,7 @@ def changes(boxes, plan, moved):
     return changes_of(boxes.gaussians, boxes.cameras, plan, moved)
 
 
+@pytest.mark.thorough
 def test_what_leaves_changes_and_what_is_covered_for_a_while_does_not(boxes, changes):
     usual = changes.usual >= 0.5
     assert usual[boxes.bodies > 0].mean() > 0.8  # the one that slides slowly is still there in part
@@ -73,6 +74,7 @@ def test_what_does_not_hang_together_is_not_one_part(boxes):
     assert divided_where_apart(weights, boxes.gaussians)[boxes.bodies == 2].argmax(-1)[:15].max() == 1
 
 
+@pytest.mark.thorough
 def test_pixels_show_what_may_move(boxes, plan, changes):
     views = range(boxes.num_cameras)
     drawn = [render(boxes.gaussians, one_camera(boxes.cameras, c), plan) for c in views]
@@ -157,6 +159,7 @@ def start(boxes, moved):
     return begin(boxes, boxes.gaussians, anchor, moved, config, None, jax.random.key(0), masks)
 
 
+@pytest.mark.thorough
 def test_parts_that_touch_are_one_group(boxes, start):
     discovery = initial_run(start, FRAMES, PartsConfig()).kept
     weights = np.asarray(discovery.weights)
@@ -223,6 +226,7 @@ def test_the_exposure_of_each_camera_is_found_whatever_stands_before_it(boxes, p
     assert np.median(without[shown]) > 0.03
 
 
+@pytest.mark.thorough
 def test_exposures_may_be_left_as_they_are(boxes, moved):
     config = PartsConfig(discover=DiscoverConfig(lift_iterations=1), exposures=False)
     anchor = choose_anchor(boxes.image, FRAMES, boxes.num_cameras, 0)

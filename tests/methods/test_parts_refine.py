@@ -84,6 +84,7 @@ def off_mm(boxes, astray, translations):
     return 1000 * np.linalg.norm(translations[:, 1] - true, axis=1)
 
 
+@pytest.mark.thorough
 def test_frames_are_loaded_once_while_there_is_room(boxes, monkeypatch):
     loaded: list[int] = []
     problem, order = Problem(boxes), [0, 2, 1, 2, 0, 1, 1, 2]
@@ -121,10 +122,12 @@ def test_colours_and_poses_come_back(boxes, astray):
     assert abs(np.median(brighter)) < 0.8 * _BRIGHTER  # it falls by 0.0025 a step at most
 
 
+@pytest.mark.thorough
 def test_the_papers_scene_stays(boxes, astray):
     assert refined(boxes, astray, replace(CONFIG, refine=RefineConfig(iterations=0))) == ([], [])
 
 
+@pytest.mark.thorough
 def test_the_result_is_what_was_refined(boxes, astray):
     config = replace(CONFIG, refine=RefineConfig(iterations=2))
     run = astray.having(step=Parts(config).steps_of_frames(Problem(boxes)))

@@ -159,6 +159,7 @@ def test_numbers_pass_from_view_to_view():
     assert (masks[1, 0, 3:6] == 0).all()
 
 
+@pytest.mark.thorough
 def test_masks_are_lifted_to_what_shows_them(boxes):
     masks = boxes.masks(boxes.bodies)
     plan = plan_render(boxes.gaussians, boxes.cameras, headroom=1.3)
@@ -179,6 +180,7 @@ def test_votes_are_shares_of_pixels(boxes):
     assert 0.2 * pixels < total.sum() <= pixels * (1 + 1e-5)
 
 
+@pytest.mark.thorough
 def test_many_labels_are_voted_for_and_drawn_like_few(boxes):
     plan = plan_render(boxes.gaussians, boxes.cameras, headroom=1.3)
     view, count = one_camera(boxes.cameras, 0), 70  # more than one program takes at once
@@ -236,6 +238,7 @@ def test_a_pixel_is_as_wide_as_depth_over_focal_length(boxes):
     assert pixel_width(middle, boxes.cameras) == pytest.approx(np.median(away) / (0.95 * 64), rel=1e-4)
 
 
+@pytest.mark.thorough
 def test_a_start_knows_its_pieces(boxes):
     config = PartsConfig(
         discover=DiscoverConfig(most_parts=3, lift_iterations=6), grid=FeatureGridConfig(4, 4, 32, 10, 2, 16)
@@ -264,6 +267,7 @@ def test_a_start_knows_its_pieces(boxes):
     assert (np.asarray(start.canonical.neighbors) != np.arange(count)[:, None]).all()
 
 
+@pytest.mark.thorough
 def test_one_camera_and_stillness_are_refused(boxes):
     anchor = choose_anchor(boxes.image, FRAMES, 3, 0)
     one = MovingBoxes(boxes.boxes, cameras=1)

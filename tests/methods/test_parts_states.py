@@ -59,6 +59,7 @@ def gap(one, other, points):
     return np.linalg.norm(moved(one, points) - moved(other, points), axis=-1).mean()
 
 
+@pytest.mark.thorough
 def test_a_door_and_a_drawer_are_found_to_a_fifth_of_a_pixel(cabinet, found):
     pixel, points = pixel_width(cabinet.frame(0)), found.surface.points
     assert len(found.motions) == 3
@@ -169,6 +170,7 @@ def test_edges_tell_where_a_plain_plate_lies_within_its_plane(corner):
     assert np.linalg.norm(registered(guess, face, blind, 0.05, 0.01, 20)[:3, 3]) > 8e-3
 
 
+@pytest.mark.thorough
 def test_the_run_of_two_states_has_joints_and_is_refined(cabinet):
     """Without a fit: the points that the cameras measure, as Gaussians."""
     surface = surface_of(cabinet.frame(0), 2 * pixel_width(cabinet.frame(0)))
@@ -207,6 +209,7 @@ def corner():
     return Surface(points, normals, np.full_like(points, 0.5), nothing, bright, nothing)
 
 
+@pytest.mark.thorough
 @settings(max_examples=20, deadline=None)
 @given(seed=st.integers(0, 2**31 - 1))
 def test_a_motion_near_a_guess_is_found(corner, seed):
@@ -321,6 +324,7 @@ def slide(by, axis):
     return motion
 
 
+@pytest.mark.thorough
 def test_two_states_without_depth_are_refused_unless_all_may_move(cabinet):
     alone = replace(cabinet, load_depth=None)
     assert not has_two_states(alone)

@@ -39,6 +39,7 @@ def boxes():
     return two_boxes()
 
 
+@pytest.mark.thorough
 @pytest.mark.usefixtures("x64")
 @pytest.mark.parametrize("of", ["pose", "field"])
 def test_derivatives_are_those_of_finite_differences(boxes, of):
@@ -62,6 +63,7 @@ def test_derivatives_are_those_of_finite_differences(boxes, of):
         assert float(ahead - behind) / (2 * step) == pytest.approx(float(expected), rel=1e-3)
 
 
+@pytest.mark.thorough
 def test_the_past_teaches_the_field_alone(boxes):
     batch, bodies = batch_of(boxes)
     params = params_of(shifted(0.02), soft(bodies), bodies)
@@ -72,6 +74,7 @@ def test_the_past_teaches_the_field_alone(boxes):
     assert np.abs(slope.field).max() > 0
 
 
+@pytest.mark.thorough
 def test_what_a_step_may_change(boxes):
     """The background's handle and empty slots stay, whatever pictures say; quaternions stay of length 1."""
     batch, bodies = batch_of(boxes)
@@ -92,6 +95,7 @@ def test_what_a_step_may_change(boxes):
     assert np.abs(state.pulls).max() > 0
 
 
+@pytest.mark.thorough
 def test_what_both_plans_need_is_reported(boxes):
     """Of this frame and of the past, also where the first plan is too small."""
     batch, bodies = batch_of(boxes)
@@ -108,6 +112,7 @@ def depths_at_rest(batch):
     return render(gaussians, batch.now.cameras, batch.plan).depths
 
 
+@pytest.mark.thorough
 def test_depth_tells_what_colour_does_not(boxes):
     batch, bodies = batch_of(boxes, past=False)
     frame = batch.now
@@ -133,6 +138,7 @@ def test_what_moves_together_is_not_torn(boxes):
     assert torn(canonical, weights, shifted(0.5), scale) < 1.02 * apart
 
 
+@pytest.mark.thorough
 def test_a_grid_and_a_table_of_logits_serve_alike(boxes):
     canonical, _ = canonical_of(boxes)
     config = PartsConfig(grid=FeatureGridConfig(3, 4, 16, 8, 2, 8))
@@ -143,6 +149,7 @@ def test_a_grid_and_a_table_of_logits_serve_alike(boxes):
     np.testing.assert_array_equal(weights(grid, canonical), weights(table, canonical))
 
 
+@pytest.mark.thorough
 def test_weights_stay_on_the_simplex_and_what_is_not_alive_gets_none(boxes):
     batch, bodies = batch_of(boxes)
     mixed = 0.7 * jax.nn.one_hot(bodies, PARTS) + 0.3 / 3 * batch.canonical.alive
@@ -200,6 +207,7 @@ def test_half_the_squares_are_the_loss_without_ssim(boxes, depth):
     assert not info["overflow"]
 
 
+@pytest.mark.thorough
 @pytest.mark.usefixtures("x64")
 def test_the_derivative_of_residuals_is_that_of_differences(boxes):
     batch = forward(batch_of(boxes, jnp.float64, past=False)[0])

@@ -298,6 +298,7 @@ class TestComposite:
     def film(self, **keys):
         return film_of(Composite(parts=("cup",), from_run="elsewhere", **keys), load_scene=self.load)
 
+    @pytest.mark.thorough
     def test_parts_of_another_run_are_brought_in(self):
         film = self.film()
         assert [layer.scene.gaussians.num for layer in film] == [8, 2]

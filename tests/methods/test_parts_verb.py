@@ -55,6 +55,7 @@ def segmenter(boxes):
     return segment
 
 
+@pytest.mark.thorough
 def test_a_discovery_is_stored_and_goes_on_to_the_same_bits(boxes, sequence, segmenter, tmp_path):
     given = {"eval_cameras": [HELD_OUT], "anchor": 0, "gaussians": boxes.gaussians, "segmenter": segmenter}
     steps = []

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import jaxlie
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -56,6 +57,7 @@ def test_all_poses_are_rigid_and_the_grasp_is_reached(start, goal):
     np.testing.assert_allclose(path.poses[19], goal, atol=1e-5)
 
 
+@pytest.mark.thorough
 @given(x=st.floats(-0.2, 0.2), z=st.floats(0.12, 0.6), step=st.integers(0, 17))
 def test_the_plan_from_a_point_of_a_plan_is_its_rest(x, z, step):
     path = plan(at(x, 0, z), to(at(0, 0, 0.1)))

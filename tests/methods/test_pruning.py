@@ -2,6 +2,7 @@
 
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -32,6 +33,7 @@ def wall(count=60):
     )
 
 
+@pytest.mark.thorough
 def test_light_is_the_sum_of_weights_in_the_view_that_sees_the_most():
     gaussians, views = wall(), [view((3.0, 0.2, 0.5)), view((2.5, -0.8, 0.1))]
     light = light_of(gaussians, views)

@@ -28,6 +28,7 @@ def half_squares(residuals) -> float:
     return 0.5 * sum(float(jnp.sum(r * r)) for r in jax.tree.leaves(residuals))
 
 
+@pytest.mark.thorough
 def test_half_the_squares_are_refines_loss(batch):
     nothing = Motion(jnp.zeros((1, 6)), jnp.zeros((OBJECT, 3)))
     loss = float(refine_loss(nothing, batch, step=0, key=None, config=CONFIG)[0])
@@ -77,6 +78,7 @@ def test_its_derivative_is_that_of_differences():
     assert cosine > 0.99
 
 
+@pytest.mark.thorough
 def test_levenberg_marquardt_brings_the_group_home(batch):
     step = least_squares_step(lambda *args, **kw: refine_residual(*args, **kw, config=CONFIG))
 
@@ -91,6 +93,7 @@ def test_levenberg_marquardt_brings_the_group_home(batch):
     np.testing.assert_allclose(motions.rotation().log()[0], [0.0, 0.1, 0.05], atol=1e-2)
 
 
+@pytest.mark.thorough
 def test_an_overflow_is_told(batch):
     small = replace(batch.plan, capacity=64)
     _, info = refine_residual(STILL, batch._replace(plan=small), step=0, key=None, config=CONFIG)

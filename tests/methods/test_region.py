@@ -2,6 +2,7 @@
 
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from gsjax.methods.track import first_pose, place
 from gsjax.methods.track.plan import Needed, TrackPlan
@@ -11,6 +12,7 @@ from gsjax.scene.region import tiles_to_pixels, touched_tiles
 from gsjax.scene.render import plan_render, render
 
 
+@pytest.mark.thorough
 def test_the_near_scene_draws_the_region_as_the_whole_scene_does(table, started):
     _, frames, _ = table()
     pose, cameras = first_pose(started), frames[0].cameras
@@ -50,6 +52,7 @@ def test_a_plan_grows_to_the_lowest_rungs_that_hold_what_was_needed():
     assert hash(grown) == hash(grown.grown(needed, 1.0))
 
 
+@pytest.mark.thorough
 def test_what_belongs_to_the_near_scene_is_given_back_to_the_whole(started):
     num = started.gaussians.num - started.num_moving
     near = jnp.arange(num) % 3 == 1

@@ -18,6 +18,7 @@ def rehearsed(table, started, quick):
     return frames, rehearsal
 
 
+@pytest.mark.thorough
 def test_poses_are_those_without_a_rehearsal_and_nothing_is_compiled(rehearsed, started, quick):
     frames, rehearsal = rehearsed
     assert rehearsal.tick() is not None

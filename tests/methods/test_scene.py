@@ -65,6 +65,7 @@ def test_a_pixel_that_flies_off_an_edge_makes_nothing_large(cloud, scene):
     assert flown.label_ids == scene.label_ids
 
 
+@pytest.mark.thorough
 def test_depth_that_is_off_in_single_pixels_makes_no_groups_and_nothing_large(table):
     """5 % of the pixels at a tenth to ten times their depth made 14 groups of 8, and objects were lost."""
     _, frames, mask = table()

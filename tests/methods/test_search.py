@@ -56,6 +56,7 @@ def jumped(moved, table):
     return behind, middle(behind).astype(np.float32), see(table(8, 2, **SIZE)[1][6]), shift
 
 
+@pytest.mark.thorough
 def test_search_finds_a_jump_that_alignment_alone_misses(jumped):
     """There is no overlap at the start, and no hint how far it went."""
     *given, shift = jumped
@@ -146,6 +147,7 @@ def test_a_suspect_that_jumps_is_followed_before_it_is_relocated(suspected, jump
         assert elsewhere.relocation_tried[0]
 
 
+@pytest.mark.thorough
 def test_what_shifts_and_turns_miss_is_relocated_in_the_same_frame(jumped):
     """It was knocked away by more than the shifts reach."""
     *given, _ = jumped
@@ -187,6 +189,7 @@ def test_one_group_is_relocated_in_the_time_in_which_two_are_turned(jumped):
     assert tried(3, first) == (two, first)
 
 
+@pytest.mark.thorough
 def test_groups_that_agree_worst_or_have_waited_longest_are_searched_for_first(jumped):
     """Four groups jumped alike. Shifts find three of them; what they left is turned first, unless another was
     glimpsed elsewhere or has waited for long."""

@@ -86,6 +86,7 @@ def miss(pose: np.ndarray) -> tuple[float, float]:
     return float(np.linalg.norm(there - truth, axis=1).mean()), float(np.degrees(turn))
 
 
+@pytest.mark.thorough
 def test_a_pose_is_found_on_the_plane(frame):
     pose = find_pose(block(plane=np.array([0, 0, 2.0, 0.0])), frame, ground().means)
     distance, turn = miss(pose)
@@ -93,6 +94,7 @@ def test_a_pose_is_found_on_the_plane(frame):
     assert turn < 6
 
 
+@pytest.mark.thorough
 def test_the_plane_may_lie_any_way_in_the_world(frame):
     """The same in a world whose ground is a wall, and slanted."""
     world = np.eye(4)

@@ -62,6 +62,7 @@ def tracked(traced):
     return traced[0]
 
 
+@pytest.mark.thorough
 def test_objects_are_followed(table, started, tracked, centroid_errors):
     sequence, frames, _ = table()
     assert len(tracked) == len(frames) - 1
@@ -141,6 +142,7 @@ def test_labels_keep_the_masks_values(table, started):
     assert (labels[started.num_moving :] == 0).all()
 
 
+@pytest.mark.thorough
 def test_going_on_from_pose_and_state_is_the_same_as_never_stopping(table, started, tracked, quick):
     _, frames, _ = table()
     rest = track(started, frames[1], frames[2:], quick, after=tracked[0])
@@ -149,6 +151,7 @@ def test_going_on_from_pose_and_state_is_the_same_as_never_stopping(table, start
         jax.tree.map(np.testing.assert_array_equal, again.result, before.result)
 
 
+@pytest.mark.thorough
 def test_a_tick_is_stored_and_gone_on_with(table, started, tracked, quick, tmp_path):
     _, frames, _ = table()
     save(tmp_path / "run.npz", tracked[1])
@@ -226,6 +229,7 @@ def test_an_update_is_traced_once(traced):
     assert traces == 1
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("what", ["images", "depths"])
 @pytest.mark.parametrize("value", [jnp.nan, jnp.inf])
 def test_a_few_broken_pixels_are_counted_and_change_little(table, started, tracked, quick, what, value):
@@ -261,6 +265,7 @@ def test_going_on_works_when_every_slot_is_taken(table, started, quick):
     assert len(rest.result.pose.means) == len(full.result.pose.means)
 
 
+@pytest.mark.thorough
 def test_a_frame_of_another_size_is_named(table, started, quick):
     _, frames, _ = table()
     small = jax.tree.map(lambda a: a, frames[1])
@@ -269,6 +274,7 @@ def test_a_frame_of_another_size_is_named(table, started, quick):
         list(track(started, frames[0], [small], quick))
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("slots", [0, 64])
 def test_one_object_larger_than_its_template_is_reduced(started, table, slots):
     _, frames, _ = table()

@@ -38,6 +38,7 @@ def assert_same(found, expected):
     jax.tree.map(np.testing.assert_array_equal, found, expected)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     "config",
     [
@@ -58,6 +59,7 @@ def test_a_blank_state_has_the_form_that_a_first_look_fills(table, started, conf
         assert (one.shape, one.dtype) == (other.shape, other.dtype)
 
 
+@pytest.mark.thorough
 def test_the_first_update_only_looks(table, started, begun):
     _, frames, _ = table()
     step, update, run = begun

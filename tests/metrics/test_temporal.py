@@ -159,6 +159,7 @@ def test_bytes_and_floats_mean_the_same():
     assert next(unit_frames(as_bytes)).max() <= 1
 
 
+@pytest.mark.thorough
 def test_flows_of_a_simulated_scene_explain_its_motion():
     """Forward and backward flow come from the scene, and moving pixels are compared too."""
     sequence = articulated(0, frames=9, width=120, height=90, cameras=1)
@@ -178,6 +179,7 @@ def test_flows_of_a_simulated_scene_explain_its_motion():
     assert flow_warp_error(video, estimated).share > 0.5
 
 
+@pytest.mark.thorough
 def test_shapes_that_do_not_fit_are_named():
     video, flows = panned(), flows_to_the_right()
     with pytest.raises(ValueError, match=r"video: expected at least two frames, found 1"):

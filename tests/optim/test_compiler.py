@@ -54,6 +54,7 @@ print(place)
 """
 
 
+@pytest.mark.thorough
 def test_programs_are_cached_unless_jax_is_already_configured(tmp_path):
     """In separate processes, because JAX is configured once per process."""
 

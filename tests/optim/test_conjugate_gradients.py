@@ -2,12 +2,14 @@
 
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gsjax.optim.conjugate_gradients import Conjugate, advanced, turned
 
 
+@pytest.mark.thorough
 @settings(max_examples=30, deadline=None)
 @given(st.integers(2, 12), st.integers(1, 4), st.integers(0, 2**16))
 def test_they_reach_the_solution_in_as_many_iterations_as_unknowns(size, columns, seed):

@@ -221,6 +221,7 @@ def test_no_other_module_imports_jaxopt():
     assert [file.relative_to(package).as_posix() for file in users] == ["optim/constrained.py"]
 
 
+@pytest.mark.thorough
 def test_entries_that_are_not_allowed_act_as_if_absent():
     A, b, best = least_squares(2)
     optimizer, allowed = simplex_descent(0.05), np.array([True, True, True, True, False])

@@ -56,6 +56,7 @@ def test_single_precision_is_enough_for_many_copies(copies):
         np.testing.assert_allclose(found, wanted, rtol=2e-2)
 
 
+@pytest.mark.thorough
 def test_dead_slots_become_copies_of_what_is_opaque_and_no_others_are_touched():
     gaussians = some([0.8, 0.0, 0.6, 0.002, 0.5, 0.0, 0.0])
     moved, touched = relocate(gaussians, jax.random.key(0), jnp.int32(6))
@@ -106,6 +107,7 @@ def test_only_the_given_rows_of_an_optimizer_are_reset():
     assert known == 4  # two moments of two fields
 
 
+@pytest.mark.thorough
 def test_noise_is_as_wide_as_the_gaussian_and_spares_what_is_opaque():
     count = 4000
     gaussians = some([0.001] * count)

@@ -99,6 +99,7 @@ def test_a_descent_that_goes_well_is_left_alone_to_the_bit():
     assert ticks.run.guard.returns == 0
 
 
+@pytest.mark.thorough
 def test_what_diverges_goes_back_to_its_best_with_smaller_steps():
     """Steps beyond the edge of stability; half of them are not."""
     ticks, infos = descended(steep_after=430)
@@ -134,6 +135,7 @@ def test_one_that_is_ended_early_is_settled_by_whoever_ends_it():
     assert ticks.run is before
 
 
+@pytest.mark.thorough
 def test_what_leaves_the_finite_unsaid_comes_back():
     """By a step that does not check itself."""
     ticks, infos = descended(nan_after=777, steps=850)
@@ -141,6 +143,7 @@ def test_what_leaves_the_finite_unsaid_comes_back():
     assert loss_of(ticks) < 1.001e-3
 
 
+@pytest.mark.thorough
 def test_where_no_step_can_be_taken_any_more_it_comes_back():
     """Each is skipped, from parameters where no loss is finite."""
     ticks, _ = descended(sick_after=777, steps=950)
@@ -210,6 +213,7 @@ def test_thrown_by_the_last_step_of_a_window_it_is_not_thrown_again():
     assert now is good
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     "at", [200, 501, *(pytest.param(at, marks=pytest.mark.slow) for at in (433, 500, 750))]
 )
@@ -227,6 +231,7 @@ def test_a_run_that_is_resumed_is_the_same_to_the_bit(tmp_path, at):
     assert again.run.guard.returns == whole.run.guard.returns
 
 
+@pytest.mark.thorough
 def test_a_loss_that_becomes_another_begins_anew_and_returns_are_counted_on():
     ticks, infos = descended(harder_after=600)
     assert float(infos[-1]["loss"]) > 5
@@ -269,6 +274,7 @@ def test_long_stretches_of_usual_runs_are_guarded(name):
     np.testing.assert_array_equal(params if settled.is_settled else guard.best.params, good)
 
 
+@pytest.mark.thorough
 @settings(max_examples=10)
 @given(seed=st.integers(0, 2**31 - 1), noise=st.sampled_from([0.03, 0.3]))
 def test_noise_alone_is_no_loss(seed, noise):
@@ -282,6 +288,7 @@ def test_noise_alone_is_no_loss(seed, noise):
     assert guard.settled(params)[0] is guard
 
 
+@pytest.mark.thorough
 @settings(max_examples=8)
 @given(seed=st.integers(0, 2**31 - 1), views=st.sampled_from([7, 150, 300, 500]))
 def test_one_bad_photograph_is_no_loss(seed, views):

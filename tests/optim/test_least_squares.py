@@ -73,6 +73,7 @@ def test_a_curve_fit_is_that_of_scipy(name, jac):
     np.testing.assert_allclose(infos["loss"][-1], want.cost, rtol=1e-12)
 
 
+@pytest.mark.thorough
 @pytest.mark.usefixtures("x64")
 @pytest.mark.parametrize("name", SOLVERS)
 def test_float32_stays_float32_where_x64_is_on(name):
@@ -234,6 +235,7 @@ def test_many_frames_compile_once():
     assert after == [after[0]] * 4
 
 
+@pytest.mark.thorough
 def test_vmap_is_the_loop():
     batches = [points(noise) for noise in (0.0, 0.02, 0.05)]
     many = jax.tree.map(lambda *a: np.stack(a), *batches)

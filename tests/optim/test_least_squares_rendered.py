@@ -98,6 +98,7 @@ def test_a_pose_is_found_by_levenberg_marquardt_also_with_pixels_missing(scene, 
         assert not info["overflow"].any()
 
 
+@pytest.mark.thorough
 def test_gauss_newton_tracks_poses_from_frame_to_frame_in_a_scan(scene, forward):
     step = least_squares_step(of_pose, SOLVERS["GN"])
     poses = [off_by(seed) for seed in range(3)]
@@ -139,6 +140,7 @@ def of_size(size, batch, *, step, key):
     return image - batch["image"], {"overflow": meta.overflow, "needed": meta.needed}
 
 
+@pytest.mark.thorough
 def test_gaussians_that_outgrow_the_plan_are_rejected(scene, forward):
     nothing = {"scene": scene, "image": jnp.zeros(()), "plan": forward}
     image, at_truth = of_size(jnp.array(2.0), nothing, step=0, key=None)

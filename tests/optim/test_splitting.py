@@ -46,6 +46,7 @@ def pulled(*mean: float, slots: int) -> Pull:
     return Pull(jnp.asarray(total), jnp.full(slots, 2.0))
 
 
+@pytest.mark.thorough
 def test_a_small_one_is_cloned_and_a_large_one_split():
     before = scene([0.05, 0.5, 0.05], slots=6)
     after, touched = divide(before, pulled(2.0, 3.0, 0.5, slots=6), jax.random.key(0), 6, **OPTIONS)

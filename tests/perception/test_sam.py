@@ -330,6 +330,7 @@ def test_the_settings_of_sam2_are_read_from_either_layout(sam2_folder, tmp_path,
     np.testing.assert_allclose(pixels[0, :, 0, 0], -np.array(MEAN) / STD, rtol=1e-6)
 
 
+@pytest.mark.thorough
 def test_without_objects_sam2_is_not_asked_and_labels_of_another_size_are_refused(views):
     images, labels = views
     propagate = Sam2Propagator(None, None, None, None)

@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -35,6 +36,7 @@ def seen_pairs(projected) -> set[tuple[int, int]]:
     return pairs
 
 
+@pytest.mark.thorough
 @given(seed=st.integers(0, 10_000), size=st.sampled_from([0.001, 0.03, 0.3, 3.0]), needle=st.booleans())
 def test_lists_hold_every_pair_that_a_pixel_sees_front_to_back(seed, size, needle):
     rng = np.random.default_rng(seed)
@@ -80,6 +82,7 @@ def test_a_count_beyond_int32_saturates_instead_of_wrapping():
     assert int(total(counts[:10])) == 324_000
 
 
+@pytest.mark.thorough
 def test_the_needed_capacity_is_counted_in_parts_whatever_the_plan_holds():
     rng = np.random.default_rng(0)
     n, plan = 3000, Plan(70, 1600, capacity=0)  # 100 rows of tiles, and 240,000 rows of Gaussians

@@ -100,6 +100,7 @@ def test_more_views_than_indices_reach_are_refused():
         rasterization(**GOOD, width=20, height=10, plan=Plan(20, 10, 2**30))
 
 
+@pytest.mark.thorough
 def test_numpy_arrays_and_half_precision_are_drawn_in_float32():
     arrays = {k: np.asarray(v, np.float16) for k, v in GOOD.items()}
     colors, alphas, _ = rasterization(**arrays, width=20, height=10, plan=Plan(20, 10, 4096))

@@ -79,6 +79,7 @@ def test_vmapped_over_tiles_equals_a_loop():
         np.testing.assert_allclose(together.values[i], composite_tile(splats, grid()).values, atol=1e-14)
 
 
+@pytest.mark.thorough
 @pytest.mark.usefixtures("x64")
 def test_it_is_differentiable_by_plain_autodiff_both_ways():
     splats = random_list(20)

@@ -95,6 +95,7 @@ def test_each_argument_by_central_differences_and_jvp_against_vjp(name):
     assert abs(by_vjp) > 1e-6
 
 
+@pytest.mark.thorough
 @pytest.mark.usefixtures("x64")
 def test_the_dot_product_test_holds_on_scenes_with_every_threshold(small, geometry):
     this, scene = small(1, np.float64, render_mode="RGB+ED", feature_channels=5)
@@ -118,6 +119,7 @@ def test_the_dot_product_test_holds_on_scenes_with_every_threshold(small, geomet
         )
 
 
+@pytest.mark.thorough
 @pytest.mark.usefixtures("x64")
 def test_reverse_plans_refuse_jvp_and_linearize_works_on_forward_ones():
     scene, tangents = smooth_scene(), directions(smooth_scene())
@@ -146,6 +148,7 @@ def assert_close(got, want, rtol=1e-5):
         np.testing.assert_allclose(a, b, atol=rtol * np.abs(b).max() + 1e-30)
 
 
+@pytest.mark.thorough
 def test_runs_are_equal_bit_for_bit(loss_and_plan):
     scene, _, run, _ = loss_and_plan
     for a, b in zip(jax.tree.leaves(run(scene)), jax.tree.leaves(run(scene)), strict=True):
@@ -181,6 +184,7 @@ def test_vmap_over_scenes_equals_a_loop_and_so_do_leading_axes(loss_and_plan):
         assert_close(jax.tree.map(lambda a: a[i], batched), want, 1e-6)  # noqa: B023
 
 
+@pytest.mark.thorough
 def test_many_cameras_equal_each_alone_also_under_vmap(loss_and_plan):
     scene, p, run, loss = loss_and_plan
     cameras = ("viewmats", "Ks", "backgrounds")

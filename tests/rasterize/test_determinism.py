@@ -6,6 +6,7 @@ import sys
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from tests.rasterize.front import GAUSSIANS, TRAINED, cotangent, drawn, plan_for, scene_before
 
@@ -17,6 +18,7 @@ def digest() -> str:
     return hashlib.sha256(b"".join(np.asarray(a).tobytes() for a in arrays)).hexdigest()
 
 
+@pytest.mark.thorough
 def test_five_runs_and_two_processes_are_equal_bit_for_bit():
     command = "import runpy, sys; print(runpy.run_path(sys.argv[1])['digest']())"
     root = Path(__file__).resolve().parents[2]

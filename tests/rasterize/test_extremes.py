@@ -124,6 +124,7 @@ def test_what_cannot_be_drawn_leaves_the_scene_without_it(name):
     assert not any(np.any(gradient[key][0]) for key in GAUSSIANS)
 
 
+@pytest.mark.thorough
 def test_a_needle_longer_than_float64_can_square_equals_itself_in_float64():
     # The reference multiplies out the covariance, and 1e24 beside 1e-3 exceeds its precision too.
     scene = changed(scales=((0, 0), 1e12))(scene_before())
@@ -159,6 +160,7 @@ def test_all_at_equal_depth_are_drawn_in_the_order_of_the_input():
     assert gradient <= 1e-3
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("width", "height"), [(1, 1), pytest.param(1, 4096, marks=pytest.mark.slow), (17, 33)]
 )
@@ -171,6 +173,7 @@ def test_images_of_any_shape(width, height):
     assert gradient <= 1e-3
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("num", [20_000, pytest.param(1_000_000, marks=pytest.mark.slow)])
 def test_a_tile_with_many_layers_equals_the_reference_on_the_layers_that_light_reaches(num):
     reached = 6_000
@@ -196,6 +199,7 @@ def test_a_tile_with_many_layers_equals_the_reference_on_the_layers_that_light_r
         assert not np.any(gradient[key][reached:])
 
 
+@pytest.mark.thorough
 def test_logits_of_100_and_opacities_of_0_and_1_through_gaussians():
     scene = scene_before()
     activated = gaussians_from_activated(*(scene[name] for name in GAUSSIANS))
@@ -220,6 +224,7 @@ def test_logits_of_100_and_opacities_of_0_and_1_through_gaussians():
         assert not np.any(gradient.means[1::2] if gaussians is both[0] else gradient.means[0::2])
 
 
+@pytest.mark.thorough
 def test_more_than_2_to_the_31_pairs_saturate_and_are_an_error_for_a_plan():
     num = 70_000  # by 32,400 tiles: 2.27e9
     arrays = {

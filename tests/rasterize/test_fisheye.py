@@ -75,6 +75,7 @@ def weights():
     return np.random.default_rng(1).normal(size=(1, HEIGHT, WIDTH, 5))
 
 
+@pytest.mark.thorough
 def test_centres_lie_where_opencv_projects_them():
     scene = scene_around(np.float32, widest=1.5)
     straight = np.array([[14.0, 0, 21.0], [0, 13.0, 14.0], [0, 0, 1]])
@@ -88,6 +89,7 @@ def test_centres_lie_where_opencv_projects_them():
     np.testing.assert_allclose(meta.depths[0, seen], np.linalg.norm(means[seen, 0], axis=1), rtol=1e-6)
 
 
+@pytest.mark.thorough
 def test_image_and_gradients_are_those_of_the_reference(weights):
     (_, (got, meta)), slopes = drawn(scene_around(np.float32), np.float32(weights))
     with jax.enable_x64(True):
@@ -103,6 +105,7 @@ def test_image_and_gradients_are_those_of_the_reference(weights):
         assert relative_error(np.asarray(slopes[name]), slope) < (1e-3 if name == "fisheye" else 2e-4), name
 
 
+@pytest.mark.thorough
 @pytest.mark.usefixtures("x64")
 @pytest.mark.parametrize("name", scene_around(np.float32))
 def test_each_argument_by_central_differences_and_jvp_against_vjp(name, weights):
@@ -126,6 +129,7 @@ def test_each_argument_by_central_differences_and_jvp_against_vjp(name, weights)
     assert abs(by_vjp) > 1e-6
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("direction", [(0, 0, 1), (1e-30, 0, 1), (3e-4, -2e-4, 1), (0.09, 0.05, 1)])
 def test_gradients_near_the_axis_are_those_of_the_reference(direction, weights):
     """Where the angle's own quotients are 0/0, and on both sides of the change from series to quotients."""
@@ -161,6 +165,7 @@ def test_what_lies_behind_or_beyond_the_fold_is_not_seen(widest, weights):
             assert not np.asarray(slope)[~seen].any(), name
 
 
+@pytest.mark.thorough
 def test_each_camera_has_its_own_lens(weights):
     scene = scene_around(np.float32)
     lenses = np.stack([COEFFS, np.zeros(4)]).astype(np.float32)
@@ -182,6 +187,7 @@ def test_a_lens_that_is_not_finite_sees_nothing_and_counts_it(weights):
     assert all(np.isfinite(slope).all() for slope in slopes.values())
 
 
+@pytest.mark.thorough
 def test_a_plan_knows_the_lens():
     scene = scene_around(np.float32)
     geometry = [jnp.asarray(scene[name]) for name in (*FIRST[:4], "viewmats", "Ks")]

@@ -35,6 +35,7 @@ def frozen(small, geometry):
     return scene, *freeze_views(*geometry(scene), 33, 17)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("channels", [1, 3, 20])
 def test_what_is_painted_is_what_the_rasterizer_draws(frozen, channels):
     scene, views, plan = frozen
@@ -46,6 +47,7 @@ def test_what_is_painted_is_what_the_rasterizer_draws(frozen, channels):
         np.testing.assert_allclose(opacity, alphas[c], atol=2e-5)
 
 
+@pytest.mark.thorough
 def test_fisheyes_are_painted_as_the_rasterizer_draws_them(small, geometry):
     _, scene = small(3)
     lens = jnp.tile(jnp.array([0.3, -0.05, 0.01, 0.0]), (len(scene["viewmats"]), 1))
@@ -70,6 +72,7 @@ def test_the_padding_of_a_view_is_not_seen(frozen):
         np.testing.assert_array_equal(one, other)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("rows", [1, 2, 3, 5])
 def test_strips_below_each_other_are_the_image(frozen, rows):
     scene, views, plan = frozen
@@ -89,6 +92,7 @@ def _with(strip, values):
     return view, values, plan
 
 
+@pytest.mark.thorough
 def test_slopes_by_the_values_are_those_of_the_whole_rasterizer_and_nothing_else_has_any(frozen):
     scene, views, plan = frozen
     view = view_of(views, 0)
@@ -143,6 +147,7 @@ def test_what_cannot_be_drawn_is_in_no_list(small, geometry):
     assert not (np.asarray(view.rows)[listed] % 3 == 0).any()
 
 
+@pytest.mark.thorough
 def test_a_view_that_sees_nothing_is_empty(small, geometry):
     _, scene = small(5)
     away = dict(scene, means=jnp.asarray(np.asarray(scene["means"]) + np.float32(1e6)))

@@ -52,6 +52,7 @@ def on_kernels(monkeypatch):
     jax.clear_caches()
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("tile_size", [8, 16])
 @pytest.mark.parametrize("masked", [False, True])
 def test_lists_hold_the_same_gaussians_in_the_same_order(tile_size, masked):
@@ -81,6 +82,7 @@ def test_lists_hold_the_same_gaussians_in_the_same_order(tile_size, masked):
             np.testing.assert_array_equal(got, want.ids[view, start : start + count])
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("lanes", [1, pytest.param(32, marks=ON_A_CARD)])
 @pytest.mark.parametrize(
     ("channels", "tile_size"),
@@ -125,6 +127,7 @@ def test_agrees_with_the_float64_reference(seed, on_kernels):
     assert max(errors.values()) < 1e-4, errors
 
 
+@pytest.mark.thorough
 def test_a_plan_that_is_too_small_draws_nothing_and_says_so(on_kernels):
     arrays, views = gaussians(2000, seed=5), cameras()
     plan = gsjax.Plan(WIDTH, HEIGHT, capacity=64)
@@ -141,6 +144,7 @@ def test_a_plan_that_is_too_small_draws_nothing_and_says_so(on_kernels):
     assert (image > 0).any()
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("dtype", [pytest.param("float32", marks=SLOW), "bfloat16"])
 def test_options_of_a_call(dtype, monkeypatch):
     arrays, views = gaussians(600), cameras()
@@ -164,6 +168,7 @@ def test_options_of_a_call(dtype, monkeypatch):
     close(got[0].astype(jnp.float32), want[0].astype(jnp.float32), 1e-5 if dtype == "float32" else 1e-2)
 
 
+@pytest.mark.thorough
 def test_vmap_is_a_loop(on_kernels):
     (means, *others), views = gaussians(200), cameras()
     plan = gsjax.plan(means, *others, *views, WIDTH, HEIGHT, headroom=2.0)

@@ -89,6 +89,7 @@ def test_a_bad_option_is_named_with_what_is_allowed(option, says):
         Plan(**{"width": 64, "height": 48, "capacity": 4096} | option)
 
 
+@pytest.mark.thorough
 def test_options_come_from_the_plan_and_may_be_repeated_but_not_contradicted(small, geometry):
     this, scene = small()
     p = plan(*geometry(scene), this.width, this.height, render_mode="RGB+ED", near_plane=0.2)
@@ -107,6 +108,7 @@ def test_options_come_from_the_plan_and_may_be_repeated_but_not_contradicted(sma
         draw(scene, dataclasses.replace(this, width=34), plan=p)
 
 
+@pytest.mark.thorough
 def test_a_plan_travels_through_jit_vmap_and_scan(small, geometry):
     this, scene = small()
     p = plan(*geometry(scene), this.width, this.height)
@@ -135,6 +137,7 @@ def test_without_a_plan_values_must_be_concrete(small, geometry):
         jax.jit(lambda m: plan(m, *geometry(scene)[1:], this.width, this.height))(scene["means"])
 
 
+@pytest.mark.thorough
 def test_eager_grad_without_a_plan_plans_by_itself(small, geometry):
     this, scene = small()
     p = plan(*geometry(scene), this.width, this.height)
@@ -169,6 +172,7 @@ def test_overflow_draws_nothing_and_is_reported_and_a_larger_plan_fixes_it(small
     np.testing.assert_array_equal(mended, want)
 
 
+@pytest.mark.thorough
 def test_one_camera_overflows_alone_and_a_scan_ors_the_flag(small, geometry):
     this, scene = small()
     p = plan(*geometry(scene), this.width, this.height)
@@ -187,6 +191,7 @@ def test_one_camera_overflows_alone_and_a_scan_ors_the_flag(small, geometry):
     assert not bool(jax.lax.scan(frame, jnp.array(False), frames[::2])[0])
 
 
+@pytest.mark.thorough
 def test_replanning_on_a_known_rung_compiles_nothing_and_a_call_is_traced_once(small, geometry):
     this, scene = small()
     traced = []
@@ -209,6 +214,7 @@ def test_replanning_on_a_known_rung_compiles_nothing_and_a_call_is_traced_once(s
     assert compiled == []
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("headroom", [0.5, 0.0, float("nan")])
 def test_headroom_below_one_is_refused_because_replanning_would_never_end(headroom):
     with pytest.raises(ValueError, match="headroom must be 1 or more"):

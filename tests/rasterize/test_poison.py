@@ -52,6 +52,7 @@ def assert_finite(tree):
         assert np.isfinite(leaf).all()
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("name", "value", "culled"),
     [(name, value, 1) for name in PER_GAUSSIAN for value in (np.nan, np.inf, -np.inf)]
@@ -157,6 +158,7 @@ def test_extremes_that_can_be_drawn_stay_finite(scene, weights, change):
     assert_finite((images, gradient))
 
 
+@pytest.mark.thorough
 @pytest.mark.usefixtures("x64")
 @pytest.mark.parametrize(
     "change",
@@ -214,6 +216,7 @@ def assert_sound(case):
 
 
 # Here one mode with matmuls and one with forward derivatives; all others are in the slow test.
+@pytest.mark.thorough
 @settings(max_examples=150)
 @given(poisons(["channels", "forward"]))
 def test_poison_anywhere_is_culled_and_counted_or_drawn_as_the_reference_draws_it(case):

@@ -31,6 +31,7 @@ def far_away(distance: float):
 
 
 # float32 has a relative precision of 6e-8: half a millimetre at 1e4 m, which here is 0.003 pixels.
+@pytest.mark.thorough
 @pytest.mark.parametrize(("distance", "pixels"), [(1.0, 1e-4), (1e2, 1e-3), (1e4, 0.1), (1e6, 10.0)])
 def test_the_error_in_pixels_grows_with_the_distance_from_the_origin(distance, pixels):
     error, _ = far_away(distance)
@@ -49,6 +50,7 @@ def half_precision(dtype, scene, this):
 
 
 # Half the spacing of values: 2^-9 for bfloat16, 2^-12 for float16.
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("dtype", "spacing"), [(jnp.bfloat16, 2**-9), pytest.param(jnp.float16, 2**-12, marks=pytest.mark.slow)]
 )

@@ -41,6 +41,7 @@ def slopes(scene, plan):
     return jnp.sum(image**2) + jnp.sum(alphas), (image, alphas, meta)
 
 
+@pytest.mark.thorough
 def test_pixel_centres_stand_at_half_x_right_y_down():
     # u = 10 * 0.25 + 8 = 10.5, v = 10 * -0.35 + 8 = 4.5: the centre of column 10, row 4.
     _, alphas, meta = draw16(**one((0.25, -0.35, 1.0)))
@@ -68,6 +69,7 @@ def test_quaternions_need_not_be_unit():
     np.testing.assert_allclose(a[0], b[0], atol=1e-6)
 
 
+@pytest.mark.thorough
 def test_equal_depths_keep_the_order_of_the_input():
     red, blue = one((0, 0, 1), color=(1, 0, 0)), one((0, 0, 1), color=(0, 0, 1))
     over, under = (np.asarray(draw16(**both(*pair))[0])[0, 8, 8] for pair in ((red, blue), (blue, red)))
@@ -75,6 +77,7 @@ def test_equal_depths_keep_the_order_of_the_input():
     np.testing.assert_allclose(over, under[::-1], rtol=1e-6)
 
 
+@pytest.mark.thorough
 def test_opacity_0_and_1_at_their_ends_have_their_gradients():
     @jax.jit
     @jax.value_and_grad
@@ -87,6 +90,7 @@ def test_opacity_0_and_1_at_their_ends_have_their_gradients():
     assert float(beyond[0]) == float(at_end[0])
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(("mode", "channels"), [("RGB", 3), ("D", 1), ("ED", 1), ("RGB+D", 4), ("RGB+ED", 4)])
 def test_channels_of_each_mode_colours_first_depth_last(mode, channels):
     scene = one((0.05, 0.05, 2.0), scale=(0.5, 0.5, 0.5), opacity=0.5, color=(0.2, 0.4, 0.6))
@@ -104,6 +108,7 @@ def seen_twice(scene):
     return scene | {k: np.repeat(scene[k], 2, 0) for k in ("viewmats", "Ks", "backgrounds")}
 
 
+@pytest.mark.thorough
 def test_backgrounds_fill_what_is_left(small):
     _, scene = small()
     backgrounds = np.array(scene["backgrounds"])
@@ -116,6 +121,7 @@ def test_backgrounds_fill_what_is_left(small):
     np.testing.assert_allclose(broken[..., 1], without[..., 1], atol=1e-5)
 
 
+@pytest.mark.thorough
 def test_colours_may_differ_from_camera_to_camera(small):
     _, scene = small()
     colors = np.asarray(scene["colors"])
@@ -125,6 +131,7 @@ def test_colours_may_differ_from_camera_to_camera(small):
         np.testing.assert_allclose(image, np.asarray(drawn(scene | {"colors": alone})[0])[0], atol=1e-6)
 
 
+@pytest.mark.thorough
 def test_roi_draws_the_tiles_it_touches_exactly_and_leaves_the_others_to_the_background(small):
     this, scene = small()
     width, height = this.width, this.height
@@ -170,6 +177,7 @@ def test_no_gaussians_show_the_background(batch):
     assert not np.any(meta.needed)
 
 
+@pytest.mark.thorough
 def test_cameras_that_see_nothing_are_empty_with_zero_gradients(small):
     _, scene = small()
     viewmats = np.array(scene["viewmats"])
@@ -180,6 +188,7 @@ def test_cameras_that_see_nothing_are_empty_with_zero_gradients(small):
     assert all(not np.any(gradient[k]) for k in gradient if k != "backgrounds")
 
 
+@pytest.mark.thorough
 @pytest.mark.usefixtures("x64")
 @pytest.mark.parametrize(
     ("width", "height"), [(17, 33), *(pytest.param(1, h, marks=pytest.mark.slow) for h in (1, 64))]
@@ -210,6 +219,7 @@ def test_meta_tells_radii_and_depths_of_what_is_visible(small, geometry):
     assert int(meta.needed[0]) >= int(meta.pairs[0]) > 0
 
 
+@pytest.mark.thorough
 def test_the_offset_moves_projected_means_and_reads_their_gradient():
     scene = one((0.25, -0.35, 1.0))
     offset = np.float32([[[2.0, 3.0]]])
@@ -219,6 +229,7 @@ def test_the_offset_moves_projected_means_and_reads_their_gradient():
     assert float(np.asarray(slope(0 * offset))[0, 0, 0]) > 0.01
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     "options",
     [{"tiles_per_batch": 2}, {"tile_size": 4}, {"tile_size": 16}, {"tile_size": 32}, {"sort": "device"}],
@@ -249,6 +260,7 @@ def test_reads_of_an_earlier_call_change_nothing_but_the_order_of_work(small):
         np.testing.assert_array_equal(again[2].reads, meta.reads)
 
 
+@pytest.mark.thorough
 def test_a_cap_on_lists_draws_the_nearest_alone(small):
     _, scene = small(3)
     whole = {"width": 32, "height": 16, "tile_size": 32}  # one tile
@@ -280,6 +292,7 @@ def test_a_saturated_tile_is_read_no_further():
     assert int(meta.reads.max()) <= 8  # 0.1^4 is the early stop
 
 
+@pytest.mark.thorough
 def test_any_capacity_serves_many_cameras(small):
     # Lists are laid out in rows of 256, so the next camera's begin a little after this one's capacity.
     _, scene = small()

@@ -262,6 +262,7 @@ def test_cameras_over_four_devices(more_on_four):
     assert more_on_four["cameras"]["part"] == [[1, HEIGHT, WIDTH, 4]] * 4
 
 
+@pytest.mark.thorough
 def test_scenes_and_cameras_over_two_by_two_devices(on_four):
     assert_same(on_four["scenes"])
     assert on_four["scenes"]["part"] == [[1, 1, HEIGHT, WIDTH, 4]] * 4
@@ -308,6 +309,7 @@ def test_every_argument_is_known():
     assert set(sharding._ARRAYS) == {*sharding._PER_SCENE, *sharding._PER_CAMERA, "colors"}
 
 
+@pytest.mark.thorough
 def test_one_device_is_the_plain_call(one_device_mesh):
     scene = jax.tree.map(jnp.asarray, a_scene((), 2, extras=False))
     plan = gsjax.Plan(WIDTH, HEIGHT, 4096)
@@ -318,6 +320,7 @@ def test_one_device_is_the_plain_call(one_device_mesh):
     )
 
 
+@pytest.mark.thorough
 def test_a_plan_without_a_capacity_keeps_its_options(one_device_mesh):
     scene = jax.tree.map(jnp.asarray, a_scene((), 2, extras=False))
     scene["means2d_offset"] = jnp.full((2, N, 2), 5.0)
@@ -363,6 +366,7 @@ class TestErrors:
         with pytest.raises(ValueError, match="means must be an array; got list"):
             self.call((), 2, {"cameras": "cameras"}, {"means": [[0.0, 0.0, 0.0]]})
 
+    @pytest.mark.thorough
     @pytest.mark.parametrize(
         ("axes", "message"),
         [

@@ -36,6 +36,7 @@ def test_both_ways_sort_as_numpy_does(seed, length, top):
         np.testing.assert_array_equal(order, np.argsort(keys, kind="stable"))
 
 
+@pytest.mark.thorough
 @given(st.integers(0, 2**32), st.sampled_from([0, 1, 2, 17, 1000]), st.sampled_from([1, 3, 2**32]))
 def test_both_ways_sum_and_repeat_as_numpy_does(seed, length, top):
     rng = np.random.default_rng(seed)
@@ -133,6 +134,7 @@ def test_without_the_interface_xla_sorts(monkeypatch):
     np.testing.assert_array_equal(argsort_keys(jnp.array([3, 1, 2], jnp.uint32)), [1, 2, 0])
 
 
+@pytest.mark.thorough
 @pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="cores cannot be chosen on this system")
 def test_one_core_does_not_hang():
     # jax.pure_callback does: its only worker waits for a copy that the same worker would have to make.
@@ -148,6 +150,7 @@ def test_one_core_does_not_hang():
     subprocess.run([sys.executable, "-c", program], check=True, timeout=120)
 
 
+@pytest.mark.thorough
 def test_a_program_may_end_while_a_call_is_under_way():
     # The host's work needs the interpreter, which is gone by then unless the exit waits for it.
     program = (
@@ -161,6 +164,7 @@ def test_a_program_may_end_while_a_call_is_under_way():
     subprocess.run([sys.executable, "-c", program], check=True, timeout=120)
 
 
+@pytest.mark.thorough
 def test_a_checkpoint_may_repeat_the_call():
     def last(x):
         return x * argsort_keys((x * 7919).astype(jnp.uint32) % 101)[-1].astype(x.dtype)

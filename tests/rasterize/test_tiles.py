@@ -19,6 +19,7 @@ def plan_of(width: int, height: int, tile_size: int = 4) -> Plan:
     return Plan(width=width, height=height, capacity=0, tile_size=tile_size)
 
 
+@pytest.mark.thorough
 @given(st.integers(1, 20), st.integers(1, 20), st.integers(1, 3), st.integers(0, 3))
 def test_tiles_make_an_image_and_come_from_it(width, height, views, channels):
     plan = plan_of(width, height)
@@ -48,6 +49,7 @@ def test_tiles_are_written_where_they_belong_and_none_where_there_is_none():
     np.testing.assert_array_equal(found[others], in_tiles(image, plan).swapaxes(1, 2)[others])
 
 
+@pytest.mark.thorough
 def test_many_channels_are_those_of_images_of_few(small, geometry):
     """Values, and gradients by every argument. Nine tiles a camera, in batches of eight."""
     size = 24, 17
@@ -75,6 +77,7 @@ def test_many_channels_are_those_of_images_of_few(small, geometry):
         np.testing.assert_allclose(one, other, atol=1e-5 * max(1.0, float(jnp.abs(other).max())))
 
 
+@pytest.mark.thorough
 def test_many_channels_forwards_backwards_and_side_by_side(small, geometry):
     """jvp against vjp, and vmap against a loop, of views with an odd number of tiles."""
     random, channels = np.random.default_rng(2), FEW_CHANNELS + 1
@@ -105,6 +108,7 @@ def test_many_channels_forwards_backwards_and_side_by_side(small, geometry):
         np.testing.assert_allclose(jnp.vdot(weights, many[1][c]), jnp.vdot(many[2][c], tangent[c]), rtol=1e-4)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("dtype", [jnp.bfloat16, jnp.float32])
 def test_many_channels_of_no_gaussian_and_in_half_precision(dtype, small, geometry):
     _, scene = small(3, width=24, height=17)

@@ -112,6 +112,7 @@ class TestField:
         np.testing.assert_array_equal(found.log_scales, gaussians.log_scales)
         np.testing.assert_allclose(matrices(found.quats), matrices(gaussians.quats), atol=1e-6)
 
+    @pytest.mark.thorough
     @pytest.mark.usefixtures("x64")
     def test_slopes(self, kind):
         gaussians = scene(features=2)
@@ -146,6 +147,7 @@ class TestField:
         np.testing.assert_array_equal(some.means[still], gaussians.means[still])
         np.testing.assert_array_equal(some.quats[still], gaussians.quats[still])
 
+    @pytest.mark.thorough
     def test_nodes_at_every_gaussian_are_the_gaussians(self, kind):
         gaussians = scene(features=2)
         config = self.config(kind, color=True, opacity=True, feature=True)
@@ -182,6 +184,7 @@ def test_sizes_are_checked(options, words):
         DeformationConfig(**options)
 
 
+@pytest.mark.thorough
 def test_a_field_of_features_needs_them():
     config = DeformationConfig(**SMALL, semantic=True)
     with pytest.raises(ValueError, match="feature_size"):

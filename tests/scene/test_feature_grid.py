@@ -124,6 +124,7 @@ class TestConfig:
 
 
 class TestInit:
+    @pytest.mark.thorough
     @pytest.mark.parametrize("depth", [0, 1, 2])
     def test_shapes_and_counts(self, depth):
         config = FeatureGridConfig(4, 4, 18, 9, features=2, hidden=5, depth=depth)
@@ -175,6 +176,7 @@ class TestFormula:
         found = encoded(grid, located_in(grid, positions))
         np.testing.assert_allclose(found, expected, atol=1e-12)
 
+    @pytest.mark.thorough
     def test_the_network_is_relu_between_affine_maps(self):
         grid = some_grid(FeatureGridConfig(4, 4, 18, 9, 2, hidden=5, depth=2))
 
@@ -285,6 +287,7 @@ def forward_and_back(arguments, tangents, cotangent):
 
 
 class TestDerivatives:
+    @pytest.mark.thorough
     @pytest.mark.usefixtures("x64")
     def test_by_everything_against_finite_differences(self):
         """Away from faces of cells and from ReLU's kink, which have only one-sided derivatives."""
@@ -352,6 +355,7 @@ def test_nan_makes_one_row_nan_and_touches_no_gradient(axis):
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-6), gradients, wanted)
 
 
+@pytest.mark.thorough
 def test_it_learns_a_segmentation_of_the_box():
     """As in the warm-up of skinning weights: two halves of the box belong to two parts."""
     config = FeatureGridConfig(4, 4, 18, 9, features=2, hidden=16)

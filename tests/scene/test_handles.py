@@ -95,6 +95,7 @@ class TestLaws:
             np.testing.assert_allclose(moved.means, expected.means, atol=1e-9)
             np.testing.assert_allclose(rotated(moved), rotated(expected), atol=1e-9)
 
+    @pytest.mark.thorough
     @pytest.mark.parametrize("seed", range(3))
     def test_derivatives(self, blend, seed):
         gaussians, weights, centers, pose = made_up(seed, num=3, most=1.0)
@@ -112,6 +113,7 @@ class TestLaws:
             np.testing.assert_allclose(batch.means[i], one.means, atol=1e-12)
             np.testing.assert_allclose(batch.quats[i], one.quats, atol=1e-12)
 
+    @pytest.mark.thorough
     def test_handles_that_look_opposite_ways_give_numbers(self, blend):
         """Half a turn apart and with equal weights, no rotation between them is preferred."""
         gaussians, _, centers, pose = made_up(1)

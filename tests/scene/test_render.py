@@ -53,6 +53,7 @@ def test_cameras_are_stacked_along_a_first_axis(cameras):
     assert (cameras.width, cameras.height) == (WIDTH, HEIGHT)
 
 
+@pytest.mark.thorough
 def test_it_is_the_rasterizer_on_activated_values(scene, cameras):
     features = jnp.asarray(np.random.default_rng(1).normal(size=(scene.num, 5)), jnp.float32)
     backgrounds = jnp.array([[0.1, 0.2, 0.3], [0.9, 0.8, 0.7]])
@@ -81,6 +82,7 @@ def test_it_is_the_rasterizer_on_activated_values(scene, cameras):
     assert float(ours.alphas.max()) > 0.5
 
 
+@pytest.mark.thorough
 def test_the_scenes_own_features_are_taken_unless_others_are_given(scene, cameras):
     assert render(scene, cameras).features is None
     ones = jnp.ones((scene.num, 2))
@@ -91,6 +93,7 @@ def test_the_scenes_own_features_are_taken_unless_others_are_given(scene, camera
     np.testing.assert_allclose(twice.features, 2 * drawn.features, atol=1e-5)
 
 
+@pytest.mark.thorough
 def test_visibility_gives_each_camera_its_own_opacities(scene, cameras):
     visibility = jnp.asarray(np.random.default_rng(2).uniform(size=(2, scene.num)), jnp.float32)
     visibility = visibility.at[0, :10].set(0.0)
@@ -110,6 +113,7 @@ def test_visibility_gives_each_camera_its_own_opacities(scene, cameras):
         np.testing.assert_allclose(together.alphas[c], alone.alphas[0], atol=2e-6)
 
 
+@pytest.mark.thorough
 def test_full_visibility_changes_nothing(scene, cameras):
     plan = plan_render(scene, cameras)
     plain, factored = render(scene, cameras, plan), render(scene, cameras, plan, visibility=jnp.ones((2, 30)))
@@ -118,6 +122,7 @@ def test_full_visibility_changes_nothing(scene, cameras):
     assert factored.meta.overflow.shape == plain.meta.overflow.shape
 
 
+@pytest.mark.thorough
 def test_gradients_reach_the_scene_the_cameras_and_the_visibility(scene, cameras):
     plan = plan_render(scene, cameras)
 
@@ -133,6 +138,7 @@ def test_gradients_reach_the_scene_the_cameras_and_the_visibility(scene, cameras
         assert jnp.abs(gradient).max() > 0
 
 
+@pytest.mark.thorough
 def test_a_region_of_interest_leaves_the_rest_alone(scene, cameras):
     roi = jnp.zeros((2, HEIGHT, WIDTH), bool).at[:, :16, :16].set(True)
     plan = plan_render(scene, cameras)
@@ -141,6 +147,7 @@ def test_a_region_of_interest_leaves_the_rest_alone(scene, cameras):
     assert float(jnp.abs(part.alphas[:, 16:, 16:]).max()) == 0
 
 
+@pytest.mark.thorough
 def test_a_plan_holds_its_scene_and_takes_options(scene, cameras):
     plan = plan_render(scene, cameras, headroom=2.0, rasterize_mode="antialiased")
     assert plan.rasterize_mode == "antialiased"
@@ -155,6 +162,7 @@ def test_under_a_trace_a_plan_is_required(scene, cameras):
         jax.jit(lambda g: render(g, cameras).colors)(scene)
 
 
+@pytest.mark.thorough
 def test_a_plan_is_made_kept_and_grown_as_needed(scene, cameras):
     wanted = render(scene, cameras).colors
     drawn, plan = render_with_room(scene, cameras)
@@ -169,6 +177,7 @@ def test_a_plan_is_made_kept_and_grown_as_needed(scene, cameras):
     assert render_with_room(bare, cameras, plan)[1].sh_degree == 1  # another degree requires another plan
 
 
+@pytest.mark.thorough
 def test_nothing_before_the_cameras_near_plane_is_drawn():
     """A plan takes the near plane from the cameras that it is made for."""
     means = jnp.array([[0.0, 0.0, 0.3], [0.0, 0.0, 2.0]])  # the first is right in front of the camera

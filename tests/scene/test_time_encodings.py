@@ -56,6 +56,7 @@ def test_gradients_of_positions_reach_the_surface_and_end_there():
 
 @pytest.mark.usefixtures("x64")
 class TestHexPlane:
+    @pytest.mark.thorough
     def test_is_the_product_of_six_planes(self):
         planes, rng = random_planes(), np.random.default_rng(1)
         places = np.concatenate([rng.uniform(size=(6, 3)), [[0, 0, 0], [1, 1, 1], [0.25, 0.5, 1]]])
@@ -73,6 +74,7 @@ class TestHexPlane:
         places = jnp.asarray(np.random.default_rng(2).uniform(0.05, 0.95, (4, 3)))
         check_grads(jax.jit(lambda p, x, t: p(x, t)), (planes, places, jnp.asarray(0.45)), order=1, rtol=1e-5)
 
+    @pytest.mark.thorough
     def test_vmap_over_times_is_a_loop(self):
         planes, places = random_planes(), jnp.asarray(np.random.default_rng(3).uniform(size=(5, 3)))
         times = jnp.linspace(0.0, 1.0, 3)
@@ -102,6 +104,7 @@ class TestSinusoids:
 
 
 class TestVoxels:
+    @pytest.mark.thorough
     def test_position_and_time_are_encoded_separately(self):
         voxels = init_voxels(jax.random.key(0), 4, 3, 2, outputs=5)
         places = jnp.asarray(np.random.default_rng(5).uniform(size=(6, 3)), jnp.float32)

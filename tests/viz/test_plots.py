@@ -67,6 +67,7 @@ def test_saving_twice_gives_the_same_bytes_and_leaves_no_state(tmp_path, suffix)
     assert pyplot.get_fignums() == []
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("plot", [plots.update_time, lambda x: plots.error_over_frames({"a": x})])
 @pytest.mark.parametrize("values", [np.full(3, np.nan), np.zeros(0), np.ones(1)])
 def test_little_or_nothing_to_draw(plot, values, tmp_path):

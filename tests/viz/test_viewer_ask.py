@@ -62,6 +62,7 @@ def scene(answers):
     return Viewable("balls", both, np.repeat([1, 2], 150), shots=shots, asking=answers.asking())
 
 
+@pytest.mark.thorough
 def test_a_query_is_answered_shown_and_saved(scene, answers):
     with open_viewer(scene, port=0) as viewer, browser(viewer, scene) as (page, _):
         folder = page._questions

@@ -29,6 +29,7 @@ def counted(monkeypatch):
     return traces
 
 
+@pytest.mark.thorough
 def test_moving_compiles_nothing_unless_a_plan_grows(monkeypatch):
     """From far away few tiles are touched, from close by all of them, which requires another plan."""
     traces, drawer = counted(monkeypatch), Drawer((0.2, 0.4, 0.6))
@@ -79,6 +80,7 @@ def test_pictures_of_what_was_drawn():
     assert near > far
 
 
+@pytest.mark.thorough
 def test_recoloured_gaussians_have_that_colour_from_all_sides():
     gaussians = cloud(shN=np.ones((24, 3, 3)))
     red = recolored(gaussians, np.tile([1.0, 0, 0], (24, 1)))

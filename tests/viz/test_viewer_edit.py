@@ -89,6 +89,7 @@ class Edits:
         return Path("edit") / name
 
 
+@pytest.mark.thorough
 def test_a_list_is_composed_previewed_and_reset():
     edits = Edits()
     scene = rising(ball(RED, 0.0), 4, edits.editing())
@@ -132,6 +133,7 @@ def test_a_list_is_composed_previewed_and_reset():
         until(lambda: set(page._splats._nodes) == {"moving"})
 
 
+@pytest.mark.thorough
 def test_playback_continues_with_the_preview():
     scene = rising(ball(RED, 0.0), 4, Edits().editing())
     with open_viewer(scene, port=0) as viewer, browser(viewer, scene) as (page, _):

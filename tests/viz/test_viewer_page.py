@@ -148,6 +148,7 @@ def color_share(picture, color):
     return {name: part.mean() for name, part in parts.items()}
 
 
+@pytest.mark.thorough
 def test_a_page_from_the_first_picture_to_the_last_screenshot(scene):
     saved = Saved()
     with open_viewer(scene, port=0, save=saved) as viewer, browser(viewer, scene) as (page, socket):
@@ -236,6 +237,7 @@ def test_a_page_can_be_used_while_it_is_built(scene, monkeypatch):
         until(lambda: "green ball" in page._legend.content)
 
 
+@pytest.mark.thorough
 def test_a_page_of_a_plain_scene_offers_no_more_than_it_has(scene):
     plain = Viewable("plain", scene.at(0), up=np.array([0.0, 0, 1]))
     with open_viewer(plain, port=0, max_gaussians=100) as viewer, browser(viewer, plain) as (page, _):

@@ -52,6 +52,7 @@ def test_pick_finds_what_brute_force_finds():
     assert 4 < hits < 16
 
 
+@pytest.mark.thorough
 def test_pick_agrees_with_the_picture():
     """Small Gaussians, one channel each: in a pixel, the rasterizer's largest weight is that of the pick."""
     count = 20

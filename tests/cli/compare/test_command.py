@@ -193,6 +193,7 @@ def test_what_is_not_alike_is_left_out_and_said(make, gsjax_compare):
     assert "MS-SSIM and LPIPS are absent for d: gsjax eval RUN adds them" in notes
 
 
+@pytest.mark.thorough
 def test_runs_of_the_tracker_are_compared_and_kinds_not_mixed(
     make, gsjax_compare, recording, still, gsjax_track, tmp_path
 ):

@@ -58,6 +58,7 @@ def scene(tmp_path_factory):
     return written(tmp_path_factory.mktemp("asked") / "run")
 
 
+@pytest.mark.thorough
 def test_an_answer_is_a_sentence(gsjax, scene):
     code, said = gsjax("ask", scene, "Where is the tool in frame 6?")
     assert code == 0

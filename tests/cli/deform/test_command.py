@@ -29,6 +29,7 @@ def deformed(tmp_path_factory):
     return run
 
 
+@pytest.mark.thorough
 def test_what_a_run_writes(deformed):
     found = metrics(deformed)
     assert (found["kind"], found["complete"], found["steps"], found["skipped"]) == ("deform", True, 30, 0)

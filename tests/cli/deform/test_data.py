@@ -63,6 +63,7 @@ def test_frames_without_a_mask_are_left_out_with_the_tools_and_said():
         read(recording(masked=[1]))
 
 
+@pytest.mark.thorough
 def test_the_scene_begins_where_most_classes_are_seen():
     """The instrument comes in at frame 4, as a few pixels first; frame 5 has no depth."""
     seen = recording()

@@ -42,6 +42,7 @@ def result(kind="hexplane", nodes=0, features=0, moves=True, rows=False):
     )
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     "given",
     [
@@ -151,6 +152,7 @@ def _with(given, **changes):
     return replace(given, timeline=given.timeline._replace(**changes))
 
 
+@pytest.mark.thorough
 @pytest.mark.usefixtures("as_users_run")
 @pytest.mark.parametrize("change", [{"timeline": 3}, {"meaning": 3}, {"moving": "x"}])
 def test_parts_of_other_kinds(change, tmp_path):

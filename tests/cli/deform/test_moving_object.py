@@ -137,6 +137,7 @@ def test_poses_are_interpolated_between_different_times_only(sequence, data):
         Deform(DeformConfig(refine_poses=True)).start(frames, hull=True)
 
 
+@pytest.mark.thorough
 def test_a_run_is_learned_and_scored_on_white(gsjax, folder, tmp_path):
     run = tmp_path / "run"
     code, said = gsjax("deform", folder, "--out", run, *SMALL, "--deform.rates.quats", 1e-3)
@@ -191,6 +192,7 @@ def test_a_run_of_an_earlier_version_goes_on_as_it_was_begun(gsjax, folder, inte
     assert json.loads((tmp_path / "run" / "metrics.json").read_text())["preset"] == "surst"
 
 
+@pytest.mark.thorough
 def test_the_verb_learns_from_all_frames_that_it_is_given(sequence):
     train = sequence.select([t for t, split in enumerate(sequence.splits) if split == "train"])
     for given in (sequence, train):
@@ -200,6 +202,7 @@ def test_the_verb_learns_from_all_frames_that_it_is_given(sequence):
         np.testing.assert_array_equal(problem.background, [[1, 1, 1]])
 
 
+@pytest.mark.thorough
 def test_without_settings_the_verb_takes_those_that_suit(sequence):
     assert gs.deform(sequence).method.config == PRESETS["around"]
     tissue = open_sequence("simulated:tissue?width=32&height=26&frames=2")

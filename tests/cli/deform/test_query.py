@@ -76,6 +76,7 @@ def asked(run):
     return json.loads((run / "query" / "query.json").read_text())
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("text", [(), ("tool",)])
 def test_an_answer_elsewhere_and_without_pictures(gsjax, taught, tmp_path, text):
     out = tmp_path / "answer"
@@ -120,6 +121,7 @@ def test_a_name_is_found_and_deleted_in_every_frame(gsjax, run):
     assert len(read_video_frames(folder / "video.mp4")) == 10
 
 
+@pytest.mark.thorough
 def test_a_point_and_a_box_mean_what_is_rendered_there(gsjax, run):
     """Where both kinds lie in a box, its mean is held against what is the less like it."""
     for option, where, meant in (

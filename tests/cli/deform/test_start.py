@@ -95,6 +95,7 @@ def test_what_there_is_is_taken_first():
         with_depth(together, "auto", 1.0, notes)
 
 
+@pytest.mark.thorough
 def test_in_python_each_kind_of_warning_is_given_once():
     grey = replace(open_sequence(EYES), load_image=lambda t, c: np.full((80, 96, 3), 9 + c, np.uint8))
     with pytest.warns(DataWarning) as caught:
@@ -124,6 +125,7 @@ def test_photographs_that_were_placed_are_frames(gsjax, photographs, tmp_path):
         sequence_of(replace(some, sizes=sizes))
 
 
+@pytest.mark.thorough
 def test_what_is_not_there_is_named(gsjax, clip, tmp_path):
     code, said = gsjax("deform", clip, "--out", tmp_path / "run", "--depth", "data")
     assert code == 2

@@ -68,6 +68,7 @@ def data_of(features, folder, channels=4, **asked):
     return deform_data(open_sequence(SCENE), 8, "draw", *given), " ".join(notes.all)
 
 
+@pytest.mark.thorough
 def test_feature_files_are_learned_and_judged_on_their_grid(learned):
     found = json.loads((learned / "metrics.json").read_text())
     assert found["features"] == "files"
@@ -80,6 +81,7 @@ def test_feature_files_are_learned_and_judged_on_their_grid(learned):
     assert stored.scene.gaussians.features.shape[1] == 4
 
 
+@pytest.mark.thorough
 def test_what_files_taught_is_asked_by_place_and_without_a_prompt(learned):
     mask = open_sequence(SCENE).mask(0, 0) > 0
     y, x = (int(np.median(axis)) for axis in np.nonzero(mask))
@@ -306,6 +308,7 @@ def test_maps_of_zeros_say_nothing(tmp_path):
         data_of(tmp_path, tmp_path)
 
 
+@pytest.mark.thorough
 def test_of_one_name_all_are_that_and_nothing_is_asked(learned, tmp_path, capsys):
     run = tmp_path / "run"
     run.mkdir()

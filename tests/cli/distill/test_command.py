@@ -15,6 +15,7 @@ from gsjax.io.ply import read_ply, write_ply
 from tests.cli.distill.conftest import SMALL, metrics
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("place", ["", "canonical"])
 def test_a_field_never_replaces_its_scene(gsjax, pristine, scene, tmp_path, place):
     run = tmp_path / "run"
@@ -67,6 +68,7 @@ def test_what_cannot_be_done_is_refused_before_anything_is(
     assert not Path("field").exists()
 
 
+@pytest.mark.thorough
 def test_views_that_are_odd_cost_nothing_but_themselves(gsjax, recording, scene, tmp_path):
     shutil.rmtree(recording / "seg/1")
     (recording / "ims/2/000000.png").write_bytes(b"no picture")
@@ -84,6 +86,7 @@ def test_views_that_are_odd_cost_nothing_but_themselves(gsjax, recording, scene,
     assert all((tmp_path / "field" / row["picture"]).is_file() for row in found["scores"])
 
 
+@pytest.mark.thorough
 def test_a_run_goes_on_with_what_it_was_begun_with_or_not_at_all(
     gsjax, interrupted, recording, scene, tmp_path
 ):
@@ -121,6 +124,7 @@ def test_a_run_goes_on_with_what_it_was_begun_with_or_not_at_all(
     assert gsjax(*told, "--resume")[0] == 0
 
 
+@pytest.mark.thorough
 def test_a_run_is_told_by_what_paths_mean_not_by_how_they_are_typed(monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     for name in ("features", "clip", "sam"):

@@ -42,6 +42,7 @@ def ahead(distance, K, width, height):
     return Camera(jnp.asarray(pose), jnp.asarray(K, jnp.float32), width, height)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("encoding", ["grid", "table"])
 def test_a_picture_of_features_needs_three_numbers_a_pixel(scene, encoding):
     gaussians = some_of(scene, 40)
@@ -69,6 +70,7 @@ def test_a_picture_of_features_needs_three_numbers_a_pixel(scene, encoding):
     assert len(kinds) == 1  # one program for both
 
 
+@pytest.mark.thorough
 def test_classes_of_a_picture_are_found_strip_by_strip(scene, monkeypatch):
     gaussians = some_of(scene, 20)
     grid = FeatureGridConfig(levels=2, most_resolution=32, log2_entries=8, hidden=8)
@@ -94,6 +96,7 @@ def test_classes_of_a_picture_are_found_strip_by_strip(scene, monkeypatch):
         assert len(np.unique(one)) > 3
 
 
+@pytest.mark.thorough
 def test_a_scene_has_one_colour_a_gaussian_from_one_camera():
     random = np.random.default_rng(0)
     means, quats = random.uniform(-1, 1, (20, 3)), random.normal(size=(20, 4))

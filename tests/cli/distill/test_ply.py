@@ -65,6 +65,7 @@ def test_a_file_that_says_it_is_antialiased_is_drawn_so(pristine, scene, tmp_pat
         assert opened.rasterize_mode == ("antialiased" if antialiased else "classic")
 
 
+@pytest.mark.thorough
 def test_a_distillation_writes_all_that_it_promises(distilled):
     found = json.loads((distilled / "metrics.json").read_text())
     assert (found["kind"], found["complete"], found["steps"]) == ("distill", True, STEPS)
@@ -89,6 +90,7 @@ def _told(run):
     return json.loads((run / "query" / "query.json").read_text())
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("preset", ["vote", "solve"])
 def test_a_field_without_descent_takes_passes_over_the_views(gsjax, pristine, scene, tmp_path, preset):
     """Its vectors are one for each class, and name most of what the masks show."""
@@ -148,6 +150,7 @@ def test_resumed_it_is_the_same_field(gsjax, interrupted, pristine, scene, disti
     assert ours == theirs
 
 
+@pytest.mark.thorough
 def test_a_field_is_found_within_the_run_of_its_scene(gsjax, pristine, scene, tmp_path):
     run = tmp_path / "run"
     run.mkdir()
@@ -217,6 +220,7 @@ def test_what_was_encoded_is_not_encoded_again(gsjax, pristine, scene, distilled
     assert sorted(cache.rglob("*.npz")) == sorted(kept)
 
 
+@pytest.mark.thorough
 def test_files_of_features_are_read_and_checked(gsjax, pristine, scene, tmp_path):
     folder = tmp_path / "features"
     random = np.random.default_rng(0)
@@ -271,6 +275,7 @@ def test_a_distillation_that_cannot_be_done(gsjax, pristine, scene, tmp_path, op
     assert not (tmp_path / "field").exists()
 
 
+@pytest.mark.thorough
 def test_what_is_missing_is_said(gsjax, pristine, scene, tmp_path):
     code, said = gsjax("distill", scene, "--out", tmp_path / "x")
     assert code == 2

@@ -27,6 +27,7 @@ def shown(pristine):
     return jax.tree.map(jnp.asarray, first_picture(pristine)[0]), photographs_of(sequence)
 
 
+@pytest.mark.thorough
 def test_a_scene_and_photographs_make_a_field_that_answers_and_goes_on(shown, tmp_path):
     scene, photographs = shown
     for now in distill(scene, photographs, "classes", SMALL):
@@ -48,6 +49,7 @@ def test_a_scene_and_photographs_make_a_field_that_answers_and_goes_on(shown, tm
         jax.tree.map(np.testing.assert_array_equal, one, other)
 
 
+@pytest.mark.thorough
 def test_features_on_three_levels_are_learned_together(shown, pristine, tmp_path):
     """Files in LangSplat's layout: objects one by one, can and carton together, and all of them."""
     scene, photographs = shown
@@ -84,6 +86,7 @@ def test_features_on_three_levels_are_learned_together(shown, pristine, tmp_path
         result.scores(np.ones((1, 60)))
 
 
+@pytest.mark.thorough
 def test_a_teacher_of_ones_own_needs_an_encoder_for_texts_alone(shown):
     scene, photographs = shown
     masks = [photographs.labels(i).astype(int) for i in range(photographs.num)]

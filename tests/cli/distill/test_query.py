@@ -88,6 +88,7 @@ def test_an_answer_elsewhere_and_without_pictures(gsjax, closed, tmp_path):
     np.testing.assert_array_equal(found_of(field)["indices"], elsewhere["indices"])
 
 
+@pytest.mark.thorough
 def test_a_text_within_another_finds_what_both_mean(gsjax, field, closed, scene, tmp_path):
     """In the field of colours and names, the blue things within the can; and within it no ball."""
     closed = shutil.copytree(closed, tmp_path / "closed")
@@ -106,6 +107,7 @@ def test_a_text_within_another_finds_what_both_mean(gsjax, field, closed, scene,
     assert "'ball' within 'can' matches nothing in this scene" in said
 
 
+@pytest.mark.thorough
 def test_a_query_is_of_the_level_that_it_fits_best_or_of_a_given_one(gsjax, pristine, scene, tmp_path):
     """On the smallest level a can is a can; on the largest all things are one, but for the background."""
     book = ClassCodebook(NAMES | {9: "everything"})
@@ -238,6 +240,7 @@ def test_a_point_means_the_thing_that_it_shows(gsjax, field, scene, pristine):
     assert sorted(told["against"]) == sorted(set(LABELS.values()) - {"carton"})
 
 
+@pytest.mark.thorough
 def test_negatives_are_what_it_is_held_against(gsjax, field, closed, tmp_path):
     assert gsjax("query", field, "can", "--negatives", "ball", "--threshold", 0.9)[0] == 0
     told = told_of(field)
@@ -280,6 +283,7 @@ def test_everything_is_an_answer_with_a_warning(gsjax, field):
     assert len(panels(field / "query")) == 4  # nor is there a picture of it
 
 
+@pytest.mark.thorough
 def test_rows_that_cannot_be_drawn_are_counted_and_rows_are_the_files(gsjax, pristine, scene, tmp_path):
     gaussians, _ = read_ply(scene[0])
     means = np.array(gaussians.means)

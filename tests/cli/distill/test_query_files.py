@@ -27,6 +27,7 @@ def change(field, how):
 # where it looks
 
 
+@pytest.mark.thorough
 def test_a_scene_is_found_by_what_is_in_it(gsjax, field, scene, tmp_path):
     """Where it was there is another one now; the run that was moved whole has it in canonical/."""
     run = tmp_path / "run"

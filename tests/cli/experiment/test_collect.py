@@ -182,6 +182,7 @@ def test_files_that_were_damaged_are_named(toy, gsjax, text):
     assert f"{cell_files()[0]}: expected " in err
 
 
+@pytest.mark.thorough
 def test_the_one_in_the_docs_runs(toy, gsjax):
     folder = toy()
     page = (Path(__file__).resolve().parents[3] / "docs" / "experiments.md").read_text(encoding="utf-8")

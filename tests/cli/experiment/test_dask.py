@@ -93,6 +93,7 @@ def kill_once_begun(count: int) -> threading.Thread:
     return thread
 
 
+@pytest.mark.thorough
 @pytest.mark.skipif(os.name != "posix", reason="signals")
 def test_a_worker_that_is_killed_loses_nothing_and_nothing_is_done_twice(beside, toy, gsjax):
     folder = toy(LOGGED.format("time.sleep(0.4)"), grid={"n": [0, 1, 2, 3, 4, 5]})
@@ -115,6 +116,7 @@ def test_a_worker_that_is_killed_loses_nothing_and_nothing_is_done_twice(beside,
     assert len(logged("ended")) == 6
 
 
+@pytest.mark.thorough
 def test_what_is_kept_is_what_a_run_here_keeps(beside, toy, gsjax):
     failing = SCRIPT.replace(
         "return", "if options['size'] == 640: raise RuntimeError('no light')\n    return"
@@ -159,6 +161,7 @@ def test_a_worker_of_another_gsjax_is_refused(beside, toy, gsjax, monkeypatch):
     assert f"found {__version__}+" in err
 
 
+@pytest.mark.thorough
 @pytest.mark.skipif(os.name != "posix", reason="signals")
 def test_a_cell_that_kills_every_worker_fails_and_the_others_are_done(toy, gsjax):
     dies = "options['n'] == 0 and os.path.exists('stop') and os.kill(os.getpid(), 9)"
@@ -274,6 +277,7 @@ def test_nothing_is_forgotten_where_no_scheduler_answers(toy, gsjax, monkeypatch
     assert cell_files() == before
 
 
+@pytest.mark.thorough
 def test_without_the_extra_it_is_named(toy, gsjax, monkeypatch):
     toy()
     monkeypatch.setitem(sys.modules, "distributed", None)

@@ -94,6 +94,7 @@ def test_ctrl_c_leaves_stale_rows_that_were_not_run_again(toy, gsjax):
     assert cell_files() == before
 
 
+@pytest.mark.thorough
 @pytest.mark.skipif(os.name != "posix", reason="signals")
 def test_kill_keeps_what_is_done(toy, gsjax):
     toy(stopping("os.kill(os.getpid(), signal.SIGKILL)"))

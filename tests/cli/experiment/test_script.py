@@ -110,6 +110,7 @@ def test_what_stands_beside_experiments_is_not_forgotten(toy):
         sys.path.remove(str(elsewhere.resolve()))
 
 
+@pytest.mark.thorough
 def test_a_script_imports_what_is_shared_and_scripts_of_other_folders(toy, gsjax):
     """By names from the folder that holds the root, also where helpers stand beside neither."""
     folder = toy(

@@ -45,6 +45,7 @@ def gsjax_fit(photographs, tmp_path, capfd):
     return call
 
 
+@pytest.mark.thorough
 def test_a_run_from_photographs_to_a_report_and_one_that_was_stopped(gsjax_fit, tmp_path, monkeypatch):
     code, said = gsjax_fit(*QUICK)
     assert code == 0, said
@@ -141,6 +142,7 @@ def test_what_minutes_decided_holds_when_a_run_is_resumed(gsjax_fit, tmp_path, m
     assert found["num_gaussians"] <= 7_400
 
 
+@pytest.mark.thorough
 @pytest.mark.skipif(os.name != "posix", reason="signals")
 def test_ctrl_c_in_the_middle_of_a_step_leaves_what_can_be_resumed(photographs, gsjax_fit, tmp_path):
     """A step gives away the buffers that it replaces, and most of the time one is being made."""
@@ -196,6 +198,7 @@ def test_a_preset_is_named_and_what_is_given_counts_more(photographs, tmp_path, 
     assert "classic" in capfd.readouterr().err
 
 
+@pytest.mark.thorough
 def test_minutes_of_which_compiling_took_most(gsjax_fit, tmp_path):
     code, said = gsjax_fit(*QUICK, "--fit.steps", "100000", "--minutes", "0.01", "--fit.sh-every", "100")
     assert code == 0, said
@@ -259,6 +262,7 @@ def test_a_damaged_checkpoint_leaves_the_one_before(gsjax_fit, tmp_path, monkeyp
     assert f"Resumed after {int(before.stem.split('-')[1])} steps" in json.dumps(found["notes"])
 
 
+@pytest.mark.thorough
 def test_it_stops_when_held_out_views_are_seen_as_well_as_asked(gsjax_fit, tmp_path):
     code, said = gsjax_fit(*QUICK, "--until-psnr", "1")
     assert code == 0, said
@@ -266,6 +270,7 @@ def test_it_stops_when_held_out_views_are_seen_as_well_as_asked(gsjax_fit, tmp_p
     assert (found["complete"], found["steps"]) == (True, 8)
 
 
+@pytest.mark.thorough
 def test_it_stops_only_when_all_held_out_views_are(gsjax_fit, tmp_path, monkeypatch):
     """On the way a few are looked at, which may be easy ones."""
     monkeypatch.setattr(
@@ -309,6 +314,7 @@ def test_a_photograph_that_is_cut_off_is_named(photographs, gsjax_fit, tmp_path)
     assert "cut off" in said
 
 
+@pytest.mark.thorough
 def test_photographs_that_do_not_fit_into_memory_are_refused_before_anything_is_cleared(
     gsjax_fit, tmp_path, monkeypatch
 ):

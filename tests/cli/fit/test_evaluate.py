@@ -66,6 +66,7 @@ def weights(tmp_path_factory):
     return path
 
 
+@pytest.mark.thorough
 def test_it_gives_the_numbers_of_the_fit(gsjax_eval, run):
     own = json.loads((run / "metrics.json").read_text())
     code, said, found = gsjax_eval()
@@ -141,6 +142,7 @@ def test_pictures_of_enough_pixels_have_ms_ssim(tmp_path, capfd):
     assert scores(dimmed, None, exposed=True)["psnr_matched"] > scores(dimmed, None)["psnr"] + 20
 
 
+@pytest.mark.thorough
 def test_a_comparison_takes_what_it_found(gsjax_eval, run, fitted, weights, tmp_path, capfd):
     assert gsjax_eval("--views", "all", "--lpips-weights", str(weights))[0] == 0
     other = shutil.copytree(fitted, tmp_path / "other")

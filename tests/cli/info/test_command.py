@@ -27,6 +27,7 @@ def told(path, capfd) -> tuple[str, str]:
     return " ".join(out.split()), " ".join(err.split())
 
 
+@pytest.mark.thorough
 def test_photographs_are_described_and_what_is_missing_is_counted(photographs, capfd):
     assert main(["info", str(photographs)]) == 0
     out, err = capfd.readouterr()
@@ -95,6 +96,7 @@ def test_masks_that_are_not_there_are_not_asked_for(recording, capfd):
     assert "camera 1, labels 1, 2, 3, 4, 5 in the first frame" in " ".join(out.split())
 
 
+@pytest.mark.thorough
 def test_a_recording_is_drawn_by_camera_with_points_of_its_depth(capfd, tmp_path):
     sequence = open_sequence("simulated:tabletop?frames=4&width=48&height=36")
     groups = by_camera(sequence)

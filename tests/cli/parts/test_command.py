@@ -43,6 +43,7 @@ def gsjax_parts(tmp_path, capfd):
     return call
 
 
+@pytest.mark.thorough
 def test_a_run_from_a_scene_to_a_report(gsjax_parts, tmp_path):
     code, said = gsjax_parts(*QUICK, "--anchor", "0")
     assert code == 0, said
@@ -159,6 +160,7 @@ def test_what_an_earlier_version_left_to_resume_is_refused(tmp_path):
         resumed(folder, Run(None, None), Progress())
 
 
+@pytest.mark.thorough
 def test_what_cannot_be_done_is_said(gsjax_parts, tmp_path):
     code, said = gsjax_parts("--cameras", "1", "--frames", "0:3")
     assert code == 2
@@ -215,6 +217,7 @@ def test_a_scene_is_not_read_from_what_is_replaced(gsjax_parts, tmp_path):
     assert "expected one outside --out, which --overwrite replaces" in said
 
 
+@pytest.mark.thorough
 def test_a_scene_in_which_nothing_moves(gsjax_parts, tmp_path):
     still = "simulated:articulated?width=48&height=36&cameras=2&still=true"
     code, said = gsjax_parts("--frames", "0:3", "--fit.steps", "4", "--fit.cap", "300", dataset=still)

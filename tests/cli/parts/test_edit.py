@@ -98,6 +98,7 @@ def test_of_a_partial_run_only_what_was_followed_is_taken(tmp_path, anchor, foll
     np.testing.assert_allclose(saved.layer.trajectory.times, STEP * np.array(kept), rtol=1e-6)
 
 
+@pytest.mark.thorough
 def test_a_script_is_filmed_and_can_be_given_again(gsjax, run, tmp_path):
     script = tmp_path / "slow.yaml"
     script.write_text(SCRIPT)
@@ -165,6 +166,7 @@ def test_a_film_of_another_length_compiles_nothing(run, caplog):
     assert compiled == []
 
 
+@pytest.mark.thorough
 def test_edits_without_a_script_from_another_camera(gsjax, run):
     """The drawer of another run, whose recording need not be there, takes the place of this run's."""
     other = write_run(run.parent / "other")
@@ -183,6 +185,7 @@ def test_edits_without_a_script_from_another_camera(gsjax, run):
     np.testing.assert_allclose(there, np.asarray(scene.gaussians.means)[drawer] + shift, atol=1e-5)
 
 
+@pytest.mark.thorough
 def test_films_of_ops_alone_are_numbered_on(gsjax, run):
     once = ("edit", run, "--op", "freeze:parts=all")
     for name in ("ops", "ops_2"):
@@ -226,6 +229,7 @@ def test_an_edit_that_is_seen_by_what_follows_it_is_not_idle(run):
     assert doubts == ["no visible effect: edit 2 (freeze)"]
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("script", ["length: 0.01", "{fps: 15, length: 0.05}", "{fps: 1000, length: 0.01}"])
 def test_a_film_of_one_moment_has_a_camera(run, script):
     saved = open_parts_run(run)
@@ -234,6 +238,7 @@ def test_a_film_of_one_moment_has_a_camera(run, script):
     assert films.telling_camera(film, saved, edits) in (0, 1, 2)
 
 
+@pytest.mark.thorough
 def test_an_edit_near_the_end_is_looked_at(run):
     """At a third of the way and at two thirds all is as it was."""
     saved = open_parts_run(run)
@@ -246,6 +251,7 @@ def test_an_edit_near_the_end_is_looked_at(run):
         assert cameras[0] == cameras[1] != saved.camera(None)
 
 
+@pytest.mark.thorough
 def test_edits_that_change_nothing_are_said_to(gsjax, run):
     """And the first held-out camera films them, as all see the same."""
     edits = ["freeze:parts=drawer,from=9", "move:parts=drawer,by=[0,0,0.1]", "scale:parts=1,factor=1"]
@@ -286,6 +292,7 @@ def test_a_film_that_is_stopped_can_be_watched(gsjax, run, monkeypatch):
     assert (found["complete"], found["frames"]) == (False, 2)
 
 
+@pytest.mark.thorough
 def test_a_partial_run_is_said(gsjax, tmp_path):
     partial = write_run(tmp_path / "run", followed=2, anchor=1)
     code, said = gsjax("edit", partial, "--op", "freeze:parts=all")

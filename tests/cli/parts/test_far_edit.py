@@ -13,6 +13,7 @@ from gsjax.methods.parts.timeline import parse_script
 from tests.cli.parts.test_edit import write_run
 
 
+@pytest.mark.thorough
 @pytest.mark.filterwarnings("ignore:.*coordinates reach")
 def test_points_are_in_the_coordinates_of_the_data_also_far_from_0(tmp_path):
     """Of edits, of the place of another run's parts, and of their own edits."""

@@ -37,6 +37,7 @@ def in_order(gaussians):
     return [np.asarray(a)[rows] for a in (gaussians.means, gaussians.opacities, gaussians.sh0)]
 
 
+@pytest.mark.thorough
 def test_a_film_leaves_as_files_of_its_frames(gsjax, film, tmp_path):
     code, said = gsjax("export", film, tmp_path / "frame_####.ply")
     assert code == 0, said
@@ -104,6 +105,7 @@ def test_a_film_goes_along_with_its_run(gsjax, made, film, tmp_path):
     assert open_viewable(moved, notes)[0].num_frames == 4
 
 
+@pytest.mark.thorough
 def test_frames_a_second_and_length_may_be_given(gsjax, made, tmp_path):
     asked = ("edit", made[0], "--op", "speed:parts=drawer,factor=2", "--fps", 30, "--length", 0.5)
     code, said = gsjax(*asked, "--out", tmp_path / "film")

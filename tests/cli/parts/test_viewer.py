@@ -79,6 +79,7 @@ def test_what_is_offered(run):
     assert editing.begin("speed", "drawer") == "speed:parts=drawer,factor=2"
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     "lines",
     [
@@ -158,6 +159,7 @@ def test_without_its_recording_nothing_is_edited(run):
     assert any("its recording is not shown, and nothing can be edited" in note for note in notes.all)
 
 
+@pytest.mark.thorough
 def test_a_film_is_kept_as_gsjax_edit_does(gsjax, run, tmp_path):
     lines = ["echo:parts=drawer,copies=2,every=0.07", "move:parts=shut_door,by=[0,0,0.1]"]
     told = []
@@ -183,6 +185,7 @@ def test_a_film_is_kept_as_gsjax_edit_does(gsjax, run, tmp_path):
     assert ours | {"render_hz": 0} == theirs | {"render_hz": 0}
 
 
+@pytest.mark.thorough
 def test_a_film_has_the_camera_that_is_asked_for_and_none_is_written_over(run):
     editing, lines = opened(run).editing, ["freeze:parts=all"]
     names = [editing.save(lines, "still", "camera 1", always).name for _ in range(3)]
@@ -213,6 +216,7 @@ def test_edits_that_cannot_be_done_leave_no_folder(run):
     assert not (run / "edit").exists()
 
 
+@pytest.mark.thorough
 def test_lines_are_those_of_the_command_line():
     lines = ["speed:parts=drawer,factor=2", "move:parts=[1, lid],by=[0, 0, 0.1]"]
     assert script_of(lines).edits == tuple(map(parse_op, lines))

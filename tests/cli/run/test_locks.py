@@ -178,6 +178,7 @@ def test_without_locks_of_files_the_writers_that_are_listed_decide(tmp_path, mon
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.thorough
 def test_without_locks_of_files_one_of_two_that_begin_at_one_instant_is_refused(tmp_path, monkeypatch):
     monkeypatch.setattr(locks, "_flock", lambda *_, **__: None)
     monkeypatch.setattr(locks.time, "sleep", lambda _: listed(tmp_path))  # the other has listed itself since

@@ -6,6 +6,8 @@ import subprocess
 import sys
 from time import time
 
+import pytest
+
 SCENE = "simulated:tabletop?width=32&height=24&frames=1"
 FIT = ("--fit.steps", "6", "--fit.cap", "60", "--fit.start.count", "50", "--fit.growth.begin", "2")
 
@@ -27,6 +29,7 @@ def traces(tmp_path):
     return {path.name: path.stat().st_ino for path in tmp_path.glob("cache/gsjax/*/traces/*.npz")}
 
 
+@pytest.mark.thorough
 def test_a_second_process_compiles_nothing_and_traces_no_step(tmp_path):
     first, kept = start(tmp_path, "first"), traces(tmp_path)
     second = start(tmp_path, "second")

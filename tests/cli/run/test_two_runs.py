@@ -17,6 +17,7 @@ class Written:
     seed: int = 0
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("how", [(), ("--overwrite",), ("--resume",)])
 @pytest.mark.parametrize("command", ["fit", "track", "parts", "deform", "live"])
 def test_a_second_run_is_refused(command, how, gsjax, photographs, pristine, tmp_path, written):

@@ -43,6 +43,7 @@ def opened(monkeypatch):
     return log
 
 
+@pytest.mark.thorough
 def test_a_run_from_end_to_end(pristine, tmp_path, gsjax_track, opened):
     code, said = gsjax_track(pristine, *CAMERAS, *QUICK)
     assert code == 0, said
@@ -141,6 +142,7 @@ def test_ctrl_c_leaves_a_usable_run(pristine, tmp_path, gsjax_track, still, monk
     assert len(read_video_frames(run / "video_2.mp4")) == 2
 
 
+@pytest.mark.thorough
 def test_ctrl_c_while_scoring_keeps_what_was_scored(pristine, tmp_path, gsjax_track, still, monkeypatch):
     frame = Sequence.frame
 
@@ -157,6 +159,7 @@ def test_ctrl_c_while_scoring_keeps_what_was_scored(pristine, tmp_path, gsjax_tr
     assert (found["frames"]["tracked"], found["frames"]["scored"], found["complete"]) == (4, 3, False)
 
 
+@pytest.mark.thorough
 @pytest.mark.skipif(os.name != "posix", reason="signals")
 @pytest.mark.parametrize("name", ["SIGINT", "SIGTERM", pytest.param("SIGHUP", marks=pytest.mark.slow)])
 def test_a_signal_stops_the_program(pristine, tmp_path, name):
@@ -173,6 +176,7 @@ def test_a_signal_stops_the_program(pristine, tmp_path, name):
     assert "stopped" in said
 
 
+@pytest.mark.thorough
 def test_objects_found_without_masks(recording, tmp_path, gsjax_track, still):
     for mask in recording.glob("seg/*/*.png"):
         mask.unlink()
@@ -190,6 +194,7 @@ def test_objects_found_without_masks(recording, tmp_path, gsjax_track, still):
     assert "the recording has no masks" in notes
 
 
+@pytest.mark.thorough
 def test_segmented_objects_are_scored_as_what_they_cover(pristine, tmp_path, gsjax_track, still):
     code, said = gsjax_track(pristine, "--cameras", "1", "--masks", "segment")
     assert code == 0, said
@@ -198,6 +203,7 @@ def test_segmented_objects_are_scored_as_what_they_cover(pristine, tmp_path, gsj
     assert found["objects"]["carton"]["point_error_mm"] is not None
 
 
+@pytest.mark.thorough
 def test_a_run_says_what_was_lost_and_whose_turn_is_not_known(
     pristine, tmp_path, gsjax_track, still, monkeypatch
 ):
@@ -265,6 +271,7 @@ def test_frames_are_slices(text, frames):
     assert list(range(100))[parse_frames(text)] == list(frames)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("text", ["", "7", "a:b", "1:2:3:4", "0:10:-1", "0:10:0"])
 def test_other_words_are_no_frames(text):
     with pytest.raises(ValueError, match="--frames"):

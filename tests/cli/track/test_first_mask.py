@@ -24,6 +24,7 @@ def unmasked(pristine, tmp_path):
     return folder, first
 
 
+@pytest.mark.thorough
 def test_a_picture_names_the_objects(unmasked, tmp_path, gsjax_track, still):
     folder, first = unmasked
     labels = np.where(first[1] == 3, 7, 0).astype(np.uint8)  # the can alone, by another value
@@ -41,6 +42,7 @@ def test_a_picture_names_the_objects(unmasked, tmp_path, gsjax_track, still):
     assert "segmenter" not in " ".join(found["notes"])
 
 
+@pytest.mark.thorough
 def test_of_pictures_read_smaller_the_mask_is_too(unmasked, tmp_path, gsjax_track, still):
     folder, first = unmasked
     write_png(tmp_path / "mask.png", first[0].astype(np.uint8))
@@ -51,6 +53,7 @@ def test_of_pictures_read_smaller_the_mask_is_too(unmasked, tmp_path, gsjax_trac
     assert sum(pixels) == pytest.approx((first[0] > 0).sum() / 4, rel=0.1)
 
 
+@pytest.mark.thorough
 def test_one_of_another_size_is_none_of_these_pictures(unmasked, tmp_path, gsjax_track):
     folder, first = unmasked
     cv2.imwrite(str(tmp_path / "mask.png"), np.kron(first[0], np.ones((2, 2), first[0].dtype)))
@@ -63,6 +66,7 @@ def test_one_of_another_size_is_none_of_these_pictures(unmasked, tmp_path, gsjax
     assert (code, "a picture of labels (PNG), found" in " ".join(said.split())) == (2, True)
 
 
+@pytest.mark.thorough
 def test_where_the_recording_has_masks_the_picture_counts(pristine, tmp_path, gsjax_track, still):
     labels = cv2.imread(str(min((pristine / "seg" / "1").iterdir())), cv2.IMREAD_UNCHANGED)
     write_png(tmp_path / "mine.png", np.where(labels == 3, 1, 0).astype(np.uint8))
@@ -107,6 +111,7 @@ def test_a_picture_that_names_nothing_is_refused_before_any_work(
     assert not (tmp_path / "run" / "config.yml").exists()
 
 
+@pytest.mark.thorough
 def test_a_run_keeps_its_picture_and_goes_on_with_it(unmasked, tmp_path, gsjax_track, still, monkeypatch):
     folder, first = unmasked
     monkeypatch.chdir(tmp_path)
@@ -128,6 +133,7 @@ def test_a_run_keeps_its_picture_and_goes_on_with_it(unmasked, tmp_path, gsjax_t
     assert open_run(tmp_path / "run").names == {1: "object 7"}
 
 
+@pytest.mark.thorough
 def test_without_depth_a_picture_says_nothing_and_an_earlier_run_is_kept(pristine, tmp_path, gsjax_track):
     folder = tmp_path / "flat"
     shutil.copytree(pristine, folder, ignore=shutil.ignore_patterns("depth"))

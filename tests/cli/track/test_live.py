@@ -48,6 +48,7 @@ def live(tmp_path, capfd, monkeypatch):
     return call
 
 
+@pytest.mark.thorough
 def test_a_recording_is_replayed_and_all_frames_are_accounted_for(pristine, live):
     code, said, folder = live(pristine, "--minutes", "0.01", "--hz", "20", "--cameras", "0", "1")
     assert code == 0, said
@@ -125,6 +126,7 @@ def test_a_stream_that_fails_leaves_what_was_followed(pristine, live, monkeypatc
     assert (folder / "trajectory.npz").exists()
 
 
+@pytest.mark.thorough
 def test_a_picture_names_the_objects_of_a_recording(pristine, live, tmp_path, monkeypatch):
     labels = np.zeros((60, 80), np.uint8)
     labels[20:40, 20:60] = 7

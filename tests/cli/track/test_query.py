@@ -40,6 +40,7 @@ def run(tracked, tmp_path):
     return shutil.copytree(tracked, tmp_path / "run")
 
 
+@pytest.mark.thorough
 def test_an_answer_elsewhere_and_without_pictures(gsjax, run, tmp_path):
     out = tmp_path / "answer"
     code, said = gsjax("query", run, "the blue can", "--no-pictures", "--out", out)
@@ -75,6 +76,7 @@ def test_query_says_which_object_and_shows_it_over_time(gsjax, run, pristine):
     assert read_video_frames(folder / "video.mp4").shape == (4, 480, 640, 3)
 
 
+@pytest.mark.thorough
 def test_a_tracked_run_answers_what_only_its_field_can(gsjax, run, pristine):
     with np.load(run / "trajectory.npz") as whole:
         labels = whole["labels"]
@@ -136,6 +138,7 @@ def test_what_somebody_else_left_there_is_kept(gsjax, run, command):
     assert (run / command / "precious.txt").read_text() == "mine"
 
 
+@pytest.mark.thorough
 def test_a_second_query_leaves_nothing_of_the_first(gsjax, run):
     assert gsjax("query", run, "can")[0] == 0
     (run / "query" / "masks" / "999999.png").touch()
@@ -221,6 +224,7 @@ def _another_recording(run):
     config.write_text("# gsjax run\n" + yaml.safe_dump(settings))
 
 
+@pytest.mark.thorough
 def test_grasps_are_found_frame_by_frame_and_drawn(gsjax, run):
     code, said = gsjax("grasp", run, "can", "--samples", "128")
     assert code == 0
@@ -238,6 +242,7 @@ def test_grasps_are_found_frame_by_frame_and_drawn(gsjax, run):
     assert len(list((run / "grasp").glob("frame_*.png"))) == 1
 
 
+@pytest.mark.thorough
 def test_no_feasible_grasp_is_said_and_is_no_success(gsjax, run):
     code, said = gsjax("grasp", run, "can", "--samples", "16", "--gripper.max-width", "0.01")
     assert code == 3
@@ -260,6 +265,7 @@ def test_an_approach_must_have_a_direction(capfd, tracked, approach):
     assert f"--approach: expected a direction, such as 0 0 -1, found {' '.join(approach)}" in said
 
 
+@pytest.mark.thorough
 def test_nothing_at_all_may_be_ignored(gsjax, run):
     """A list that is empty by itself means all there is; one that is not, none."""
     code, said = gsjax("grasp", run, "can", "--samples", "16", "--ignore")

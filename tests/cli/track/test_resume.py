@@ -59,6 +59,7 @@ def test_there_must_be_something_to_resume(pristine, gsjax_track, still):
     assert "expected a run to resume, found none" in said
 
 
+@pytest.mark.thorough
 def test_other_options_are_no_resuming(pristine, gsjax_track, still, tmp_path):
     assert gsjax_track(pristine, "--cameras", "0", "--frames", "0:2")[0] == 0
     (tmp_path / "run" / "report.html").unlink()
@@ -70,6 +71,7 @@ def test_other_options_are_no_resuming(pristine, gsjax_track, still, tmp_path):
     assert "was stopped before its first update, so nothing was saved; start again" in " ".join(said.split())
 
 
+@pytest.mark.thorough
 def test_a_full_disk_is_said_and_tracking_goes_on(pristine, gsjax_track, still, monkeypatch):
     def full(path, *_):
         raise OSError(errno.ENOSPC, "No space left on device", str(path))

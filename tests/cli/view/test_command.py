@@ -263,6 +263,7 @@ def test_an_open_address_is_warned_of(view, ply):
     assert "can view the scene, and save screenshots and films here" in said
 
 
+@pytest.mark.thorough
 def test_a_page_is_served_until_ctrl_c(ply):
     """The program itself, in a process of its own."""
     command = [sys.executable, "-m", "gsjax.cli", "view", str(ply), "--port", "0"]
