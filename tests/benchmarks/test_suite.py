@@ -250,6 +250,7 @@ def bench(monkeypatch, tmp_path, capfd, measured):
     return call
 
 
+@pytest.mark.thorough
 def test_a_run_from_end_to_end(bench, tmp_path):
     code, output = bench(update_baseline=True)
     assert code == 0
@@ -278,6 +279,7 @@ def test_a_run_from_end_to_end(bench, tmp_path):
         bench(only=("ball-1e3-48x32",), check=True)
 
 
+@pytest.mark.thorough
 def test_ctrl_c_keeps_what_was_measured(bench, tmp_path, monkeypatch):
     def interrupted(workload, repeats, say):
         if workload is not TINY:

@@ -62,6 +62,7 @@ def test_cameras_are_where_the_pictures_were_drawn_from(found):
     assert scene.image(0).shape == (room.HEIGHT, room.WIDTH, 3)
 
 
+@pytest.mark.thorough
 def test_the_report_says_what_was_found_and_what_was_left(found):
     report = json.loads((found / "poses.json").read_text())
     assert (report["photographs"], report["registered"]) == (COUNT + 1, COUNT)

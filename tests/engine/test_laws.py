@@ -127,6 +127,7 @@ def test_params_and_state_keep_their_form_and_info_has_its_names(name):
     assert any(jax.tree.leaves(changed))
 
 
+@pytest.mark.thorough
 def test_what_is_not_finite_changes_nothing(name):
     case = case_of(name)
     state = state_of(name)
@@ -135,6 +136,7 @@ def test_what_is_not_finite_changes_nothing(name):
     assert_same((params, after), (case.params, state))
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("name", [name for name in cases.STEPS if name not in cases.WITHOUT_PLAN])
 def test_where_a_plan_is_too_small_nothing_changes_and_what_is_needed_is_told(name):
     case = case_of(name)
@@ -169,6 +171,7 @@ def test_it_runs_in_a_scan_as_it_does_alone(name):
     assert shapes(carry) == shapes((params, state))
 
 
+@pytest.mark.thorough
 def test_a_step_that_wraps_it_works(name):
     case = case_of(name)
     wrapped = averaged(case.step)

@@ -172,6 +172,7 @@ def test_a_browser_plays_it(tmp_path):
     assert ">0.50 s of 1000.00 s</output>" in page
 
 
+@pytest.mark.thorough
 @pytest.mark.skipif(BROWSER is None, reason="there is no Chromium")
 @pytest.mark.parametrize(
     ("antialiased", "frame", "near"),

@@ -84,6 +84,7 @@ def test_all_pairs_are_compared_by_the_l1_distance_of_rows():
     np.testing.assert_allclose(found, np.average(distances, weights=choices), rtol=1e-9)
 
 
+@pytest.mark.thorough
 @pytest.mark.usefixtures("x64")
 def test_features_equal_to_the_teachers_have_no_loss_and_teacher_and_graph_no_gradient():
     inputs = case(3)
@@ -176,6 +177,7 @@ def test_in_degenerate_cases_losses_are_zero_with_zero_gradient(name):
     np.testing.assert_allclose(slopes_of(inputs["features"], inputs), 0, atol=1e-6)
 
 
+@pytest.mark.thorough
 def test_zero_features_learn_from_the_node_loss_and_the_rest_is_finite():
     inputs = extreme("")
     none = np.zeros((T, N, D), np.float32)

@@ -43,6 +43,7 @@ def test_a_known_motion_is_found_and_agrees_better(moved):
     assert gap(points._replace(means=jnp.asarray(means)), sight) < gap(points, sight)
 
 
+@pytest.mark.thorough
 def test_colour_alone_finds_it_too(moved):
     points, center, sight, then, _ = moved
     _, means = run(points, center, without_depth(sight))

@@ -101,12 +101,14 @@ def test_a_governor_always_recovers(hiccups):
     assert governor.allowed() >= 3
 
 
+@pytest.mark.thorough
 def test_a_budget_of_nothing_is_refused(table, started):
     _, frames, _ = table()
     with pytest.raises(ValueError, match="budget_ms: expected milliseconds above 0, found -1"):
         next(track(started, frames[0], frames[1:], budget_ms=-1))
 
 
+@pytest.mark.thorough
 def test_costs_are_measured_with_the_second_frame(table, started, monkeypatch):
     """Where cameras move, updates to the first one again would draw no background."""
     _, frames, _ = table()

@@ -156,6 +156,7 @@ class TestSeenIds:
         half = ids_seen(places, alone, ids[1:, ::2, ::2], frame.depths[1:])
         np.testing.assert_array_equal(half, ids[1, ::2, ::2][rows // 2, columns // 2])
 
+    @pytest.mark.thorough
     def test_what_is_hidden_or_outside_has_none_and_the_next_camera_is_asked(self, small):
         frame, ids = jax.device_get((small.batches[0].frame, small.ids[0]))
         rows, columns = (np.array([40, 41]), np.array([40, 50]))

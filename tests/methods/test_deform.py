@@ -150,11 +150,13 @@ class TestLearning:
         last = len(first) - 1
         assert now[last] > sight(problem, run, last, problem.seen[0].time) + 0.3
 
+    @pytest.mark.thorough
     def test_features_approach_those_of_the_teacher(self, learned):
         *_, infos = learned
         assert {"node", "structure"} <= set(infos[-1])
         assert infos[-1]["feature"] < 0.6 * infos[0]["feature"]
 
+    @pytest.mark.thorough
     def test_the_field_is_added_after_the_warm_up_and_the_graph_later(self, learned):
         *_, infos = learned
         assert next(i for i, info in enumerate(infos) if "planes" in info) == 8
@@ -245,6 +247,7 @@ class TestLearning:
         assert not given.means.is_deleted()
 
 
+@pytest.mark.thorough
 def test_the_class_of_a_trained_scene_is_the_teachers(learned):
     """Tools are left out, so one class is in view."""
     _, run, *_ = learned

@@ -45,6 +45,7 @@ def test_a_scene_that_moves_or_grows_as_one_has_none(begun):
     assert strain_of(begun, with_bias(run, bias)) < 1e-4
 
 
+@pytest.mark.thorough
 def test_turning_in_place_is_strained_as_neighbours_do_not_follow(begun):
     """By half a turn of each node's surroundings: a strain of 2."""
     _, run = begun

@@ -113,6 +113,7 @@ def test_strips_change_neither_the_loss_nor_its_slope(two_balls, kind):
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=2e-5), slope, other_slope)
 
 
+@pytest.mark.thorough
 def test_only_active_entries_are_trained_and_the_full_grid_agrees(two_balls):
     scene, *_ = two_balls
     field, located = init_field(jax.random.key(0), QUICK, scene.means, DIMENSION)
@@ -144,6 +145,7 @@ class Numerals:
         return BOOK[int(text)]
 
 
+@pytest.mark.thorough
 def test_the_result_scores_its_gaussians_and_others(two_balls, result, problem):
     scene, *_ = two_balls
     vectors = BOOK[[2, 1]]

@@ -50,6 +50,7 @@ def test_other_views_tell_what_a_view_lacks(scene):
         assert same[~known].mean() > 0.95 if (~known).any() else True
 
 
+@pytest.mark.thorough
 def test_what_no_view_has_on_a_level_stays_that_of_the_next(scene):
     gaussians, _, masks = scene
     given = lesson(masks, {v: (1,) for v in range(8)})
@@ -59,6 +60,7 @@ def test_what_no_view_has_on_a_level_stays_that_of_the_next(scene):
         assert same.mean() > 0.95  # but for outlines, where Gaussians of the ball show some background
 
 
+@pytest.mark.thorough
 def test_many_kinds_are_clustered_and_drawn_a_few_at_a_time(scene, monkeypatch):
     """Each view has embeddings of its own, a little beside the codes."""
     gaussians, _, masks = scene

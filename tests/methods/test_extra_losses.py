@@ -150,6 +150,7 @@ class TestInRefinement:
         _, _, told = refined(nothing)
         assert told["culled"] == 0
 
+    @pytest.mark.thorough
     def test_one_of_zero_leaves_every_bit(self, refined):
         plain, _, info = refined()
         with_zero, _, told = refined(nothing)

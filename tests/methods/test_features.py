@@ -72,6 +72,7 @@ def test_projection_is_the_mean_of_the_pixels_that_show_a_gaussian(little, weigh
     np.testing.assert_allclose(features[seen], wanted[seen], atol=1e-5)
 
 
+@pytest.mark.thorough
 def test_unseen_ones_take_what_the_nearest_of_their_label_has(little, weights, maps):
     scene, frame = little
     features, means = project_features(scene, frame, maps), np.asarray(scene.gaussians.means)
@@ -99,6 +100,7 @@ def test_projection_is_linear_in_the_maps(little, maps):
     np.testing.assert_allclose(together, apart, atol=2e-5)
 
 
+@pytest.mark.thorough
 def test_distillation_solves_its_least_squares_problem(little, weights, maps):
     """Against the dense normal equations in float64."""
     damping = 0.05

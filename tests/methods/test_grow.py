@@ -137,6 +137,7 @@ def test_what_is_missing_joins_the_object_that_it_continues(table, torn, plan):
     assert share.sum() > (torn_share[..., torn.label_ids.index(CARTON)] > 0.5).sum() + 30
 
 
+@pytest.mark.thorough
 def test_a_scene_that_explains_all_grows_little(table, started, plan):
     frame = table()[1][0]
     scene, _ = grown(with_slots(started, 256), frame, plan)

@@ -100,6 +100,7 @@ def test_a_single_gaussian_in_front_of_another_is_drawn_at_almost_its_depth(opac
     assert alpha > 0.89
 
 
+@pytest.mark.thorough
 def test_cameras_see_the_same_gaussians_in_both(both, started, table):
     whole, shown, _ = both
     cameras, pose = table()[1][0].cameras, first_pose(started)
@@ -109,6 +110,7 @@ def test_cameras_see_the_same_gaussians_in_both(both, started, table):
     assert (a == b).mean() > 0.97
 
 
+@pytest.mark.thorough
 def test_what_stands_in_front_hides_what_moves(both, started, plans):
     _, _, backdrop = both
     wall = backdrop._replace(

@@ -87,6 +87,7 @@ def test_a_group_agrees_in_its_place_and_nowhere_else(carton):
     assert confidence(moved(points, 0, 0, 0.1, 0, 0, 0), images, GAP).agreement[0] < LOST
 
 
+@pytest.mark.thorough
 def test_an_occluder_is_inconclusive(carton):
     """A hand before the left camera: the other camera decides; with both hidden, none does."""
     images, points = carton

@@ -171,6 +171,7 @@ def test_parts_that_touch_are_one_group(boxes, start):
     assert [group.parts.tolist() for group in groups_of(discovery)] == [[1, 3], [2]]
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("t", [1, 4])
 def test_what_jumped_is_found(boxes, start, t):
     shifts = [box.shifts[t] for box in boxes.boxes]
@@ -183,6 +184,7 @@ def test_what_jumped_is_found(boxes, start, t):
     np.testing.assert_array_equal(found.translations[1], pose.translations[1])
 
 
+@pytest.mark.thorough
 def test_what_lands_in_front_of_something_is_found_by_the_other_cameras(boxes, start):
     t, shifts, rest = 2, boxes.boxes[1].shifts, at_rest(len(start.canonical.alive))
     predicted = np.array([boxes.boxes[0].shifts[t], shifts[t - 1]], np.float32)
@@ -196,6 +198,7 @@ def test_what_lands_in_front_of_something_is_found_by_the_other_cameras(boxes, s
     assert np.linalg.norm(found.translations[2] - shifts[t]) < 0.025  # of 0.125 m
 
 
+@pytest.mark.thorough
 def test_what_is_where_it_should_be_stays_to_the_bit(boxes, start):
     discovery, here = initial_run(start, FRAMES, PartsConfig()).kept, boxes.frame(0)
     assert searched(discovery, here, here, "quaternion") is discovery.predicted

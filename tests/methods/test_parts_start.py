@@ -171,6 +171,7 @@ def test_masks_are_lifted_to_what_shows_them(boxes):
     assert losses[-3:].mean() < losses[:3].mean()
 
 
+@pytest.mark.thorough
 def test_votes_are_shares_of_pixels(boxes):
     plan = plan_render(boxes.gaussians, boxes.cameras, headroom=1.3)
     masks = boxes.masks(boxes.bodies)
@@ -231,6 +232,7 @@ def test_a_field_has_weights_of_living_parts_only(kind):
     assert (found.argmax(-1) == np.asarray(wanted).argmax(-1)).mean() > 0.97
 
 
+@pytest.mark.thorough
 def test_a_pixel_is_as_wide_as_depth_over_focal_length(boxes):
     middle = np.array([[0.0, 0.0, 0.03]])
     eyes = np.linalg.inv(np.asarray(boxes.cameras.viewmat))[:, :3, 3]

@@ -70,6 +70,7 @@ def test_a_door_and_a_drawer_are_found_to_a_fifth_of_a_pixel(cabinet, found):
         assert best < 0.2 * pixel
 
 
+@pytest.mark.thorough
 def test_points_follow_the_motion_of_what_they_are_on(cabinet, found):
     labels = true_labels_at(cabinet, 0, found.surface.points)
     matches = [(found.labels == k) & (labels == label) for k in (1, 2) for label in (1, 2)]

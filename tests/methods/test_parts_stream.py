@@ -125,6 +125,7 @@ def test_depth_tells_what_colour_does_not(boxes):
     assert info["now"] < 0.05 * (with_depth - without) + 5e-3
 
 
+@pytest.mark.thorough
 def test_what_moves_together_is_not_torn(boxes):
     canonical, bodies = canonical_of(boxes)
     weights = jax.nn.one_hot(bodies, PARTS)
@@ -167,6 +168,7 @@ def test_weights_stay_on_the_simplex_and_what_is_not_alive_gets_none(boxes):
     assert np.abs(weights - mixed).max() > 0.05
 
 
+@pytest.mark.thorough
 def test_several_frames_of_the_past_count_in_the_mean(boxes):
     batch, bodies = batch_of(boxes)
     params = params_of(shifted(0.01), soft(bodies), bodies)
@@ -189,6 +191,7 @@ def half_squares(residuals):
     return 0.5 * sum(float(np.vdot(r, r)) for r in jax.tree.leaves(residuals))
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("depth", [False, True])
 def test_half_the_squares_are_the_loss_without_ssim(boxes, depth):
     batch, bodies = batch_of(boxes, past=False)

@@ -75,11 +75,13 @@ def test_a_discovery_is_stored_and_goes_on_to_the_same_bits(boxes, sequence, seg
     assert sorted(now.result.joints()) == list(range(1, now.result.scene.num_parts))
 
 
+@pytest.mark.thorough
 def test_gaussians_need_their_frame_named(boxes, sequence):
     with pytest.raises(ValueError, match="anchor: expected the frame that the given Gaussians show"):
         parts(sequence, CONFIG, gaussians=boxes.gaussians)
 
 
+@pytest.mark.thorough
 def test_one_camera_is_refused(boxes, sequence, segmenter):
     given = {"anchor": 0, "gaussians": boxes.gaussians, "segmenter": segmenter}
     with pytest.raises(ValueError, match="cameras: expected at least 2, synchronised, found 1"):

@@ -56,6 +56,7 @@ def test_light_is_the_sum_of_weights_in_the_view_that_sees_the_most():
     )
 
 
+@pytest.mark.thorough
 def test_what_is_hidden_or_behind_all_cameras_sends_none():
     light = light_of(wall(), [view((3.0, 0.2, 0.5))])
     assert light[-1] == 0.0

@@ -43,6 +43,7 @@ def test_half_the_squares_are_refines_loss(batch):
     assert found[1] < found[0]  # rounded off
 
 
+@pytest.mark.thorough
 def test_without_depth_there_is_colour_alone(batch):
     frame = Frame(batch.frame.images, None, batch.frame.cameras)
     options = {"step": 0, "key": None, "config": CONFIG, "block": 1}
@@ -52,6 +53,7 @@ def test_without_depth_there_is_colour_alone(batch):
     np.testing.assert_array_equal(residuals["color"], whole["color"])
 
 
+@pytest.mark.thorough
 def test_pixels_that_fill_no_block_are_left_out(batch):
     residuals, _ = refine_residual(STILL, batch, step=0, key=None, config=CONFIG, block=5)
     assert residuals["color"].shape == (2, 9, 12, 3)

@@ -91,6 +91,7 @@ def test_search_finds_what_is_pushed_while_it_turns(moved):
     np.testing.assert_allclose(found[3:], true[3:], atol=0.02)
 
 
+@pytest.mark.thorough
 def test_something_in_front_does_not_pull(moved):
     points, center, images, then, _ = moved
     row, column = np.argwhere(np.asarray(moved[4][0]) == 1).mean(0).astype(int)

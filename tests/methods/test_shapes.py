@@ -124,6 +124,7 @@ def test_a_scene_from_shapes_is_posed_coloured_and_labelled(frame):
     assert float(jnp.abs(drawn.colors - frame.images).mean()) < 0.03
 
 
+@pytest.mark.thorough
 def test_a_shape_with_nothing_to_rest_on_is_told(frame):
     with pytest.raises(ValueError, match="'block': expected a pose"):
         scene_from_shapes([ground(), block()], frame)

@@ -223,6 +223,7 @@ def test_an_overflow_changes_nothing_and_track_plans_again(table, started, track
     np.testing.assert_allclose(now.result.pose.means[own], tracked[0].result.pose.means[own], atol=2e-3)
 
 
+@pytest.mark.thorough
 def test_an_update_is_traced_once(traced):
     updates, traces = traced
     assert len(updates) == 3

@@ -77,6 +77,7 @@ def test_the_first_update_only_looks(table, started, begun):
     assert np.asarray(state.watch.agrees == 1).all()
 
 
+@pytest.mark.thorough
 def test_a_first_frame_that_cannot_be_read_leaves_the_state_blank(table, begun):
     _, frames, _ = table()
     step, update, run = begun
@@ -108,6 +109,7 @@ def test_it_runs_in_a_scan_as_frame_by_frame_and_grows_there(table, begun):
     assert joined[-1] == taken > 0
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("what", ["images", "depths", "viewmat"])
 def test_a_frame_that_cannot_be_read_changes_nothing(table, begun, what):
     _, frames, _ = table()
@@ -140,6 +142,7 @@ def test_bytes_are_seen_as_floats_are(in_bytes_and_floats, begun):
     np.testing.assert_allclose(found[0].pose.means, found[1].pose.means, atol=1e-5)
 
 
+@pytest.mark.thorough
 def test_what_draws_at_random_takes_its_key(table, begun):
     """Nothing does where nothing is lost: another key gives the same bits."""
     _, frames, _ = table()

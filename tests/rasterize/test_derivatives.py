@@ -155,6 +155,7 @@ def test_runs_are_equal_bit_for_bit(loss_and_plan):
         np.testing.assert_array_equal(a, b)
 
 
+@pytest.mark.thorough
 def test_the_order_of_gaussians_does_not_matter(loss_and_plan):
     scene, _, run, _ = loss_and_plan
     order = np.random.default_rng(0).permutation(40)

@@ -34,6 +34,7 @@ def test_five_runs_and_two_processes_are_equal_bit_for_bit():
     assert len(outputs[0]) == 64
 
 
+@pytest.mark.thorough
 def test_a_permutation_of_the_gaussians_changes_no_bit():
     scene, order = scene_before(), np.random.default_rng(3).permutation(12)
     want, slope, _ = drawn(scene, cotangent(), plan_for())

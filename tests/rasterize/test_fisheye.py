@@ -147,6 +147,7 @@ def test_gradients_near_the_axis_are_those_of_the_reference(direction, weights):
             assert np.abs(slopes[name]).max() <= 1e-12, name
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("widest", [2.5, 3.1])
 def test_what_lies_behind_or_beyond_the_fold_is_not_seen(widest, weights):
     """A lens whose polynomial turns back at 1 radian shows nothing from beyond it, and no NaN from behind."""

@@ -60,6 +60,7 @@ def test_fisheyes_are_painted_as_the_rasterizer_draws_them(small, geometry):
         np.testing.assert_allclose(painted(view_of(views, c), values, plan)[0], colors[c], atol=2e-5)
 
 
+@pytest.mark.thorough
 def test_the_padding_of_a_view_is_not_seen(frozen):
     scene, views, plan = frozen
     view = view_of(views, 0)

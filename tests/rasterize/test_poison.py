@@ -88,6 +88,7 @@ def test_a_poisoned_gaussian_is_as_if_it_were_absent(scene, weights, name, value
     assert_finite((got, gradient))
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("name", ["viewmats", "Ks"])
 @pytest.mark.parametrize("value", [np.nan, np.inf])
 def test_a_camera_that_is_not_finite_sees_nothing_and_culls_everything(scene, weights, name, value):

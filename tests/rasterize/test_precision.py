@@ -62,6 +62,7 @@ def test_colours_in_half_precision_cost_their_own_rounding_and_no_more(dtype, sp
     assert others <= 4 * spacing
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("dtype", [jnp.bfloat16, pytest.param(jnp.float16, marks=pytest.mark.slow)])
 def test_half_precision_is_composited_in_float32(dtype):
     scene, this = scene_before(64, 48, num=300), dataclasses.replace(plan_for(64, 48, 300), render_mode="RGB")

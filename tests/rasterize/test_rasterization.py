@@ -275,6 +275,7 @@ def test_a_cap_on_lists_draws_the_nearest_alone(small):
     assert int(meta.pairs[0]) == 5
 
 
+@pytest.mark.thorough
 def test_a_saturated_tile_is_read_no_further():
     n = 400
     depths = np.float32(1 + 1e-3 * np.arange(n))

@@ -268,6 +268,7 @@ def test_scenes_and_cameras_over_two_by_two_devices(on_four):
     assert on_four["scenes"]["part"] == [[1, 1, HEIGHT, WIDTH, 4]] * 4
 
 
+@pytest.mark.thorough
 def test_every_device_reports_when_its_plan_is_too_small(on_four):
     assert on_four["overflow"] == {"flags": [True, False, True, False], "counts": 0}
 
@@ -287,6 +288,7 @@ def test_two_processes():
     assert first["part"] == second["part"] == [[2, HEIGHT, WIDTH, 4]]  # half of the cameras each
 
 
+@pytest.mark.thorough
 def test_nothing_but_the_gradients_of_gaussians_is_sent(on_four):
     (kind,) = on_four["scenes"]["sent"]
     assert kind == "all-reduce"

@@ -97,6 +97,7 @@ def test_a_query_is_answered_shown_and_saved(scene, answers):
         until(lambda: page._now.scene is scene)
 
 
+@pytest.mark.thorough
 def test_a_query_that_cannot_be_answered_is_reported(scene, answers):
     with open_viewer(scene, port=0) as viewer, browser(viewer, scene) as (page, _):
         folder = page._questions

@@ -147,6 +147,7 @@ def test_playback_continues_with_the_preview():
         page._player.toggle()
 
 
+@pytest.mark.thorough
 def test_a_film_is_saved_with_its_progress():
     edits = Edits()
     scene = rising(ball(RED, 0.0), 4, edits.editing())

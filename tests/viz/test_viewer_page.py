@@ -220,6 +220,7 @@ def test_a_page_from_the_first_picture_to_the_last_screenshot(scene):
         assert saved.pictures[0][1].shape == (104, 160, 3)
 
 
+@pytest.mark.thorough
 def test_a_page_can_be_used_while_it_is_built(scene, monkeypatch):
     built = Page._build_shots
 

@@ -66,6 +66,7 @@ def test_an_answer_is_a_sentence(gsjax, scene):
     assert "measuring frame 6" in said
 
 
+@pytest.mark.thorough
 def test_json_has_the_value_and_what_it_rests_on(scene, capsys):
     from gsjax.cli import main
 

@@ -52,6 +52,7 @@ def test_what_a_run_writes(deformed):
     assert found["curve"][-1]["structure"] is not None  # the graph counts in the end
 
 
+@pytest.mark.thorough
 def test_scores_over_time_and_of_classes(deformed):
     found = metrics(deformed)
     test = found["test"]

@@ -118,6 +118,7 @@ def test_the_solution_can_be_asked_while_it_is_trained(gsjax, pristine, scene, t
     assert written == [("ArrayImpl", 0), ("FeatureGrid", 0)]
 
 
+@pytest.mark.thorough
 def test_what_was_distilled_can_be_asked(gsjax, field, pristine):
     code, said = gsjax("query", field, "can")
     assert code == 0, said

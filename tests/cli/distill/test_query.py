@@ -74,6 +74,7 @@ def test_an_answer_goes_nowhere_where_something_would_be_lost(gsjax, closed, tmp
     assert (code, "--camera: expected --point" in said) == (2, True)
 
 
+@pytest.mark.thorough
 def test_an_answer_elsewhere_and_without_pictures(gsjax, closed, tmp_path):
     field, out = shutil.copytree(closed, tmp_path / "closed"), tmp_path / "answers" / "can"
     code, said = gsjax("query", field, "can", "--no-pictures", "--out", out)

@@ -142,6 +142,7 @@ def test_what_is_kept_is_what_a_run_here_keeps(beside, toy, gsjax):
     assert sorted(calls()) == ["640 exact 0", "640 fast 0"]  # those that failed
 
 
+@pytest.mark.thorough
 def test_scripts_and_helpers_that_were_edited_are_loaded_again(beside, toy, gsjax):
     script = "import helper\ndef run(options, seed, folder): return {'x': helper.X}"
     for value in (1, 2):
@@ -151,6 +152,7 @@ def test_scripts_and_helpers_that_were_edited_are_loaded_again(beside, toy, gsja
         assert [row["result"]["x"] for row in results(folder)["rows"]] == [value] * 2
 
 
+@pytest.mark.thorough
 def test_a_worker_of_another_gsjax_is_refused(beside, toy, gsjax, monkeypatch):
     toy()
     monkeypatch.setattr("gsjax.__version__", "9.9")
@@ -265,6 +267,7 @@ def test_who_cannot_run_cells(toy, gsjax, options, says, monkeypatch):
     assert says in err
 
 
+@pytest.mark.thorough
 def test_nothing_is_forgotten_where_no_scheduler_answers(toy, gsjax, monkeypatch):
     toy()
     gsjax("run", "toy")

@@ -243,6 +243,7 @@ def test_what_a_part_of_the_time_bought_is_the_last_look_before_it():
     assert ablate_time(rows[4:]) == []
 
 
+@pytest.mark.thorough
 def test_a_damaged_checkpoint_leaves_the_one_before(gsjax_fit, tmp_path, monkeypatch):
     add, calls, often = Progress.add, [], ("--save-every", "1e-9")
 
@@ -281,6 +282,7 @@ def test_it_stops_only_when_all_held_out_views_are(gsjax_fit, tmp_path, monkeypa
     assert json.loads((tmp_path / "run" / "metrics.json").read_text())["steps"] == 24
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("options", "says"),
     [
@@ -301,6 +303,7 @@ def test_wishes_that_cannot_be_met(gsjax_fit, tmp_path, options, says):
     assert not (tmp_path / "run").exists()
 
 
+@pytest.mark.thorough
 def test_a_photograph_that_is_cut_off_is_named(photographs, gsjax_fit, tmp_path):
     copy = tmp_path / "copy"
     (copy / "images").mkdir(parents=True)

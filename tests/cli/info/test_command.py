@@ -52,6 +52,7 @@ def test_what_a_layout_leaves_open_is_asked_for_and_taken(tmp_path, capfd):
     assert "51° wide" in out
 
 
+@pytest.mark.thorough
 def test_a_picture_shows_what_becomes_of_each_photograph(photographs, capfd, tmp_path, monkeypatch):
     drawn = {}
 

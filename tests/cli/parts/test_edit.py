@@ -263,6 +263,7 @@ def test_edits_that_change_nothing_are_said_to(gsjax, run):
     assert "seen by camera 2" in said
 
 
+@pytest.mark.thorough
 def test_an_earlier_film_is_replaced_when_asked(gsjax, run, tmp_path):
     out = tmp_path / "film"
     once = ("edit", run, "--op", "freeze:parts=all", "--out", out)

@@ -54,12 +54,14 @@ def test_a_film_leaves_as_files_of_its_frames(gsjax, film, tmp_path):
     assert len(list(tmp_path.glob("*.sog"))) == 3
 
 
+@pytest.mark.thorough
 def test_a_film_leaves_as_a_page_that_plays(gsjax, film, tmp_path):
     code, said = gsjax("export", film, tmp_path / "film.html")
     assert code == 0, said
     assert "of 13 frames" in said
 
 
+@pytest.mark.thorough
 def test_a_film_is_viewed_over_its_own_time(film):
     scene, folder = open_viewable(film, Notes(Console(quiet=True)))
     assert (scene.num_frames, folder) == (13, film)
@@ -67,6 +69,7 @@ def test_a_film_is_viewed_over_its_own_time(film):
     assert scene.shots is not None
 
 
+@pytest.mark.thorough
 def test_a_film_is_described(gsjax, made, film):
     code, said = gsjax("info", film)
     assert code == 0, said
@@ -75,6 +78,7 @@ def test_a_film_is_described(gsjax, made, film):
     assert "0.87 s, 13 frames" in said
 
 
+@pytest.mark.thorough
 def test_a_film_whose_run_is_gone_names_it(gsjax, film, tmp_path):
     alone = tmp_path / "alone"
     shutil.copytree(film, alone)
@@ -93,6 +97,7 @@ def test_a_film_whose_run_is_gone_names_it(gsjax, film, tmp_path):
     assert "edit.yaml: edits: expected" in said
 
 
+@pytest.mark.thorough
 def test_a_film_goes_along_with_its_run(gsjax, made, film, tmp_path):
     moved = tmp_path / "elsewhere"
     shutil.copytree(made[0], moved)

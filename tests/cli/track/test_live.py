@@ -111,6 +111,7 @@ def test_what_cannot_be_followed_is_said(pristine, live, source, options, says):
     assert says in " ".join(said.split())
 
 
+@pytest.mark.thorough
 def test_a_stream_that_fails_leaves_what_was_followed(pristine, live, monkeypatch):
     def failing(frames, hz, seconds):
         yield from gsjax.data.stream.replay(frames, hz, 0.2)
