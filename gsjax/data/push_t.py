@@ -108,7 +108,7 @@ def _ground_model(points: Float[np.ndarray, "n 3"], plane: Float[np.ndarray, "4"
     spacing = neighbor_spacing(points)
     scales = np.stack([spacing, spacing, np.full_like(spacing, GROUND_THICKNESS_M)], axis=1)
     count = len(points)
-    to_plane, _ = Rotation.align_vectors(plane[None, :3], [[0.0, 0.0, 1.0]])
+    to_plane = Rotation.align_vectors(plane[None, :3], [[0.0, 0.0, 1.0]])[0]
     return PointModel(
         name="ground",
         means=points,

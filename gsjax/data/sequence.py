@@ -304,6 +304,7 @@ class Sequence:
         image = self._load(self.load_image, "image", t, c)
         kind, type_name = (np.floating, "floats in 0..1") if self.float_images else (np.uint8, "uint8 RGB")
         _check_array(self.where("image", t, c), image, (self.height, self.width, 3), kind, type_name)
+        assert image is not None
         return image
 
     def _load(self, loader: Callable | None, kind: str, t: int, c: int) -> np.ndarray | None:

@@ -148,8 +148,10 @@ def _files(path: Path) -> tuple[Path, dict[Path, str | None]]:
         return path.parent, {path: None}
     if (path / "transforms.json").is_file():
         return path, {path / "transforms.json": None}
-    files = {path / f"transforms_{split}.json": split for split in SPLITS}
-    files = {file: split for file, split in files.items() if file.is_file()}
+    files: dict[Path, str | None] = {}
+    for split in SPLITS:
+        if (file := path / f"transforms_{split}.json").is_file():
+            files[file] = split
     if not files:
         found = (
             ", ".join(sorted(entry.name for entry in path.iterdir())[:8])

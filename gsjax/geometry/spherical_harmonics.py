@@ -43,16 +43,16 @@ def sh_bases(degree: int, directions: Float[Array, "*n 3"]) -> Float[Array, "*n 
             _C2[3] * xz,
             _C2[4] * (xx - yy),
         ]
-    if degree >= 3:
-        bases += [
-            _C3[0] * y * (3 * xx - yy),
-            _C3[1] * xy * z,
-            _C3[2] * y * (4 * zz - xx - yy),
-            _C3[3] * z * (2 * zz - 3 * xx - 3 * yy),
-            _C3[4] * x * (4 * zz - xx - yy),
-            _C3[5] * z * (xx - yy),
-            _C3[6] * x * (xx - 3 * yy),
-        ]
+        if degree >= 3:
+            bases += [
+                _C3[0] * y * (3 * xx - yy),
+                _C3[1] * xy * z,
+                _C3[2] * y * (4 * zz - xx - yy),
+                _C3[3] * z * (2 * zz - 3 * xx - 3 * yy),
+                _C3[4] * x * (4 * zz - xx - yy),
+                _C3[5] * z * (xx - yy),
+                _C3[6] * x * (xx - 3 * yy),
+            ]
     return jnp.stack(bases, axis=-1)
 
 

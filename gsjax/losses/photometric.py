@@ -99,7 +99,7 @@ def _blurred(planes: Float[Array, "n h w"]) -> Float[Array, "n h w"]:
         length = planes.shape[axis]
         padded = jnp.pad(planes, [(half, half) if i == axis else (0, 0) for i in range(3)])
         parts = (jax.lax.slice_in_dim(padded, i, i + length, axis=axis) for i in range(len(_WINDOW)))
-        planes = sum(weight * part for weight, part in zip(_WINDOW.tolist(), parts, strict=True))
+        planes = jnp.asarray(sum(w * part for w, part in zip(_WINDOW.tolist(), parts, strict=True)))
     return planes
 
 

@@ -111,13 +111,12 @@ class OpticalFlow(Protocol):
 
 @runtime_checkable
 class LanguageEncoder(Protocol):
-    """Objects and text in one vector space, in which similarity is the cosine.
+    """Objects and text in one vector space, in which similarity is the cosine."""
 
-    Attributes:
-        min_score: a query whose best cosine is lower matches none of the objects.
-    """
-
-    min_score: float
+    @property
+    def min_score(self) -> float:
+        """A query whose best cosine is lower matches none of the objects; an attribute will do."""
+        ...
 
     def embed_objects(
         self, image: Num[np.ndarray, "H W 3"], labels: Int[np.ndarray, "H W"], count: int

@@ -66,7 +66,7 @@ def ssim(
     image, reference = _same_shape(image, reference)
     if min(image.shape[:2]) < _SSIM_WINDOW:
         raise ValueError(f"image: expected at least 11 pixels on each side for SSIM, found {image.shape[:2]}")
-    mean, similarity = structural_similarity(
+    mean, similarity, *_ = structural_similarity(
         image,
         reference,
         data_range=1.0,

@@ -40,7 +40,7 @@ class _Moments(NamedTuple):
     square: PyTree
 
 
-def simplex_descent(rate: optax.ScalarOrSchedule) -> optax.GradientTransformation:
+def simplex_descent(rate: optax.ScalarOrSchedule) -> optax.GradientTransformationExtraArgs:
     """Projected gradient descent with Adam's moments, for arrays [..., P] whose rows lie on the simplex.
 
     For each row w with gradient g, centred to mean 0 because the projection ignores the mean:

@@ -358,7 +358,7 @@ def _linearise(fn, y: PyTree, jac: str):
 
 
 def _half_sum_of_squares(values: PyTree) -> Float[Array, ""]:
-    return 0.5 * sum(jnp.sum(a * a) for a in jax.tree.leaves(values))
+    return jnp.asarray(0.5 * sum(jnp.sum(a * a) for a in jax.tree.leaves(values)))
 
 
 def _no_tangent(a: Any) -> Any:

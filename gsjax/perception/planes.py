@@ -77,6 +77,12 @@ def surface_normals(points: Float[np.ndarray, "H W 3"]) -> Float[np.ndarray, "H 
     return np.where(lengths > 1e-12, normals / np.maximum(lengths, 1e-12), 0.0)
 
 
+def _opened(pixels: Bool[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"]:
+    """What is left of pixels without what is thin, grown back and a little beyond."""
+    core = ndimage.binary_opening(pixels)
+    return np.asarray(ndimage.binary_dilation(core, iterations=_EDGE))
+
+
 def find_planes(
     points: Float[np.ndarray, "H W 3"],
     normals: Float[np.ndarray, "H W 3"],
@@ -109,8 +115,7 @@ def find_planes(
             normal, offset = _fit(points[agreeing])
         if agreeing.sum() < min_pixels:
             break
-        core = ndimage.binary_opening(agreeing)
-        planes.append(Plane(normal, offset, near & ndimage.binary_dilation(core, iterations=_EDGE)))
+        planes.append(Plane(normal, offset, near & _opened(agreeing)))
         free &= ~(planes[-1].pixels | agreeing)
     return planes
 
@@ -146,8 +151,7 @@ def find_levels(
         peak = bins == np.argmax(np.bincount(bins))
         offset = float(np.median(heights[agreeing][peak]))
         near = free & (np.abs(heights - offset) <= tolerance)
-        core = ndimage.binary_opening(near & agreeing)
-        labels = label(near & ndimage.binary_dilation(core, iterations=_EDGE), connectivity=1)
+        labels = label(near & _opened(near & agreeing), connectivity=1)
         found = [labels == name for name in range(1, labels.max() + 1)]
         patches += [Plane(up, offset, patch) for patch in found if patch.sum() >= min_pixels]
         taken = near | (agreeing & (np.abs(heights - offset) <= width))

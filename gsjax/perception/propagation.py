@@ -96,5 +96,5 @@ class FlowPropagator:
         edges = [ndimage.gaussian_gradient_magnitude(lab[..., i], self.smoothing) for i in range(3)]
         # The watershed fills pixels whose marker is 0.
         flooded = watershed(np.linalg.norm(edges, axis=0), carried - _UNKNOWN) + _UNKNOWN
-        distance = ndimage.distance_transform_edt(carried == _UNKNOWN)
+        distance = np.asarray(ndimage.distance_transform_edt(carried == _UNKNOWN))
         return np.where(distance > self.reach, 0, flooded).astype(carried.dtype)

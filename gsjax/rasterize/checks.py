@@ -133,8 +133,8 @@ def check_inputs(
 @partial(jax.jit, static_argnums=(1, 2, 3), inline=True)
 def _laid_out(arrays: dict[str, Any], shapes: tuple, kinds: tuple, edge: int) -> Views:
     """The arrays in their shapes and types, by one program; the pixels of interest as tiles."""
-    kinds = dict(kinds)
-    laid_out = {name: arrays[name].astype(kinds[name]).reshape(shape) for name, shape in shapes}
+    types = dict(kinds)
+    laid_out = {name: arrays[name].astype(types[name]).reshape(shape) for name, shape in shapes}
     if "roi" in laid_out:
         laid_out["tile_mask"] = _tiles_with_a_pixel(laid_out["roi"], edge)
     return Views(*(laid_out.get(name) for name in Views._fields))

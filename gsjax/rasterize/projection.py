@@ -146,15 +146,15 @@ def project_gaussians(
     def linearised(local, K, coeffs):
         return pinhole(local, K, plan) if coeffs is None else fisheye(local, coeffs)
 
-    means, quats, scales = (columns_in_lanes(a) for a in (means, quats, scales))
+    mean, quat, scale = (columns_in_lanes(a) for a in (means, quats, scales))  # lists of their numbers
     opacities, usable = in_lanes(opacities), in_lanes(usable)
     offset = [] if means2d_offset is None else columns_in_lanes(means2d_offset)
-    sound = _all_finite([*means, *quats, *scales, opacities, *offset]) & usable & camera_finite
+    sound = _all_finite([*mean, *quat, *scale, opacities, *offset]) & usable & camera_finite
     # Unlike jnp.clip this passes the whole gradient at exactly 0 and 1.
     opacities = jnp.where(opacities < 0, 0.0, jnp.where(opacities > 1, 1.0, opacities))
 
     # First on values alone: which rows can be drawn, and how far they reach.
-    values = jax.lax.stop_gradient((means, quats, scales, opacities, viewmat, K))
+    values = jax.lax.stop_gradient((mean, quat, scale, opacities, viewmat, K))
     local = _to_camera(values[0], values[4])
     at = linearised(local, values[5], coeffs if coeffs is None else jax.lax.stop_gradient(coeffs))
     (u, v), conics, alphas, variances, det = _project_local(at, *values[1:], plan)
@@ -191,13 +191,13 @@ def project_gaussians(
             harmless = [jnp.where(sees, c.ravel()[first], h) for c, h in zip(seen, harmless, strict=True)]
         return [jnp.where(visible, c, h) for c, h in zip(columns, harmless, strict=True)]
 
-    quats = kept(quats, (1.0, 0.0, 0.0, 0.0), values[1])
-    scales = kept(scales, (1.0, 1.0, 1.0), values[2])
+    quat = kept(quat, (1.0, 0.0, 0.0, 0.0), values[1])
+    scale = kept(scale, (1.0, 1.0, 1.0), values[2])
     opacities = jnp.where(visible, opacities, 0.0)
-    means = kept(means, (0.0, 0.0, 0.0), values[0])
-    local = kept(_to_camera(means, viewmat), (0.0, 0.0, 1.0), local)
+    mean = kept(mean, (0.0, 0.0, 0.0), values[0])
+    local = kept(_to_camera(mean, viewmat), (0.0, 0.0, 1.0), local)
     at = linearised(local, K, coeffs)
-    means2d, conics, opacities, _, _ = _project_local(at, quats, scales, opacities, viewmat, K, plan)
+    means2d, conics, opacities, _, _ = _project_local(at, quat, scale, opacities, viewmat, K, plan)
     if offset:
         means2d = [c + d for c, d in zip(means2d, kept(offset, (0.0, 0.0)), strict=True)]
 

@@ -296,6 +296,7 @@ def features_at(
     else:
         blends = nodes._replace(indices=nodes.indices[rows], weights=nodes.weights[rows])
         changes = jax.vmap(lambda time: _by_nodes(gaussians, field, time, blends).features)(times)
+    assert changes is not None
     return still + changes
 
 

@@ -1,7 +1,7 @@
 """What a set of cameras saw at one moment: the one observation that every loss and method takes."""
 
 from functools import partial
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import equinox as eqx
 import jax
@@ -67,7 +67,7 @@ def _one_on_device(seen: Seen, c: Int[Array, ""] | int) -> Seen:
     return _chosen(seen, jnp.reshape(c, 1))
 
 
-def _chosen(seen: Seen, which: slice | Int[Array | np.ndarray, "k"]) -> Seen:
+def _chosen(seen: Any, which: slice | Int[Array | np.ndarray, "k"]) -> Any:
     return of_cameras(seen, which) if isinstance(seen, Frame) else jax.tree.map(lambda a: a[which], seen)
 
 
@@ -101,8 +101,8 @@ def part_of(frame: Frame, cameras: tuple[int, ...] = (), shrink: int = 1) -> Fra
     def picked(pixels):
         return None if pixels is None else pixels[:, middle, middle][:, :height, :width]
 
-    cameras = resized(frame.cameras, 1 / shrink, width, height)
-    return Frame(images, picked(frame.depths), cameras, picked(frame.masks), frame.time)
+    smaller = resized(frame.cameras, 1 / shrink, width, height)
+    return Frame(images, picked(frame.depths), smaller, picked(frame.masks), frame.time)
 
 
 def without_broken(frame: Frame) -> tuple[Frame, Int[Array, ""]]:

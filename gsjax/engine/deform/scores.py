@@ -174,7 +174,7 @@ def _drawn(
 
 def _photograph(frame: Frame) -> Float[np.ndarray, "h w 3"]:
     """The picture of a frame of one camera, 0 to 1."""
-    return frame.images[0] / 255.0
+    return np.asarray(frame.images[0]) / 255.0
 
 
 def _counted(frame: Frame) -> Bool[np.ndarray, "h w"] | None:

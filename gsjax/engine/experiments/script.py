@@ -49,9 +49,10 @@ def load_script(root: Path, path: Path, text: str, described: bool) -> tuple[Cal
         raise ValueError(f"{path}: expected a script that can be loaded, found {found}") from error
     run, figure = getattr(module, "run", None), getattr(module, "figure", None)
     expect(callable(run), f"{path}", "a function run(options, seed, folder)", "none")
+    assert callable(run)
     wanted = "a function figure(rows, path), which the config describes"
     expect(callable(figure) or not described, f"{path}", wanted, "none")
-    return run, figure
+    return run, figure if callable(figure) else None
 
 
 def _make_importable(root: Path) -> None:

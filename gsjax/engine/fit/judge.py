@@ -135,7 +135,7 @@ class Compared:
     @property
     def mask(self) -> np.ndarray | None:
         """The pixels that count, [H,W]; None for all."""
-        return None if self.frame.masks is None else self.frame.masks[0]
+        return None if self.frame.masks is None else np.asarray(self.frame.masks[0])
 
     def psnr(self) -> float:
         """PSNR over the pixels that count, dB."""

@@ -119,7 +119,7 @@ def _moves(layer: Layer) -> Bool[np.ndarray, "n"]:
     changes = np.zeros(parts, bool)
     for leaf in map(np.asarray, jax.tree.leaves((trajectory.poses, trajectory.opacities, trajectory.scales))):
         changes |= (leaf != leaf[:1]).reshape(len(leaf), parts, -1).any(axis=(0, 2))
-    return np.asarray(layer.scene.weights)[:, changes].any(axis=1)
+    return np.any(np.asarray(layer.scene.weights)[:, changes], axis=1)
 
 
 def _labels(film: Film, names: Names) -> tuple[Int[np.ndarray, "n"], dict[int, str]]:

@@ -172,7 +172,8 @@ class Teaching:
             photographs, pairs = self._photographs, list(zip(found, indices, strict=True))
             ids = [_as_large(one.ids, photographs, i) for one, i in pairs]
             filled = [_as_large(one.filled, photographs, i) for one, i in pairs if one.filled is not None]
-            return ids, [one.codebook for one in found], filled or None
+            rows = [one.codebook for one in found if one.codebook is not None]  # all, without maps
+            return ids, rows, filled or None
         assert views is not None
         shown = track(indices, "features", console=console, transient=True)
         objects = []
@@ -233,6 +234,7 @@ class Teaching:
     ) -> Teacher:
         """MaskCLIP's maps; masks, if any, define which pixels form one object."""
         encoder, maps = self._patches, []
+        assert encoder is not None
         for i in track(indices, "patches", console=console, transient=True):
             image = self._photographs.image(i)
             output = self._cache(

@@ -163,7 +163,7 @@ def lost_over_frames(
         values: the mask value of each group, [K+1], or None.
         label: the object's.
     """
-    return _of_object(tracking, tracking.lost, values, label).any(axis=1)
+    return np.any(_of_object(tracking, tracking.lost, values, label), axis=1)
 
 
 def turn_unknown(tracking: Tracking, values: np.ndarray | None, label: int) -> Bool[np.ndarray, "updates"]:
@@ -172,7 +172,7 @@ def turn_unknown(tracking: Tracking, values: np.ndarray | None, label: int) -> B
     Args:
         tracking, values, label: as for `lost_over_frames`.
     """
-    return ~_of_object(tracking, tracking.turn_known, values, label).all(axis=1)
+    return ~np.all(_of_object(tracking, tracking.turn_known, values, label), axis=1)
 
 
 def turn_unknown_from(tracking: Tracking, values: np.ndarray | None, label: int) -> int | None:

@@ -100,7 +100,7 @@ def _shown(view: Frame, background: tuple[float, float, float] | None) -> Bool[n
     """The pixels that may show the scene."""
     if background is None:
         return np.ones(view.images.shape[1:3], bool)
-    differs = (np.abs(_colors(view) - np.array(background)) > _DIFFERS).any(axis=-1)
+    differs = np.any(np.abs(_colors(view) - np.array(background)) > _DIFFERS, axis=-1)
     return differs if view.masks is None else differs | ~np.asarray(view.masks[0])
 
 

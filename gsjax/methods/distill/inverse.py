@@ -51,4 +51,4 @@ def learned_inverse(
     (inverse, _), losses = jax.lax.scan(
         step, (start, optimizer.init(start)), jax.random.split(keys, iterations)
     )
-    return inverse, losses
+    return jnp.asarray(inverse), losses

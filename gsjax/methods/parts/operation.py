@@ -71,8 +71,8 @@ class TimeEdit(Edit):
         begin, last = self.begin or 0.0, max(ends[p] for p in parts)
         moving = parts if self.end is not None else [p for p in parts if begin < ends[p]]
         if not moving:
-            parts = ", ".join(f"part {part}" if isinstance(part, int) else part for part in self.parts)
-            expected = f"a time before {last:g}, where the motion of {parts} ends"
+            told = ", ".join(f"part {part}" if isinstance(part, int) else part for part in self.parts)
+            expected = f"a time before {last:g}, where the motion of {told} ends"
             raise ValueError(f"from: expected {expected}, found {begin:g}")
         return moving
 

@@ -210,8 +210,8 @@ def _numbers(parts: Sequence[str | int], names: Names, num: int) -> list[int]:
         if part == ALL:
             numbers += range(num)
         elif isinstance(part, str) and part not in known:
-            names = ", ".join(f"{name} ({p})" for name, p in known.items())
-            raise ValueError(f"parts: expected one of {names}, found {did_you_mean(part, known)}")
+            listed = ", ".join(f"{name} ({p})" for name, p in known.items())
+            raise ValueError(f"parts: expected one of {listed}, found {did_you_mean(part, known)}")
         else:
             numbers.append(known[part] if isinstance(part, str) else part)
     wrong = [p for p in numbers if not 0 <= p < num]

@@ -149,7 +149,7 @@ def _normal_equations(
     x, y, z = jnp.moveaxis(residuals.gradients, 1, 0)
 
     def over_channels(a, b) -> Float[Array, "c p"]:
-        return sum(w * ab for w, ab in zip(weights, _by_kind(a * b), strict=True))
+        return jnp.asarray(sum(w * ab for w, ab in zip(weights, _by_kind(a * b), strict=True)))
 
     # A row of the Jacobian is (g, arm x g), so a point adds (F, F A^T; A F, A F A^T) with A v = arm x v and F
     # the sum of g g^T over its channels. No row is stored, which XLA:CPU would do for a matrix product.

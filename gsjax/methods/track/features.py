@@ -212,7 +212,7 @@ def _residual(
     def draw(features):
         rendered = render(gaussians, cameras, plan, features=features)
         meta = rendered.meta
-        return rendered.features, (rendered.alphas, (meta.overflow.any(), meta.needed.max()))
+        return jnp.asarray(rendered.features), (rendered.alphas, (meta.overflow.any(), meta.needed.max()))
 
     drawn, transpose, (alphas, room) = jax.vjp(draw, features, has_aux=True)
     target = alphas[..., None] * maps if faded else maps

@@ -157,7 +157,7 @@ def find_pose(shape: Shape, frame: Frame, extent: np.ndarray | None) -> Float[np
     rows = np.random.default_rng(0).permutation(len(shape.means))[:_SAMPLES]
     sampled = [jnp.asarray(values[rows], jnp.float32) for values in (shape.means, shape.colors)]
     for up in (1.0, -1.0):
-        base, _ = Rotation.align_vectors([normal], [[0.0, 0.0, up]])
+        base = Rotation.align_vectors([normal], [[0.0, 0.0, up]])[0]
         standing = shape.means @ base.as_matrix().T
         lift = -offset - np.quantile(standing @ normal, 0.02)
         center = standing.mean(0)

@@ -5,7 +5,7 @@ In XLA this takes gathers, scatters and running sums over all rows of tiles and 
 """
 
 # Warp's types are values.
-# pyright: reportInvalidTypeForm=false, reportGeneralTypeIssues=false
+# pyright: reportInvalidTypeForm=false, reportGeneralTypeIssues=false, reportOperatorIssue=false
 
 from functools import cache
 from typing import NamedTuple

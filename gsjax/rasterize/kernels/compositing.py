@@ -10,6 +10,9 @@ each Gaussian in a fixed order. Nothing is added atomically, so results are the 
 The same kernels run on a CPU, one thread per tile: that is how they are tested where there is no GPU.
 """
 
+# Warp's types are values.
+# pyright: reportOperatorIssue=false
+
 import math
 from functools import cache
 from typing import NamedTuple

@@ -1,5 +1,8 @@
 """Sums of rows of gradients, one per entry of the lists, over the entries of each Gaussian."""
 
+# Warp's types are values.
+# pyright: reportOperatorIssue=false
+
 from functools import cache
 
 import jax.numpy as jnp

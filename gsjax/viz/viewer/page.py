@@ -154,8 +154,8 @@ class Page:
         with panel.add_tab("Render by gsjax"):
             self._image = gui.add_image(np.full((208, 320, 3), 40, np.uint8), format="png")
             self._status = gui.add_markdown("Compiling ...")
-            extra = tuple(name for name in scene.colorings if name in ("label", "features"))
-            shows: tuple[Shown, ...] = ("colour", "depth", "alpha", *extra)
+            extra: tuple[Shown, ...] = ("label", "features")
+            shows = ("colour", "depth", "alpha", *(name for name in extra if name in scene.colorings))
             self._shown = gui.add_dropdown("Shows", shows)
             self._width = gui.add_dropdown("Width", WIDTHS, initial_value=_WIDTH, hint="In pixels")
             self._photograph = gui.add_image(np.zeros((1, 1, 3), np.uint8), visible=False)
