@@ -8,6 +8,7 @@ random keys, headroom, the guard against divergence, and when Ctrl-C may interru
 """
 
 import operator
+import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
@@ -19,6 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from gsjax.engine.interrupts import raise_if_interrupted, shielded
+from gsjax.losses.extra import ExtraLosses, captured
 from gsjax.optim.compiler import compile_seconds, host_options
 from gsjax.optim.guard import Guard, begun, part_of_step, window_of
 from gsjax.optim.method import Method, Run
@@ -80,6 +82,8 @@ class Tick:
         return self.method.result(self.problem, self.run)
 
 
+_SKIPPED = 10  # steps in a row, after which custom losses are suspected
+
 UPDATE = "/gsjax/update"
 """Event of `jax.monitoring` after each tick, with its seconds, for those who listen."""
 
@@ -115,7 +119,9 @@ class Drive(Iterator[Tick]):
         self._window = window_of(total, method.period(problem))
         self._progress = (lambda step: step / total if total else 1.0) if progress is None else progress
         self._headroom = headroom
-        self._advance = _compiled(method)
+        self._losses: ExtraLosses = getattr(method, "extra_losses", ())
+        self._advance = _compiled(method, captured(self._losses))
+        self._skipped = 0  # steps in a row
         self._key = jax.random.key(method.config.seed)
 
     def __iter__(self) -> "Drive":
@@ -159,6 +165,9 @@ class Drive(Iterator[Tick]):
                 break
             self.run = self.run.grown(names, info["needed"], self._headroom)
         loss = np.nan if skipped else float(loss)
+        self._skipped = self._skipped + 1 if skipped else 0
+        if self._losses and self._skipped == _SKIPPED:
+            _warn_of_skipped(info)
         guard, params = guard.watched(loss, params, self._window)
         self.run = self.run.having(params=params, guard=guard, step=run.step + 1)
         if self._progress(self.run.step) >= 1:
@@ -199,9 +208,21 @@ def _guard_of(before: Run, run: Run) -> Guard:
     return run.guard if run.guard is not None and is_same else begun(run.params, before.guard)
 
 
+def _warn_of_skipped(info: dict[str, Any]) -> None:
+    values = {name: float(value) for name, value in info["extra"].items()}
+    faulty = [f"{name} is {value}" for name, value in values.items() if not np.isfinite(value)]
+    found = ", ".join(faulty) or f"finite losses ({', '.join(values)}), so a gradient is not"
+    warnings.warn(
+        f"{_SKIPPED} steps in a row changed nothing, as what they computed is not finite: {found}",
+        RuntimeWarning,
+        stacklevel=4,
+    )
+
+
 @lru_cache(maxsize=4)
-def _compiled(method: Method) -> Callable:
-    """The jitted update of a method, cached so that a second problem like the first starts at once."""
+def _compiled(method: Method, outside: tuple) -> Callable:
+    """The jitted update of a method, cached so that a second problem like the first starts at once. What its
+    custom losses take from `outside` is compiled in."""
     update = method.step.update
 
     def advance(params, state, share, batch, step, key):

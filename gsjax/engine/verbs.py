@@ -8,21 +8,24 @@ scene so far:
     now.result
 """
 
+import warnings
 from collections.abc import Sequence as Indices
 from typing import TYPE_CHECKING, Any, Literal
+
+import jax
 
 from gsjax.data.photographs import Photographs, photographs_of
 from gsjax.data.sequence import Sequence
 from gsjax.engine.drive import Drive, Tick, drive
 from gsjax.engine.track.tracking import track as track
-from gsjax.losses.extra import ExtraLosses
+from gsjax.losses.extra import ExtraLosses, named_losses
 from gsjax.methods.deform import DeformConfig
 from gsjax.methods.distill import PRESETS, Distill, DistillConfig, Teacher
 from gsjax.methods.fit import Fit, FitConfig, prune
 from gsjax.methods.parts import Parts, PartsConfig
 from gsjax.methods.parts.pictures import Problem as PartsProblem
 from gsjax.methods.protocols import Segmenter
-from gsjax.optim.method import Method, Run
+from gsjax.optim.method import Run
 from gsjax.scene.gaussians import Gaussians
 
 if TYPE_CHECKING:
@@ -208,7 +211,19 @@ def parts(
     return drive(method, problem, run, headroom=config.headroom)
 
 
-def _going_on(after: Tick, method: Method) -> Run:
-    """The run of an earlier tick. With other settings or losses, its losses are not compared with those
-    before."""
-    return after.run if after.method == method else after.run.having(guard=None)
+def _going_on(after: Tick, method: Any) -> Run:
+    """A copy of an earlier tick's run, as steps donate its arrays, and one may go on from a tick twice. With
+    other settings or losses, its losses are not compared with those before."""
+    lost = sorted({*(after.info.get("extra") or ())} - {*named_losses(getattr(method, "extra_losses", ()))})
+    if lost:
+        warnings.warn(
+            f"after: the run was trained with custom losses that are not given now: {', '.join(lost)}; "
+            "gsjax.save does not store functions, so pass extra_losses again",
+            UserWarning,
+            stacklevel=3,
+        )
+    run = after.run
+    held = run.params, run.state
+    params, state = jax.tree.map(lambda leaf: leaf.copy() if isinstance(leaf, jax.Array) else leaf, held)
+    run = run.having(params=params, state=state)
+    return run if after.method == method else run.having(guard=None)

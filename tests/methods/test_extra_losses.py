@@ -10,9 +10,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import gsjax
 from gsjax.engine.drive import drive
 from gsjax.engine.track.tracking import track
-from gsjax.losses.extra import extra_terms
+from gsjax.losses.extra import captured, extra_terms
 from gsjax.methods.deform import Deform, DeformConfig, deform_loss, with_field
 from gsjax.methods.deform import batch_of as deform_batch_of
 from gsjax.methods.fit import Fit, FitConfig, StartConfig, fit_loss
@@ -259,6 +260,70 @@ class TestOtherMethods:
         assert now.step == 2
 
 
+class Unhashable:
+    __hash__ = None
+
+    def __call__(self, scene, rendered, frame):
+        return jnp.zeros(())
+
+
+def weighted(weight):
+    def loss(scene, rendered, frame):
+        return weight * nothing(scene, rendered, frame)
+
+    return loss
+
+
+class TestWhatTheyTakeFromOutside:
+    @pytest.mark.parametrize("value", [2, 2.5, "b", np.float32(3), np.arange(3.0), jnp.arange(4)])
+    def test_globals_closures_and_arguments_count(self, value, monkeypatch):
+        assert captured((weighted(1.0),)) == captured((weighted(1.0),)) != captured((weighted(value),))
+        assert captured((partial(nothing, frame=1.0),)) != captured((partial(nothing, frame=value),))
+
+        def calls(scene, rendered, frame):
+            return height(scene, rendered, frame)
+
+        before = captured((calls,))
+        monkeypatch.setitem(globals(), "HEIGHT_WEIGHT", value)
+        assert captured((calls,)) != before
+
+    @pytest.mark.thorough
+    def test_another_weight_in_a_global_variable_counts(self, photographs, monkeypatch):
+        values = []
+        for weight in (5.0, 0.0):
+            monkeypatch.setitem(globals(), "HEIGHT_WEIGHT", weight)
+            method = Fit(FIT, (height,))
+            now = next(drive(method, *method.start(photographs), progress=lambda i: 0.5 + i / 8))
+            values.append(float(now.info["extra"]["height"]))
+        assert values[0] != 0
+        assert values[1] == 0
+
+
+@pytest.mark.thorough
+def test_where_one_is_never_finite_it_is_named(photographs):
+    def nanny(scene, rendered, frame):
+        return jnp.mean(jnp.log(rendered.alphas - 2.0))
+
+    method = Fit(replace(FIT, steps=24), (nothing, nanny))
+    with pytest.warns(RuntimeWarning, match="10 steps in a row changed nothing, .*: nanny is nan$"):
+        list(drive(method, *method.start(photographs), progress=lambda i: 0.5 + i / 24))
+
+
+@pytest.mark.thorough
+def test_a_tick_is_gone_on_from_twice_and_its_losses_are_missed(tmp_path):
+    taken = gsjax.open_photographs("simulated:tabletop?width=32&height=24&frames=1")
+    for now in gsjax.fit(taken, FIT, extra_losses=(height,)):
+        gsjax.save(tmp_path / "fit.npz", now)
+        break
+    kept, ends = gsjax.load(tmp_path / "fit.npz"), []
+    for _ in range(2):
+        *_, end = gsjax.fit(taken, FIT, after=kept, extra_losses=(height,))
+        ends.append(np.asarray(end.result.means))
+    np.testing.assert_array_equal(*ends)
+    with pytest.warns(UserWarning, match="custom losses that are not given now: height"):
+        gsjax.fit(taken, FIT, after=kept)
+
+
 class TestMistakes:
     @pytest.mark.parametrize(
         ("losses", "said"),
@@ -268,12 +333,23 @@ class TestMistakes:
             ((1.0,), "expected functions loss"),
             ((nothing, nothing), "two named 'nothing'"),
             ((lambda *_: jnp.zeros(3),), r"expected a scalar from <lambda>, found shape \(3,\)"),
-            ((lambda *_: None,), "expected a scalar from <lambda>, found None"),
+            ((lambda *_: None,), "expected a scalar from <lambda>, found NoneType"),
+            ((lambda *_: (jnp.zeros(()), {}),), "expected a scalar from <lambda>, found tuple"),
+            ((partial(nothing), nothing), "two named 'nothing'"),
+            ((Unhashable(),), "found a Unhashable that cannot be hashed"),
         ],
     )
     def test_what_is_no_loss_is_refused(self, losses, said):
         with pytest.raises(ValueError, match=f"extra_losses: .*{said}"):
             extra_terms(losses, None, None, None)
+
+    def test_what_fails_in_one_says_in_which(self):
+        def wrong(scene, rendered, frame):
+            return float(scene[0])
+
+        with pytest.raises(jax.errors.ConcretizationTypeError) as failed:
+            jax.jit(lambda scene: extra_terms((wrong,), scene, None, None))(jnp.zeros(3))
+        assert "in the extra loss wrong(scene, rendered, frame)" in failed.value.__notes__[0]
 
     @pytest.mark.thorough
     @pytest.mark.usefixtures("as_users_run")

@@ -12,7 +12,7 @@ import numpy as np
 
 from gsjax.engine.drive import Clock, Tick, announced
 from gsjax.engine.interrupts import raise_if_interrupted, shielded
-from gsjax.losses.extra import ExtraLosses
+from gsjax.losses.extra import ExtraLosses, captured
 from gsjax.methods.track.budget import Costs, Governor, choose, ladder
 from gsjax.methods.track.config import TrackConfig
 from gsjax.methods.track.frames import FrameShape, shape_of
@@ -157,7 +157,7 @@ class _Updates:
     """The compiled update of one configuration, compiled again where a plan has become too small."""
 
     def __init__(self, method: Track, shape: FrameShape, run: Run):
-        self._advance = _compiled(method, shape, run.kept.reduction)
+        self._advance = _compiled(method, shape, run.kept.reduction, captured(method.extra_losses))
         self._key = jax.random.key(method.config.seed)
         self._headroom = method.config.headroom
 
@@ -175,9 +175,9 @@ class _Updates:
 
 
 @lru_cache(maxsize=8)
-def _compiled(method: Track, shape: FrameShape, reduction: int) -> Callable:
+def _compiled(method: Track, shape: FrameShape, reduction: int, outside: tuple) -> Callable:
     """The jitted update, cached so that a second sequence like the first starts at once. Nothing is donated,
-    so ticks stay valid."""
+    so ticks stay valid. What its custom losses take from `outside` is compiled in."""
     update = method.step(shape, reduction).update
 
     def advance(params, state, batch, step, key):

@@ -48,6 +48,7 @@ from gsjax.methods.deform.result import DeformResult, Timeline
 from gsjax.methods.deform.start import can_start_from, start_gaussians
 from gsjax.methods.deform.update import (
     Batch,
+    DeformedScene,
     DeformingScene,
     Moving,
     deform_loss,
@@ -66,6 +67,7 @@ __all__ = [
     "DeformRatesConfig",
     "DeformResult",
     "DeformWeightsConfig",
+    "DeformedScene",
     "DeformingScene",
     "FrameGraph",
     "GraphConfig",

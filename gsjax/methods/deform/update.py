@@ -85,6 +85,19 @@ class DeformingScene(eqx.Module):
         return jnp.where(jnp.isin(rows, moving)[:, None], found, still)
 
 
+class DeformedScene(NamedTuple):
+    """The scene at one moment, as passed to extra losses.
+
+    Attributes:
+        gaussians: the Gaussians as they were drawn, deformed to this time.
+        canonical: what is trained: `canonical.gaussians` before they were deformed, `canonical.at(time)` at
+            any time, and `canonical.field`, which is None in the warm-up.
+    """
+
+    gaussians: Gaussians
+    canonical: DeformingScene
+
+
 Moving = Nodes | Int[Array, "M"] | None
 """Where the field is evaluated: at nodes, at some Gaussians, or at all of them."""
 
@@ -121,8 +134,8 @@ def deform_loss(config: DeformConfig, extra_losses: ExtraLosses = ()) -> Callabl
 
     Args:
         config: configuration, with the weights.
-        extra_losses: custom losses of the `DeformingScene` with its Gaussians deformed to this time, the
-            rendered view, in which pixels that do not count are those of the photograph, and the frame.
+        extra_losses: custom losses of the `DeformedScene` at this time, the rendered view, in which pixels
+            that do not count are those of the photograph, and the frame.
     """
     weights = config.weights
 
@@ -166,7 +179,7 @@ def deform_loss(config: DeformConfig, extra_losses: ExtraLosses = ()) -> Callabl
         meta = drawn.meta
         info = {"psnr": -10 * jnp.log10(mse), "overflow": meta.overflow.any(), "needed": meta.needed.max()}
         if extra_losses:
-            now = eqx.tree_at(lambda s: s.gaussians, scene, there)
+            now = DeformedScene(there, scene)
             rendered = drawn._replace(colors=image)
             seen = Frame(target, frame.depths, camera, frame.masks, frame.time)
             info["extra"] = extra_terms(extra_losses, now, rendered, seen)
