@@ -11,7 +11,7 @@ DEMO := "simulated:tabletop?width=240&height=180"
 .PHONY: help demo test test-thorough test-all test-floors bench gallery notebooks docs lint dist clean
 
 help: ## list the targets
-	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-11s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-13s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
 
 demo: $(VENV)/installed ## track the built-in scene from nothing to a report
 	@rm -rf $(RUN)

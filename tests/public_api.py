@@ -5,12 +5,14 @@ python -m tests.public_api release    # and what the next changes are compared w
 """
 
 import ast
+import dataclasses
 import hashlib
 import inspect
 import json
 import re
 import sys
 from pathlib import Path
+from types import FunctionType
 
 import gsjax
 
@@ -20,7 +22,8 @@ AGAIN = "python -m tests.public_api"
 """What to run where the page is not current."""
 _INTRODUCTION = """# What is promised
 
-What `import gsjax` offers: these names, as they are written here. Before version 1.0 a minor version may
+What `import gsjax` offers: these names, as they are written here, and the settings within settings with their
+defaults (`TrackConfig.grow`). Before version 1.0 a minor version may
 change them, a patch version does not, and CHANGELOG.md says what changed: a test fails otherwise. The same
 holds, without a test, for options of commands and for the files of a run.
 
@@ -30,8 +33,24 @@ move in any version.
 
 
 def signatures() -> dict[str, str]:
-    """What is promised of each public name, as source."""
-    return {name: _signature(name) for name in gsjax.__all__}
+    """What is promised of each public name, and of the settings within settings, as source."""
+    named = {name: inspect.unwrap(getattr(gsjax, name)) for name in gsjax.__all__}
+    within = {}
+    for name, thing in named.items():
+        if name.endswith("Config"):
+            within |= _within(name, thing())
+    return {name: _signature(thing) for name, thing in (named | within).items()}
+
+
+def _within(name: str, settings: object) -> dict[str, type]:
+    """The classes of settings within settings, by where they are."""
+    found = {}
+    for field in dataclasses.fields(settings):
+        value = getattr(settings, field.name)
+        if dataclasses.is_dataclass(value):
+            place = f"{name}.{field.name}"
+            found |= {place: type(value)} | _within(place, value)
+    return found
 
 
 def page() -> str:
@@ -47,7 +66,7 @@ def unmentioned() -> list[str]:
     changed = sorted(name for name in before | now if before.get(name) != now.get(name))
     newest = re.split(r"^## ", (ROOT / "CHANGELOG.md").read_text(), flags=re.MULTILINE)[1]
     quoted = set(re.findall(r"\w+", " ".join(re.findall(r"`([^`]*)`", newest))))
-    return [name for name in changed if name not in quoted]
+    return [name for name in changed if name.split(".")[-1] not in quoted]
 
 
 def broken() -> list[str]:
@@ -63,8 +82,7 @@ def digests() -> dict[str, str]:
     return {name: hashlib.sha256(text.encode()).hexdigest()[:16] for name, text in signatures().items()}
 
 
-def _signature(name: str) -> str:
-    thing = inspect.unwrap(getattr(gsjax, name))
+def _signature(thing: type | FunctionType) -> str:
     tree = ast.parse(Path(inspect.getsourcefile(thing)).read_text(encoding="utf-8"))
     node = next(node for node in tree.body if getattr(node, "name", None) == thing.__name__)
     if isinstance(node, ast.FunctionDef):

@@ -1,5 +1,7 @@
-"""The one loop over steps. It alone owns compiler options, the donation of buffers, overflow, compile time,
-random keys, headroom, the guard against divergence, and when Ctrl-C may interrupt.
+"""The loop over steps of four of the methods. It owns compiler options, the donation of buffers, overflow,
+compile time, random keys, headroom, the guard against divergence, and when Ctrl-C may interrupt. The tracker,
+which is given a new frame at every step, donates nothing and keeps to a budget, has a loop of its own with
+the same parts (`gsjax.engine.track.tracking`).
 
     ticks = drive(method, problem, run)
     for now in ticks:

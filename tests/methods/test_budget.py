@@ -5,8 +5,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gsjax import track
-from gsjax.methods.track import PRESETS, GrowConfig, TrackConfig
-from gsjax.methods.track.budget import Costs, Governor, choose, ladder
+from gsjax.methods.track import PRESETS, GrowConfig, StartConfig, TrackConfig
+from gsjax.methods.track.budget import Costs, Governor, choose, ladder, not_used
 
 RUNGS = ladder(TrackConfig(), 3)
 NAMES = list(RUNGS)
@@ -108,6 +108,16 @@ def test_a_budget_of_nothing_is_refused(table, started):
         next(track(started, frames[0], frames[1:], budget_ms=-1))
 
 
+def test_settings_of_ones_own_that_a_budget_does_not_use_are_named():
+    for config in (TrackConfig(), *PRESETS.values()):
+        assert not_used(config) == []
+    mine = TrackConfig(
+        start=StartConfig(iterations=3), grow=GrowConfig(slots=9, reach=7), seed=4, headroom=3.0, coarseness=7
+    )
+    assert not_used(mine) == ["grow.reach", "coarseness"]
+
+
+@pytest.mark.filterwarnings("ignore:under a budget")
 @pytest.mark.thorough
 def test_costs_are_measured_with_the_second_frame(table, started, monkeypatch):
     """Where cameras move, updates to the first one again would draw no background."""
@@ -126,6 +136,7 @@ def test_costs_are_measured_with_the_second_frame(table, started, monkeypatch):
         assert seen.value.args[0] is expected
 
 
+@pytest.mark.filterwarnings("ignore:under a budget")
 @pytest.mark.slow
 def test_objects_are_followed_within_a_generous_budget(table, started, quick, centroid_errors):
     sequence, frames, _ = table()

@@ -63,7 +63,7 @@ class Options(FirstMasks, OfRecording):
 
     budget_ms: float | None = None
     """Time that an update may take, milliseconds. Settings are then chosen by measured cost; of those under
-    --track, only the initial scene, the limit on its growth, and the seed are used."""
+    --track, only start, grow.slots, headroom and seed are used."""
     preset: Literal["fast", "balanced", "accurate", "paper"] = "fast"
     """Default settings of the tracker: for 30 Hz (fast), for small errors (accurate), between the two
     (balanced), or as in the paper."""

@@ -2,6 +2,7 @@
 one."""
 
 import itertools
+import warnings
 from collections.abc import Callable, Iterable, Iterator
 from functools import lru_cache, partial
 from typing import Any
@@ -10,10 +11,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from gsjax.data.errors import DataWarning
 from gsjax.engine.drive import Clock, Tick, announced
 from gsjax.engine.interrupts import raise_if_interrupted, shielded
 from gsjax.losses.extra import ExtraLosses, captured
-from gsjax.methods.track.budget import Costs, Governor, choose, ladder
+from gsjax.methods.track.budget import Costs, Governor, choose, ladder, not_used
 from gsjax.methods.track.config import TrackConfig
 from gsjax.methods.track.frames import FrameShape, shape_of
 from gsjax.methods.track.method import PLAN, Track
@@ -49,7 +51,8 @@ def track(
         frames: the frames after it, in order of time; all of one size and number of cameras.
         config: see `TrackConfig` (default: its defaults).
         budget_ms: time that an update may take, milliseconds. The richest settings that keep to it are then
-            chosen by measured cost, and of `config` only the start of a scene is used (see `budget`).
+            chosen by measured cost, and of `config` only `start`, `grow.slots`, `headroom` and `seed` are
+            used; a DataWarning names others that are no preset's.
         after: a tick to continue from, with its scene, state and chosen settings.
         like: returns a tick of another scene of the same shapes, or None. Its plan is used again, so that
             nothing is compiled for settings that it has too; see `gsjax.engine.track.rehearsal`.
@@ -86,6 +89,10 @@ def track(
         frames = itertools.chain(ahead, frames)
         second = [*ahead, first][0]
         _check_alike(second, first, 1)
+        if unused := not_used(config):
+            named = ", ".join(unused)
+            message = f"under a budget settings are chosen by their cost: {named} of yours will not be used"
+            warnings.warn(message, DataWarning, stacklevel=2)
         rungs = ladder(config, len(first.images))
         chosen = choose(rungs, partial(_measured, start, second), budget_ms / 1e3, count)
     method = Track(chosen.config)

@@ -6,7 +6,7 @@ update can vary. Delays are compensated by the updates that follow.
 """
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import fields, is_dataclass, replace
 from typing import NamedTuple
 
 from gsjax.methods.track.config import PRESETS, TrackConfig
@@ -35,13 +35,17 @@ class Chosen(NamedTuple):
     fits: bool  # False if even the cheapest rung exceeds the budget
 
 
+_KEPT = ("start", "headroom", "seed")  # and grow.slots
+
+
 def ladder(config: TrackConfig, num_cameras: int) -> dict[str, TrackConfig]:
-    """Settings by name, from the richest to the cheapest, for this number of cameras. How a scene starts, and
-    how much may join it, is always as in `config`."""
+    """Settings by name, from the richest to the cheapest, for this number of cameras. All have `start`,
+    `grow.slots`, `headroom` and `seed` of `config`: how a scene starts, how much may join it, the room in
+    plans, and the seed."""
 
     def rung(preset: TrackConfig) -> TrackConfig:
         grow = replace(preset.grow, slots=config.grow.slots)
-        return replace(preset, start=config.start, headroom=config.headroom, seed=config.seed, grow=grow)
+        return replace(preset, grow=grow, **{name: getattr(config, name) for name in _KEPT})
 
     rungs = {name: rung(PRESETS[name]) for name in ("accurate", "balanced", "fast")}
     small = replace(rungs["fast"], shrink=2)
@@ -50,6 +54,25 @@ def ladder(config: TrackConfig, num_cameras: int) -> dict[str, TrackConfig]:
         cameras = "1 camera" if count == 1 else f"{count} cameras"
         rungs[f"fast, half the resolution, {cameras}"] = replace(small, cameras=tuple(range(count)))
     return rungs
+
+
+def not_used(config: TrackConfig) -> list[str]:
+    """Names of settings that are of no preset, so somebody's own, and that no rung of `ladder` takes."""
+    found = []
+    for one in fields(config):
+        mine, theirs = getattr(config, one.name), [getattr(preset, one.name) for preset in PRESETS.values()]
+        if one.name in _KEPT or mine in theirs:
+            continue
+        if not is_dataclass(mine):
+            found.append(one.name)
+            continue
+        within = {part.name: getattr(mine, part.name) for part in fields(mine)}
+        found += [
+            f"{one.name}.{name}"
+            for name, value in within.items()
+            if (one.name, name) != ("grow", "slots") and value not in [getattr(p, name) for p in theirs]
+        ]
+    return found
 
 
 def first_rung(config: TrackConfig, num_cameras: int) -> TrackConfig:
