@@ -87,7 +87,8 @@ class ClipEncoder:
     ) -> Float[np.ndarray, "count D"]:
         """The vector of a square crop around each of the labels 1 to `count`; zeros for absent labels.
 
-        A crop keeps the object's surroundings, because CLIP was trained on whole images, not on cut-outs.
+        A crop keeps the object's surroundings, because these models were trained on whole images, not on
+        cut-outs.
 
         Args:
             image: RGB, uint8 or floats 0 to 1.

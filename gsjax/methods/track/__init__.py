@@ -4,23 +4,27 @@ scene = start_scene(first, mask, mask_camera, config)
 for now in gsjax.track(scene, first, frames, config):
     now.result.gaussians()
 
-config.py     settings                    scene.py      Gaussians with labels, the moving ones first
-first_fit.py  the scene at frame one      shapes.py     the same without depth, from known shapes
-frames.py     preparation of frames       motion.py     twists of groups, displacements of Gaussians
+What a frame goes through, in its order, and what each step is made of:
+
+config.py     settings
+scene.py      Gaussians with labels, the moving ones first
+first_fit.py  the scene at frame one; shapes.py: the same without depth, from known shapes
+state.py      parameters, state and batch of the step; plan.py: its capacities
+frames.py     preparation of a frame
+update.py     the step, whose six stages are in stages/
+motion.py     twists of groups, displacements of Gaussians
 layers.py     moving Gaussians over a background that is drawn once
 points.py     the points that are aligned: pixels of the last frame and of a keyframe, centres
 align.py      Levenberg-Marquardt on points, without rendering
-reference.py  the Gaussians that the first mask labelled: what an object has to look like
-lost.py       detection of lost objects   recover.py    relocation of lost objects
 search.py     several starts, aligned; the one that agrees best is kept
-watch.py      the record of each object: what is usual, whether it is lost or was found
 matching.py   masked cross-correlation of templates (the paper's)
 refine.py     photometric refinement (the paper's), in the tiles of region.py
-plan.py       capacities of a step        state.py      parameters, state and batch of the step
-stages/       the six stages of a frame   grow.py       surfaces that come into view
-update.py     the step                    method.py     the tracker as one value
-budget.py     settings for a time limit   features.py   features that move with the Gaussians
-query.py      language queries
+reference.py  the Gaussians that the first mask labelled: what an object has to look like
+watch.py      the record of each object: what is usual, whether it is lost or was found
+lost.py       detection of lost objects; recover.py: their relocation
+grow.py       surfaces that come into view
+method.py     the tracker as one value; budget.py: settings for a time limit
+features.py   features that move with the Gaussians; query.py: language queries
 """
 
 from gsjax.methods.track.config import (

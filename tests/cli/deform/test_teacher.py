@@ -23,7 +23,8 @@ from gsjax.engine.teaching.choice import TeacherChoice
 from gsjax.engine.teaching.source import Source
 from gsjax.methods.deform import Deform, DeformConfig, Meaning, counted_ids, feature_prompt, text_prompt
 from tests.cli.deform.test_command import SCENE, SMALL
-from tests.perception.test_foundation import clip_folder, needs_foundation  # noqa: F401
+from tests.perception.test_clip import clip_folder  # noqa: F401
+from tests.perception.test_foundation import needs_foundation
 
 DIMENSION, GRID = 24, (13, 16)
 OF_TISSUE, OF_TOOL = np.random.default_rng(0).normal(size=(2, DIMENSION)).astype(np.float32)
