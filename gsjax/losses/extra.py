@@ -95,7 +95,7 @@ def captured(losses: ExtraLosses) -> tuple[Hashable, ...]:
 
 
 def _is_library(function: Any) -> bool:
-    return getattr(function, "__module__", "").partition(".")[0] in ("gsjax", "jax", "numpy")
+    return (getattr(function, "__module__", None) or "").partition(".")[0] in ("gsjax", "jax", "numpy")
 
 
 def _captured(loss: Any, known: set[int]) -> Iterator[Hashable]:
@@ -103,9 +103,13 @@ def _captured(loss: Any, known: set[int]) -> Iterator[Hashable]:
         return
     known.add(id(loss))
     if isinstance(loss, partial):
-        outside: dict[str, Any] = dict(enumerate(loss.args)) | loss.keywords | {"func": loss.func}
+        outside: dict[Any, Any] = dict(enumerate(loss.args)) | loss.keywords | {"func": loss.func}
     elif isinstance(loss, FunctionType):
-        found, defaults = getclosurevars(loss), enumerate(loss.__defaults__ or ())
+        try:
+            found = getclosurevars(loss)
+        except ValueError:  # a variable that is not set yet
+            return
+        defaults = enumerate(loss.__defaults__ or ())
         outside = {**found.globals, **found.nonlocals, **(loss.__kwdefaults__ or {}), **dict(defaults)}
     else:
         return
