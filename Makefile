@@ -34,7 +34,7 @@ test-all: $(VENV)/installed-test ## every test, those of minutes too, on program
 # Of the tests those that touch every dependency and are quick. Some floors have no wheel for a newer Python.
 FLOORS := build/floors
 QUICK := geometry rasterize losses scene optim io viz data/test_files.py cli/test_main.py
-test-floors: pyproject.toml ## quick tests with the lowest versions that pyproject.toml allows, on Python 3.11
+test-floors: pyproject.toml ## tests of some folders with the lowest versions that pyproject.toml allows, on Python 3.11
 	rm -rf $(FLOORS) && mkdir -p build
 	python3.11 -m venv $(FLOORS)
 	$(FLOORS)/bin/python tests/floors.py test > build/floors.txt

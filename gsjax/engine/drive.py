@@ -22,7 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from gsjax.engine.interrupts import raise_if_interrupted, shielded
-from gsjax.losses.extra import ExtraLosses, captured
+from gsjax.losses.extra import ExtraLosses, Outside, named_losses
 from gsjax.optim.compiler import compile_seconds, host_options
 from gsjax.optim.guard import Guard, begun, part_of_step, window_of
 from gsjax.optim.method import Method, Run
@@ -122,7 +122,7 @@ class Drive(Iterator[Tick]):
         self._progress = (lambda step: step / total if total else 1.0) if progress is None else progress
         self._headroom = headroom
         self._losses: ExtraLosses = getattr(method, "extra_losses", ())
-        self._advance = _compiled(method, captured(self._losses))
+        self._outside = Outside(self._losses)
         self._skipped = 0  # steps in a row
         self._key = jax.random.key(method.config.seed)
 
@@ -160,7 +160,10 @@ class Drive(Iterator[Tick]):
             run, step = self.run, jnp.asarray(self.run.step)
             batch, names = method.batch(problem, run, progress)
             inputs = run.params, run.state, guard.share
-            params, state, info = self._advance(*inputs, batch, step, self._key)
+            # Looked up at each step: what custom losses take from outside may change.
+            advance = _compiled(method, self._outside.before())
+            params, state, info = advance(*inputs, batch, step, self._key)
+            self._outside.after()
             self.run = run.having(params=params, state=state)
             overflow, skipped, loss = jax.device_get([info[name] for name in ("overflow", "skipped", "loss")])
             if not overflow:
@@ -210,14 +213,27 @@ def _guard_of(before: Run, run: Run) -> Guard:
     return run.guard if run.guard is not None and is_same else begun(run.params, before.guard)
 
 
+def warn_of_lost(after: Tick, method: Any) -> None:
+    """Warn if a run that goes on was trained with custom losses that it is not given now."""
+    lost = sorted({*(after.info.get("extra") or ())} - {*named_losses(getattr(method, "extra_losses", ()))})
+    if lost:
+        warnings.warn(
+            f"after: the run was trained with custom losses that are not given now: {', '.join(lost)}; "
+            "gsjax.save does not store functions, so pass extra_losses again",
+            UserWarning,
+            stacklevel=4,
+        )
+
+
 def _warn_of_skipped(info: dict[str, Any]) -> None:
     values = {name: float(value) for name, value in info["extra"].items()}
     faulty = [f"{name} is {value}" for name, value in values.items() if not np.isfinite(value)]
-    found = ", ".join(faulty) or f"finite losses ({', '.join(values)}), so a gradient is not"
+    if not faulty:
+        faulty = ["a gradient" if np.isfinite(float(info["loss"])) else "the method's own loss"]
     warnings.warn(
-        f"{_SKIPPED} steps in a row changed nothing, as what they computed is not finite: {found}",
+        f"{_SKIPPED} steps in a row changed nothing, as something is not finite: {', '.join(faulty)}",
         RuntimeWarning,
-        stacklevel=4,
+        stacklevel=5,
     )
 
 

@@ -8,7 +8,6 @@ scene so far:
     now.result
 """
 
-import warnings
 from collections.abc import Sequence as Indices
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -16,9 +15,9 @@ import jax
 
 from gsjax.data.photographs import Photographs, photographs_of
 from gsjax.data.sequence import Sequence
-from gsjax.engine.drive import Drive, Tick, drive
+from gsjax.engine.drive import Drive, Tick, drive, warn_of_lost
 from gsjax.engine.track.tracking import track as track
-from gsjax.losses.extra import ExtraLosses, named_losses
+from gsjax.losses.extra import ExtraLosses
 from gsjax.methods.deform import DeformConfig
 from gsjax.methods.distill import PRESETS, Distill, DistillConfig, Teacher
 from gsjax.methods.fit import Fit, FitConfig, prune
@@ -214,16 +213,11 @@ def parts(
 def _going_on(after: Tick, method: Any) -> Run:
     """A copy of an earlier tick's run, as steps donate its arrays, and one may go on from a tick twice. With
     other settings or losses, its losses are not compared with those before."""
-    lost = sorted({*(after.info.get("extra") or ())} - {*named_losses(getattr(method, "extra_losses", ()))})
-    if lost:
-        warnings.warn(
-            f"after: the run was trained with custom losses that are not given now: {', '.join(lost)}; "
-            "gsjax.save does not store functions, so pass extra_losses again",
-            UserWarning,
-            stacklevel=3,
-        )
+    warn_of_lost(after, method)
     run = after.run
     held = run.params, run.state
+    if any(leaf.is_deleted() for leaf in jax.tree.leaves(held) if isinstance(leaf, jax.Array)):
+        raise ValueError("after: expected a tick whose loop has taken no further step, found an earlier one")
     params, state = jax.tree.map(lambda leaf: leaf.copy() if isinstance(leaf, jax.Array) else leaf, held)
     run = run.having(params=params, state=state)
     return run if after.method == method else run.having(guard=None)

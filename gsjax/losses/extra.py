@@ -11,10 +11,12 @@ The weight of a loss is a factor inside it. Without extra losses, a method's pro
 """
 
 import hashlib
-from collections.abc import Callable, Hashable, Iterator
+import sysconfig
+from collections.abc import Callable, Hashable
+from contextlib import suppress
 from functools import partial
-from inspect import getclosurevars
-from types import FunctionType
+from pathlib import Path
+from types import CodeType, FunctionType, MethodType
 from typing import Any, Protocol, runtime_checkable
 
 import jax
@@ -43,6 +45,8 @@ class ExtraLoss(Protocol):
         ...
 
 
+_DIGESTED = 2**20  # bytes up to which an array is known by its content, not by its identity
+
 ExtraLosses = tuple[ExtraLoss, ...]
 """A tuple, because it is static under jit. A new function object, such as a fresh lambda, recompiles."""
 
@@ -65,8 +69,8 @@ def named_losses(losses: Any) -> dict[str, ExtraLoss]:
             hash(loss)
         except TypeError as error:
             raise ValueError(
-                f"extra_losses: expected functions, found a {type(loss).__name__} that cannot be hashed, as "
-                "it holds arrays; define a function that takes them from outside"
+                f"extra_losses: expected functions, found {type(loss).__name__}, which cannot be hashed; "
+                "freeze its dataclass, and let a function take arrays from outside"
             ) from error
         name = _name(loss)
         if name in named:
@@ -85,42 +89,105 @@ def _name(loss: Any) -> str:
 
 
 def captured(losses: ExtraLosses) -> tuple[Hashable, ...]:
-    """The numbers, texts and arrays that losses take from outside (globals, closures, defaults, those of
-    functions that they call), which are compiled in: where one has changed, a method compiles anew.
+    """What losses take from outside, which is compiled in: where it differs, a method compiles anew.
+
+    Numbers, texts and arrays are found in globals, closures, defaults, partials, containers, attributes of
+    callable objects, and in functions of one's own that are called. What is reached in other ways (an
+    attribute of a module or of another object) is not, and under `jax.jit` JAX keeps what it traced.
 
     Args:
         losses: functions of scene, rendered and frame.
     """
-    return tuple(value for loss in losses for value in _captured(loss, set()))
+    found: list[Hashable] = []
+    known: dict[int, Any] = {}  # held, so that no other gets the id of one
+    for loss in losses:
+        _collect(loss, found, known)
+    return tuple(found)
 
 
-def _is_library(function: Any) -> bool:
-    return (getattr(function, "__module__", None) or "").partition(".")[0] in ("gsjax", "jax", "numpy")
+class Outside:
+    """What losses take from outside, over the steps of a loop. What the trace itself changes, such as a
+    counter of traces, is no change."""
+
+    def __init__(self, losses: ExtraLosses):
+        """
+        Args:
+            losses: functions of scene, rendered and frame.
+        """
+        self._losses, self._key, self._left = losses, (), None
+
+    def before(self) -> tuple[Hashable, ...]:
+        """What a program of the next step belongs to."""
+        if self._losses and (now := captured(self._losses)) != self._left:
+            self._key = now
+        return self._key
+
+    def after(self) -> None:
+        """To be called after the step."""
+        self._left = captured(self._losses) if self._losses else None
 
 
-def _captured(loss: Any, known: set[int]) -> Iterator[Hashable]:
-    if id(loss) in known:
+class _Same:
+    """An array that equals itself alone. As a key of a cache holds it, nothing else gets its id."""
+
+    def __init__(self, array: Any):
+        self.array = array
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Same) and self.array is other.array
+
+    def __hash__(self) -> int:
+        return id(self.array)
+
+
+def _collect(value: Any, found: list[Hashable], known: dict[int, Any]) -> None:
+    if isinstance(value, bool | int | float | complex | str | np.generic):
+        found.append((type(value).__name__, repr(value)))
         return
-    known.add(id(loss))
-    if isinstance(loss, partial):
-        outside: dict[Any, Any] = dict(enumerate(loss.args)) | loss.keywords | {"func": loss.func}
-    elif isinstance(loss, FunctionType):
-        try:
-            found = getclosurevars(loss)
-        except ValueError:  # a variable that is not set yet
-            return
-        defaults = enumerate(loss.__defaults__ or ())
-        outside = {**found.globals, **found.nonlocals, **(loss.__kwdefaults__ or {}), **dict(defaults)}
-    else:
+    if id(value) in known:
         return
-    for name, value in outside.items():
-        if isinstance(value, bool | int | float | complex | str | np.generic):
-            yield name, type(value).__name__, repr(value)
-        elif isinstance(value, np.ndarray | jax.Array) and not isinstance(value, jax.core.Tracer):
-            array = np.asarray(value)
-            yield name, str(array.dtype), array.shape, hashlib.sha256(array.tobytes()).hexdigest()
-        elif isinstance(value, partial | FunctionType) and not _is_library(value):
-            yield from _captured(value, known)
+    known[id(value)] = value
+    if isinstance(value, np.ndarray) and value.nbytes <= _DIGESTED and value.dtype != object:
+        digest = hashlib.sha256(np.ascontiguousarray(value)).hexdigest()
+        found.append((str(value.dtype), value.shape, digest))
+    elif isinstance(value, np.ndarray | jax.Array):
+        found.append(_Same(value))
+    elif isinstance(value, tuple | list):
+        found.append(len(value))
+        for one in value:
+            _collect(one, found, known)
+    elif isinstance(value, dict):
+        for name, one in value.items():
+            found.append(str(name))
+            _collect(one, found, known)
+    elif isinstance(value, partial):
+        _collect([value.func, *value.args, value.keywords], found, known)
+    elif isinstance(value, MethodType):
+        _collect([value.__func__, value.__self__], found, known)
+    elif isinstance(value, FunctionType):
+        if not _is_library(value.__code__):
+            _collect(_outside(value), found, known)
+    elif callable(value) and not isinstance(value, type):
+        _collect(getattr(value, "__dict__", {}), found, known)
+
+
+def _outside(function: FunctionType) -> dict[str, Any]:
+    """Values of a function's globals, of its closure and of its defaults, by name."""
+    names, codes = set(), [function.__code__]
+    while codes:  # a lambda or a comprehension within it has code of its own
+        code = codes.pop()
+        names |= set(code.co_names)
+        codes += [one for one in code.co_consts if isinstance(one, CodeType)]
+    values = {name: function.__globals__[name] for name in sorted(names & function.__globals__.keys())}
+    for name, cell in zip(function.__code__.co_freevars, function.__closure__ or (), strict=True):
+        with suppress(ValueError):  # not set yet
+            values[f"{name} of the closure"] = cell.cell_contents
+    return values | {"defaults": function.__defaults__ or (), **(function.__kwdefaults__ or {})}
+
+
+def _is_library(code: CodeType) -> bool:
+    places = (sysconfig.get_path("stdlib"), sysconfig.get_path("purelib"), str(Path(__file__).parents[1]))
+    return code.co_filename.startswith(places)
 
 
 def extra_terms(losses: Any, scene: Any, rendered: Any, frame: Any) -> dict[str, Float[Array, ""]]:

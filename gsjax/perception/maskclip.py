@@ -34,8 +34,8 @@ class MaskClipEncoder:
     def __post_init__(self):
         if self.clip.is_siglip:  # it pools by a query of its own, not by a token among the patches
             raise ValueError(
-                "vectors of patches (maskclip): expected the weights of CLIP, found those of SigLIP, which "
-                "has vectors of whole pictures only; take --features clip without --second"
+                "vectors of patches: expected the weights of CLIP, found those of SigLIP, which has vectors "
+                "of whole pictures only"
             )
 
     @property

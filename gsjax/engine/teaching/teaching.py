@@ -309,10 +309,13 @@ def _clip(weights: Path) -> tuple[LanguageEncoder, str]:
 
 
 def _patches(clip: Any) -> Callable[[np.ndarray], np.ndarray]:
-    """The encoder of patches."""
+    """MaskCLIP, by CLIP's weights."""
     from gsjax.perception.maskclip import MaskClipEncoder
 
-    return MaskClipEncoder(clip)
+    try:
+        return MaskClipEncoder(clip)
+    except ValueError as error:
+        raise ValueError(f"--weights: {error}; take --features clip, without --second") from error
 
 
 def _segmenter(choice: TeacherChoice, masks: str) -> tuple[Callable[..., np.ndarray] | None, str]:

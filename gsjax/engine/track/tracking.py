@@ -11,10 +11,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gsjax.data.errors import DataWarning
-from gsjax.engine.drive import Clock, Tick, announced
+from gsjax.engine.drive import Clock, Tick, announced, warn_of_lost
 from gsjax.engine.interrupts import raise_if_interrupted, shielded
-from gsjax.losses.extra import ExtraLosses, captured
+from gsjax.losses.extra import ExtraLosses, Outside
 from gsjax.methods.track.budget import Costs, Governor, choose, ladder, not_used
 from gsjax.methods.track.config import TrackConfig
 from gsjax.methods.track.frames import FrameShape, shape_of
@@ -52,7 +51,7 @@ def track(
         config: see `TrackConfig` (default: its defaults).
         budget_ms: time that an update may take, milliseconds. The richest settings that keep to it are then
             chosen by measured cost, and of `config` only `start`, `grow.slots`, `headroom` and `seed` are
-            used; a DataWarning names others that are no preset's.
+            used; a warning names others that are not the default.
         after: a tick to continue from, with its scene, state and chosen settings.
         like: returns a tick of another scene of the same shapes, or None. Its plan is used again, so that
             nothing is compiled for settings that it has too; see `gsjax.engine.track.rehearsal`.
@@ -81,6 +80,10 @@ def track(
         method = Track(config, extra_losses)
         yield from _ticks(method, *_begun(method, scene, first, after, like()), first, frames, None)
         return
+    if unused := not_used(config):
+        named = ", ".join(unused)
+        message = f"under a budget settings are chosen by their cost: {named} of yours will not be used"
+        warnings.warn(message, UserWarning, stacklevel=2)
     count = (scene if after is None else after.run.params.scene).num_objects
     chosen = None if after is None else after.run.kept.chosen
     start = partial(_begun, scene=scene, first=first, after=after, like=like(), anew=chosen is None)
@@ -89,10 +92,6 @@ def track(
         frames = itertools.chain(ahead, frames)
         second = [*ahead, first][0]
         _check_alike(second, first, 1)
-        if unused := not_used(config):
-            named = ", ".join(unused)
-            message = f"under a budget settings are chosen by their cost: {named} of yours will not be used"
-            warnings.warn(message, DataWarning, stacklevel=2)
         rungs = ladder(config, len(first.images))
         chosen = choose(rungs, partial(_measured, start, second), budget_ms / 1e3, count)
     method = Track(chosen.config)
@@ -142,6 +141,8 @@ def _begun(
 ) -> tuple[FrameShape, Run]:
     """A run before its next frame; `anew` keeps only the scene of `after`, because its state belongs to other
     settings."""
+    if after is not None:
+        warn_of_lost(after, method)
     if after is None:
         shape, run = method.start(scene, first, like.run if like and like.method == method else None)
         return shape, _looked(method, shape, run, first)
@@ -164,7 +165,7 @@ class _Updates:
     """The compiled update of one configuration, compiled again where a plan has become too small."""
 
     def __init__(self, method: Track, shape: FrameShape, run: Run):
-        self._advance = _compiled(method, shape, run.kept.reduction, captured(method.extra_losses))
+        self._of, self._outside = (method, shape, run.kept.reduction), Outside(method.extra_losses)
         self._key = jax.random.key(method.config.seed)
         self._headroom = method.config.headroom
 
@@ -174,7 +175,10 @@ class _Updates:
         clock, step = Clock(), np.int32(run.step)
         while True:
             batch = TrackBatch(frame, run.plans[PLAN], jnp.int32(everywhere))
-            result = jax.block_until_ready(self._advance(run.params, run.state, batch, step, self._key))
+            # Looked up at each frame: what custom losses take from outside may change.
+            advance = _compiled(*self._of, self._outside.before())
+            result = jax.block_until_ready(advance(run.params, run.state, batch, step, self._key))
+            self._outside.after()
             params, state, info = result
             if not bool(info["overflow"]):
                 return run.having(params=params, state=state, step=run.step + 1), info, *clock.read()

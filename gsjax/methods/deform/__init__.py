@@ -48,9 +48,9 @@ from gsjax.methods.deform.result import DeformResult, Timeline
 from gsjax.methods.deform.start import can_start_from, start_gaussians
 from gsjax.methods.deform.update import (
     Batch,
-    DeformedScene,
     DeformingScene,
     Moving,
+    SceneAtTime,
     deform_loss,
     feature_loss,
     on_grid,
@@ -67,7 +67,6 @@ __all__ = [
     "DeformRatesConfig",
     "DeformResult",
     "DeformWeightsConfig",
-    "DeformedScene",
     "DeformingScene",
     "FrameGraph",
     "GraphConfig",
@@ -80,6 +79,7 @@ __all__ = [
     "PromptedAnswerer",
     "Question",
     "QuestionType",
+    "SceneAtTime",
     "SceneFacts",
     "TemplatedAnswerer",
     "Timeline",

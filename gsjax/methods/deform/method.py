@@ -85,7 +85,7 @@ class Deform:
 
     Attributes:
         config: configuration of the reconstruction.
-        extra_losses: custom losses `loss(scene, rendered, frame)` of a `DeformedScene`; see
+        extra_losses: custom losses `loss(scene, rendered, frame)` of a `SceneAtTime`; see
             `gsjax.losses.extra`. `info["extra"]` has their values.
     """
 

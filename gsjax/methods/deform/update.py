@@ -85,17 +85,23 @@ class DeformingScene(eqx.Module):
         return jnp.where(jnp.isin(rows, moving)[:, None], found, still)
 
 
-class DeformedScene(NamedTuple):
+class SceneAtTime(NamedTuple):
     """The scene at one moment, as passed to extra losses.
 
     Attributes:
         gaussians: the Gaussians as they were drawn, deformed to this time.
-        canonical: what is trained: `canonical.gaussians` before they were deformed, `canonical.at(time)` at
-            any time, and `canonical.field`, which is None in the warm-up.
+        canonical: what is trained: `canonical.gaussians` before they were deformed, and `canonical.field`,
+            which is None in the warm-up.
+        moving: where the field is evaluated.
     """
 
     gaussians: Gaussians
     canonical: DeformingScene
+    moving: "Moving" = None
+
+    def at(self, time: Float[Array, ""]) -> Gaussians:
+        """The Gaussians as they are drawn at a time, 0 to 1."""
+        return self.canonical.at(time, self.moving)
 
 
 Moving = Nodes | Int[Array, "M"] | None
@@ -134,7 +140,7 @@ def deform_loss(config: DeformConfig, extra_losses: ExtraLosses = ()) -> Callabl
 
     Args:
         config: configuration, with the weights.
-        extra_losses: custom losses of the `DeformedScene` at this time, the rendered view, in which pixels
+        extra_losses: custom losses of the `SceneAtTime`, the rendered view, in which pixels
             that do not count are those of the photograph, and the frame.
     """
     weights = config.weights
@@ -179,7 +185,7 @@ def deform_loss(config: DeformConfig, extra_losses: ExtraLosses = ()) -> Callabl
         meta = drawn.meta
         info = {"psnr": -10 * jnp.log10(mse), "overflow": meta.overflow.any(), "needed": meta.needed.max()}
         if extra_losses:
-            now = DeformedScene(there, scene)
+            now = SceneAtTime(there, scene, batch.moving)
             rendered = drawn._replace(colors=image)
             seen = Frame(target, frame.depths, camera, frame.masks, frame.time)
             info["extra"] = extra_terms(extra_losses, now, rendered, seen)

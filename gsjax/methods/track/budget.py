@@ -7,7 +7,7 @@ update can vary. Delays are compensated by the updates that follow.
 
 from collections.abc import Callable
 from dataclasses import fields, is_dataclass, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from gsjax.methods.track.config import PRESETS, TrackConfig
 
@@ -35,7 +35,7 @@ class Chosen(NamedTuple):
     fits: bool  # False if even the cheapest rung exceeds the budget
 
 
-_KEPT = ("start", "headroom", "seed")  # and grow.slots
+_KEPT = ("start", "grow.slots", "headroom", "seed")
 
 
 def ladder(config: TrackConfig, num_cameras: int) -> dict[str, TrackConfig]:
@@ -45,7 +45,7 @@ def ladder(config: TrackConfig, num_cameras: int) -> dict[str, TrackConfig]:
 
     def rung(preset: TrackConfig) -> TrackConfig:
         grow = replace(preset.grow, slots=config.grow.slots)
-        return replace(preset, grow=grow, **{name: getattr(config, name) for name in _KEPT})
+        return replace(preset, start=config.start, grow=grow, headroom=config.headroom, seed=config.seed)
 
     rungs = {name: rung(PRESETS[name]) for name in ("accurate", "balanced", "fast")}
     small = replace(rungs["fast"], shrink=2)
@@ -57,21 +57,18 @@ def ladder(config: TrackConfig, num_cameras: int) -> dict[str, TrackConfig]:
 
 
 def not_used(config: TrackConfig) -> list[str]:
-    """Names of settings that are of no preset, so somebody's own, and that no rung of `ladder` takes."""
-    found = []
-    for one in fields(config):
-        mine, theirs = getattr(config, one.name), [getattr(preset, one.name) for preset in PRESETS.values()]
-        if one.name in _KEPT or mine in theirs:
-            continue
-        if not is_dataclass(mine):
-            found.append(one.name)
-            continue
-        within = {part.name: getattr(mine, part.name) for part in fields(mine)}
-        found += [
-            f"{one.name}.{name}"
-            for name, value in within.items()
-            if (one.name, name) != ("grow", "slots") and value not in [getattr(p, name) for p in theirs]
-        ]
+    """Names of settings that are not the default and that no rung of `ladder` takes."""
+    mine, usual = _flat(config), _flat(TrackConfig())
+    differ = [name for name in mine if mine[name] != usual[name]]
+    return [name for name in differ if name not in _KEPT and name.partition(".")[0] not in _KEPT]
+
+
+def _flat(settings: Any, prefix: str = "") -> dict[str, Any]:
+    """Settings within settings by their dotted names."""
+    found = {}
+    for one in fields(settings):
+        value, name = getattr(settings, one.name), f"{prefix}{one.name}"
+        found |= _flat(value, f"{name}.") if is_dataclass(value) else {name: value}
     return found
 
 
