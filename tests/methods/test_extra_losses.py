@@ -25,7 +25,7 @@ from gsjax.methods.track import AlignConfig
 from gsjax.methods.track.config import RefineConfig
 from gsjax.methods.track.motion import Motion
 from gsjax.methods.track.refine import refine, refine_loss
-from gsjax.scene.deformation import DeformationConfig
+from gsjax.scene.deformation import DeformationConfig, Nodes
 from gsjax.scene.handles import at_rest
 from tests.methods.ball_before_wall import batch_after
 from tests.methods.photographed_blobs import photographed_blobs
@@ -241,6 +241,26 @@ class TestOtherMethods:
         added = slope_added(lambda extra: deform_loss(config, extra), scene, deform_batch_of(problem, run, 0))
         np.testing.assert_allclose(added.gaussians.means, uphill(scene.gaussians.means), atol=1e-4)
         assert np.any(added.field.layers[-1].weight)  # through the deformation
+
+    @pytest.mark.thorough
+    @pytest.mark.parametrize("nodes", [0, 12])
+    def test_a_deforming_scene_at_its_time_is_what_was_drawn(self, photographs, nodes):
+        def apart(scene, rendered, frame):
+            return jnp.abs(scene.at(frame.time).means - scene.gaussians.means).max()
+
+        def moved(scene, rendered, frame):
+            return jnp.abs(scene.gaussians.means - scene.canonical.gaussians.means).max()
+
+        config = DeformConfig(start_pixels=2.0, deformation=TINY, nodes=nodes)
+        problem, run = Deform(config).start(over_time(photographs))
+        scene, moving = with_field(config, problem, run.params)
+        assert isinstance(moving, Nodes) == bool(nodes)
+        last = scene.field.layers[-1].weight
+        scene = eqx.tree_at(lambda s: s.field.layers[-1].weight, scene, jnp.full_like(last, 0.05))
+        batch = deform_batch_of(problem, run, 0)._replace(moving=moving)
+        _, info = deform_loss(config, (apart, moved))(scene, batch, step=0, key=None)
+        assert info["extra"]["moved"] > 1e-4
+        assert info["extra"]["apart"] < 1e-6
 
     @pytest.mark.thorough
     def test_loops_hand_them_on_and_compile_once(self, photographs):
