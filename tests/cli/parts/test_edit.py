@@ -75,6 +75,11 @@ def run(tmp_path):
     return write_run(tmp_path / "run")
 
 
+def moved_away(run):
+    config = run / "config.yml"
+    config.write_text(config.read_text().replace(DATASET, "gone"))
+
+
 def test_a_run_is_read_as_it_was_written(run):
     saved = open_parts_run(run)
     scene, trajectory = scene_and_trajectory()
@@ -170,7 +175,7 @@ def test_a_film_of_another_length_compiles_nothing(run, caplog):
 def test_edits_without_a_script_from_another_camera(gsjax, run):
     """The drawer of another run, whose recording need not be there, takes the place of this run's."""
     other = write_run(run.parent / "other")
-    _moved_away(other)
+    moved_away(other)
     place = f"composite:parts=drawer,from_run={other},place={{to: [0.1, 0.0, 0.5]}}"
     edits = ("--op", "fade:parts=drawer", "--op", place)
     code, said = gsjax("edit", run, *edits, "--camera", "0", "--ply")

@@ -5,7 +5,7 @@ import pytest
 
 from gsjax.io.ply import read_ply, write_ply
 from gsjax.scene.gaussians import take
-from tests.cli.parts.test_edit import DATASET, write_run
+from tests.cli.parts.test_edit import moved_away, write_run
 
 SPEED = ("--op", "speed:parts=drawer,factor=2")
 
@@ -71,7 +71,7 @@ def test_a_script_that_is_none(gsjax, run, tmp_path, text, says):
             lambda run: _with_fewer(run),
             "expected 200 Gaussians as in parts.npz, found 199 drawable Gaussians of 199",
         ),
-        (lambda run: _moved_away(run), "its recording cannot be opened"),
+        (lambda run: moved_away(run), "its recording cannot be opened"),
     ],
 )
 def test_a_run_that_is_none(gsjax, run, break_it, says):
@@ -102,8 +102,3 @@ def _of_track(run):
 def _with_fewer(run):
     gaussians, _ = read_ply(run / "scene.ply")
     write_ply(run / "scene.ply", take(gaussians, np.arange(199)))
-
-
-def _moved_away(run):
-    config = run / "config.yml"
-    config.write_text(config.read_text().replace(DATASET, "gone"))
