@@ -13,7 +13,7 @@ import operator
 import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache
+from functools import cached_property, lru_cache, partial
 from time import perf_counter
 from typing import Any
 
@@ -22,7 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from gsjax.engine.interrupts import raise_if_interrupted, shielded
-from gsjax.losses.extra import ExtraLosses, Outside, named_losses
+from gsjax.losses.extra import ExtraLosses, UpToDate, named_losses
 from gsjax.optim.compiler import compile_seconds, host_options
 from gsjax.optim.guard import Guard, begun, part_of_step, window_of
 from gsjax.optim.method import Method, Run
@@ -122,7 +122,7 @@ class Drive(Iterator[Tick]):
         self._progress = (lambda step: step / total if total else 1.0) if progress is None else progress
         self._headroom = headroom
         self._losses: ExtraLosses = getattr(method, "extra_losses", ())
-        self._outside = Outside(self._losses)
+        self._advance = UpToDate(self._losses, partial(_compiled, method))
         self._skipped = 0  # steps in a row
         self._key = jax.random.key(method.config.seed)
 
@@ -160,10 +160,7 @@ class Drive(Iterator[Tick]):
             run, step = self.run, jnp.asarray(self.run.step)
             batch, names = method.batch(problem, run, progress)
             inputs = run.params, run.state, guard.share
-            # Looked up at each step: what custom losses take from outside may change.
-            advance = _compiled(method, self._outside.before())
-            params, state, info = advance(*inputs, batch, step, self._key)
-            self._outside.after()
+            params, state, info = self._advance(*inputs, batch, step, self._key)
             self.run = run.having(params=params, state=state)
             overflow, skipped, loss = jax.device_get([info[name] for name in ("overflow", "skipped", "loss")])
             if not overflow:
@@ -213,7 +210,7 @@ def _guard_of(before: Run, run: Run) -> Guard:
     return run.guard if run.guard is not None and is_same else begun(run.params, before.guard)
 
 
-def warn_of_lost(after: Tick, method: Any) -> None:
+def warn_of_lost(after: Tick, method: Method) -> None:
     """Warn if a run that goes on was trained with custom losses that it is not given now."""
     lost = sorted({*(after.info.get("extra") or ())} - {*named_losses(getattr(method, "extra_losses", ()))})
     if lost:

@@ -24,7 +24,7 @@ from gsjax.methods.fit import Fit, FitConfig, prune
 from gsjax.methods.parts import Parts, PartsConfig
 from gsjax.methods.parts.pictures import Problem as PartsProblem
 from gsjax.methods.protocols import Segmenter
-from gsjax.optim.method import Run
+from gsjax.optim.method import Method, Run
 from gsjax.scene.gaussians import Gaussians
 
 if TYPE_CHECKING:
@@ -210,7 +210,7 @@ def parts(
     return drive(method, problem, run, headroom=config.headroom)
 
 
-def _going_on(after: Tick, method: Any) -> Run:
+def _going_on(after: Tick, method: Method) -> Run:
     """A copy of an earlier tick's run, as steps donate its arrays, and one may go on from a tick twice. With
     other settings or losses, its losses are not compared with those before."""
     warn_of_lost(after, method)

@@ -11,10 +11,11 @@ The weight of a loss is a factor inside it. Without extra losses, a method's pro
 """
 
 import hashlib
+import os
 import sysconfig
 from collections.abc import Callable, Hashable
 from contextlib import suppress
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from types import CodeType, FunctionType, MethodType
 from typing import Any, Protocol, runtime_checkable
@@ -105,26 +106,26 @@ def captured(losses: ExtraLosses) -> tuple[Hashable, ...]:
     return tuple(found)
 
 
-class Outside:
-    """What losses take from outside, over the steps of a loop. What the trace itself changes, such as a
-    counter of traces, is no change."""
+class UpToDate:
+    """The program of a loop, compiled anew where what its losses take from outside has changed between two
+    steps. What the trace itself changes, such as a counter of traces, is no change."""
 
-    def __init__(self, losses: ExtraLosses):
+    def __init__(self, losses: ExtraLosses, compiled: Callable[[tuple[Hashable, ...]], Callable]):
         """
         Args:
             losses: functions of scene, rendered and frame.
+            compiled: makes the program for what `captured` found.
         """
-        self._losses, self._key, self._left = losses, (), None
+        self._losses, self._compiled = losses, compiled
+        self._left = captured(losses)
+        self._program = compiled(self._left)
 
-    def before(self) -> tuple[Hashable, ...]:
-        """What a program of the next step belongs to."""
+    def __call__(self, *args: Any) -> Any:
         if self._losses and (now := captured(self._losses)) != self._left:
-            self._key = now
-        return self._key
-
-    def after(self) -> None:
-        """To be called after the step."""
-        self._left = captured(self._losses) if self._losses else None
+            self._program = self._compiled(now)
+        result = self._program(*args)
+        self._left = captured(self._losses)
+        return result
 
 
 class _Same:
@@ -186,8 +187,13 @@ def _outside(function: FunctionType) -> dict[str, Any]:
 
 
 def _is_library(code: CodeType) -> bool:
-    places = (sysconfig.get_path("stdlib"), sysconfig.get_path("purelib"), str(Path(__file__).parents[1]))
-    return code.co_filename.startswith(places)
+    return code.co_filename.startswith(_library_folders())
+
+
+@cache
+def _library_folders() -> tuple[str, ...]:
+    folders = sysconfig.get_path("stdlib"), sysconfig.get_path("purelib"), str(Path(__file__).parents[1])
+    return tuple(f"{folder}{os.sep}" for folder in folders)
 
 
 def extra_terms(losses: Any, scene: Any, rendered: Any, frame: Any) -> dict[str, Float[Array, ""]]:

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gsjax.losses.extra import Outside, captured
+from gsjax.losses.extra import UpToDate, captured
 
 WEIGHT, TRACES = 5.0, []
 
@@ -74,13 +74,17 @@ def test_what_a_trace_itself_changes_is_no_change(monkeypatch):
         TRACES.append(1)
         return WEIGHT * nothing(scene, rendered, frame)
 
-    outside = Outside((noted,))
-    keys = []
+    made = []
+
+    def compiled(outside):
+        made.append(outside)
+        return jax.jit(lambda scene: noted(scene, None, None))
+
+    program = UpToDate((noted,), compiled)
+    counts = []
     for weight in (5.0, 5.0, 2.0, 2.0):
         monkeypatch.setitem(globals(), "WEIGHT", weight)
-        keys.append(outside.before())
-        if len(set(keys)) != len(set(keys[:-1])):
-            noted(None, None, None)  # as the step is traced
-        outside.after()
-    assert keys[0] == keys[1] != keys[2] == keys[3]
-    assert Outside(()).before() == ()
+        program(jnp.zeros(3))
+        counts.append(len(made))
+    assert counts == [1, 1, 2, 2]
+    assert UpToDate((), lambda outside: lambda x: (outside, x))(3) == ((), 3)

@@ -13,7 +13,7 @@ import numpy as np
 
 from gsjax.engine.drive import Clock, Tick, announced, warn_of_lost
 from gsjax.engine.interrupts import raise_if_interrupted, shielded
-from gsjax.losses.extra import ExtraLosses, Outside
+from gsjax.losses.extra import ExtraLosses, UpToDate
 from gsjax.methods.track.budget import Costs, Governor, choose, ladder, not_used
 from gsjax.methods.track.config import TrackConfig
 from gsjax.methods.track.frames import FrameShape, shape_of
@@ -76,6 +76,8 @@ def track(
             "leave one of the two out"
         )
     frames = iter(frames)
+    if after is not None:
+        warn_of_lost(after, Track(config, extra_losses))
     if budget_ms is None:
         method = Track(config, extra_losses)
         yield from _ticks(method, *_begun(method, scene, first, after, like()), first, frames, None)
@@ -141,8 +143,6 @@ def _begun(
 ) -> tuple[FrameShape, Run]:
     """A run before its next frame; `anew` keeps only the scene of `after`, because its state belongs to other
     settings."""
-    if after is not None:
-        warn_of_lost(after, method)
     if after is None:
         shape, run = method.start(scene, first, like.run if like and like.method == method else None)
         return shape, _looked(method, shape, run, first)
@@ -165,7 +165,7 @@ class _Updates:
     """The compiled update of one configuration, compiled again where a plan has become too small."""
 
     def __init__(self, method: Track, shape: FrameShape, run: Run):
-        self._of, self._outside = (method, shape, run.kept.reduction), Outside(method.extra_losses)
+        self._advance = UpToDate(method.extra_losses, partial(_compiled, method, shape, run.kept.reduction))
         self._key = jax.random.key(method.config.seed)
         self._headroom = method.config.headroom
 
@@ -175,10 +175,7 @@ class _Updates:
         clock, step = Clock(), np.int32(run.step)
         while True:
             batch = TrackBatch(frame, run.plans[PLAN], jnp.int32(everywhere))
-            # Looked up at each frame: what custom losses take from outside may change.
-            advance = _compiled(*self._of, self._outside.before())
-            result = jax.block_until_ready(advance(run.params, run.state, batch, step, self._key))
-            self._outside.after()
+            result = jax.block_until_ready(self._advance(run.params, run.state, batch, step, self._key))
             params, state, info = result
             if not bool(info["overflow"]):
                 return run.having(params=params, state=state, step=run.step + 1), info, *clock.read()
