@@ -210,9 +210,9 @@ def _guard_of(before: Run, run: Run) -> Guard:
     return run.guard if run.guard is not None and is_same else begun(run.params, before.guard)
 
 
-def warn_of_lost(after: Tick, method: Method) -> None:
+def warn_of_lost(after: Tick, extra_losses: ExtraLosses) -> None:
     """Warn if a run that goes on was trained with custom losses that it is not given now."""
-    lost = sorted({*(after.info.get("extra") or ())} - {*named_losses(getattr(method, "extra_losses", ()))})
+    lost = sorted({*(after.info.get("extra") or ())} - {*named_losses(extra_losses)})
     if lost:
         warnings.warn(
             f"after: the run was trained with custom losses that are not given now: {', '.join(lost)}; "

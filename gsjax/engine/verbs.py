@@ -213,7 +213,7 @@ def parts(
 def _going_on(after: Tick, method: Method) -> Run:
     """A copy of an earlier tick's run, as steps donate its arrays, and one may go on from a tick twice. With
     other settings or losses, its losses are not compared with those before."""
-    warn_of_lost(after, method)
+    warn_of_lost(after, getattr(method, "extra_losses", ()))
     run = after.run
     held = run.params, run.state
     if any(leaf.is_deleted() for leaf in jax.tree.leaves(held) if isinstance(leaf, jax.Array)):

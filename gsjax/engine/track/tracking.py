@@ -77,7 +77,7 @@ def track(
         )
     frames = iter(frames)
     if after is not None:
-        warn_of_lost(after, Track(config, extra_losses))
+        warn_of_lost(after, extra_losses)
     if budget_ms is None:
         method = Track(config, extra_losses)
         yield from _ticks(method, *_begun(method, scene, first, after, like()), first, frames, None)
