@@ -32,9 +32,9 @@ from gsjax.scene.handles import at_rest
 from gsjax.scene.initialize import gaussians_from_points
 from gsjax.scene.render import plan_render
 from tests.methods.around import cameras_around
-from tests.methods.photographed_blobs import photographed_blobs
-from tests.methods.tissue import CONFIG, tissue
-from tests.methods.two_boxes import PARTS, batch_of, params_of, shifted, soft, two_boxes
+from tests.methods.deform.tissue import CONFIG, tissue
+from tests.methods.fit.photographed_blobs import photographed_blobs
+from tests.methods.parts.two_boxes import PARTS, batch_of, params_of, shifted, soft, two_boxes
 
 FIT = FitConfig(
     steps=40, cap=120, sh_degree=1, sh_every=20, coarse_until=0.3, start=StartConfig(count=100), seed=1

@@ -16,7 +16,7 @@ from gsjax.methods.track import (
     start_scene,
 )
 from gsjax.methods.track.points import pixels_of_groups
-from tests.methods.carton import CARTON, CONFIG, SIZE, middle, see
+from tests.methods.track.carton import CARTON, CONFIG, SIZE, middle, see
 
 QUICK = replace(
     PRESETS["paper"],

@@ -34,7 +34,7 @@ from gsjax.scene.deformation import Nodes
 from gsjax.scene.render import plan_render
 from tests.docs.blocks import programs
 from tests.engine.cases import FIT
-from tests.methods.tissue import CONFIG, tissue
+from tests.methods.deform.tissue import CONFIG, tissue
 
 ROOT = Path(__file__).resolve().parents[2]
 CODES = jnp.asarray(np.eye(7, 8), jnp.float32)

@@ -27,9 +27,9 @@ from gsjax.methods.track.motion import Motion
 from gsjax.methods.track.refine import refine, refine_loss
 from gsjax.scene.deformation import DeformationConfig, Nodes
 from gsjax.scene.handles import at_rest
-from tests.methods.ball_before_wall import batch_after
-from tests.methods.photographed_blobs import photographed_blobs
-from tests.methods.two_boxes import batch_of, params_of, shifted, soft, two_boxes
+from tests.methods.fit.photographed_blobs import photographed_blobs
+from tests.methods.parts.two_boxes import batch_of, params_of, shifted, soft, two_boxes
+from tests.methods.track.ball_before_wall import batch_after
 
 FIT = FitConfig(steps=4, cap=60, sh_degree=0, coarse_until=0.0, start=StartConfig(count=50))
 TINY = DeformationConfig(resolution=16, time_resolution=6, levels=1, channels=4, hidden=16)

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from gsjax.engine.deform.scores import OVER_TIME, classes_of_pixels, over_time
-from tests.methods.tissue import one_frame
+from tests.methods.deform.tissue import one_frame
 
 HEIGHT, WIDTH = 40, 48
 

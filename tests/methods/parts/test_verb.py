@@ -1,0 +1,88 @@
+"""`gsjax.engine.verbs.parts`: a sequence as it was opened goes in, parts that can be edited come out."""
+
+from dataclasses import replace
+
+import jax
+import numpy as np
+import pytest
+
+from gsjax.data import Sequence
+from gsjax.engine.checkpoint import load, save
+from gsjax.engine.verbs import parts
+from gsjax.methods.parts import DiscoverConfig, PartsConfig, RefineConfig, StreamConfig
+from gsjax.scene.feature_grid import FeatureGridConfig
+from tests.methods.parts.moving_boxes import Box, MovingBoxes, linear
+
+FRAMES, HELD_OUT = 3, 7
+CONFIG = PartsConfig(
+    discover=DiscoverConfig(most_parts=2, lift_iterations=3),
+    stream=StreamConfig(iterations=3, coarse=0.0),
+    refine=RefineConfig(iterations=2),
+    grid=FeatureGridConfig(2, 4, 16, 8, 2, 8),
+)
+
+
+@pytest.fixture(scope="module")
+def boxes():
+    turning = Box((0, 0, 0.05), (0.12, 0.08, 0.1), linear(FRAMES, (0, 0, 0.3)), linear(FRAMES, (0, 0.1, 0)))
+    return MovingBoxes([turning])
+
+
+@pytest.fixture(scope="module")
+def sequence(boxes):
+    Ks, viewmats = (np.asarray(a, np.float64) for a in (boxes.cameras.K, boxes.cameras.viewmat))
+    return Sequence(
+        name="boxes",
+        camera_ids=(5, 6, HELD_OUT),
+        width=boxes.cameras.width,
+        height=boxes.cameras.height,
+        times=boxes.times,
+        frame_ids=tuple(range(FRAMES)),
+        Ks=np.tile(Ks, (FRAMES, 1, 1, 1)),
+        viewmats=np.tile(viewmats, (FRAMES, 1, 1, 1)),
+        load_image=boxes.image,
+    )
+
+
+@pytest.fixture(scope="module")
+def segmenter(boxes):
+    """Knows the true masks of the canonical frame."""
+    masks = boxes.masks(boxes.bodies)
+
+    def segment(image, depth, K):
+        return next(masks[c] for c in range(3) if (boxes.image(0, c) == image).all())
+
+    return segment
+
+
+@pytest.mark.thorough
+def test_a_discovery_is_stored_and_goes_on_to_the_same_bits(boxes, sequence, segmenter, tmp_path):
+    given = {"eval_cameras": [HELD_OUT], "anchor": 0, "gaussians": boxes.gaussians, "segmenter": segmenter}
+    steps = []
+    for now in parts(sequence, CONFIG, **given):
+        steps.append(float(now.info["loss"]))
+        if now.step == 4:
+            save(tmp_path / "run.npz", now)
+    assert len(steps) == 3 * (FRAMES - 1) + 2
+    assert np.isfinite(steps).all()
+    loaded = load(tmp_path / "run.npz")
+    assert loaded.result.done.tolist() == [True, True, False]  # the second frame is half found
+    assert len(loaded.result.layer.trajectory.times) == 2
+    *_, again = parts(sequence, loaded.method.config, eval_cameras=[HELD_OUT], after=loaded)
+    for a, b in zip(jax.tree.leaves(again.result), jax.tree.leaves(now.result), strict=True):
+        np.testing.assert_array_equal(a, b)
+    assert now.result.weights.shape == (boxes.gaussians.num, now.result.scene.num_parts)
+    assert sorted(now.result.joints()) == list(range(1, now.result.scene.num_parts))
+
+
+@pytest.mark.thorough
+def test_gaussians_need_their_frame_named(boxes, sequence):
+    with pytest.raises(ValueError, match="anchor: expected the frame that the given Gaussians show"):
+        parts(sequence, CONFIG, gaussians=boxes.gaussians)
+
+
+@pytest.mark.thorough
+def test_one_camera_is_refused(boxes, sequence, segmenter):
+    given = {"anchor": 0, "gaussians": boxes.gaussians, "segmenter": segmenter}
+    with pytest.raises(ValueError, match="cameras: expected at least 2, synchronised, found 1"):
+        parts(sequence, replace(CONFIG, seed=1), eval_cameras=[6, HELD_OUT], **given)
