@@ -7,10 +7,16 @@ A method that takes `extra_losses` adds them to its own and trains on the gradie
 
     gsjax.track(scene, first, frames, config, extra_losses=(above_the_table,))
 
-The weight of a loss is a factor inside it. Without extra losses, a method's program is unchanged.
+The weight of a loss is a factor inside it. A loss is told by keyword where in a run it is, if it asks:
+
+    def prior(scene, rendered, frame, *, index, progress):
+        return (1 - progress) * jnp.abs(rendered.depths - DEPTHS[index]).mean()
+
+Without extra losses, a method's program is unchanged.
 """
 
 import hashlib
+import inspect
 import os
 import sysconfig
 from collections.abc import Callable, Hashable
@@ -18,33 +24,29 @@ from contextlib import suppress
 from functools import cache, partial
 from pathlib import Path
 from types import CodeType, FunctionType, MethodType
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
-from gsjax.scene.frame import Frame
-from gsjax.scene.render import Rendered
+ExtraLoss = Callable[..., Float[Array, ""]]
+"""A pure, differentiable function `loss(scene, rendered, frame)` to be minimised, of
 
+- the method's scene, with `scene.gaussians` [N] as they were drawn; see the method for its other fields,
+- its rendering (`gsjax.scene.render.Rendered`): colours, depths and alphas of C cameras,
+- the frame that these cameras saw (`gsjax.scene.frame.Frame`): images [C,H,W,3], 0 to 1, and depths,
 
-@runtime_checkable
-class ExtraLoss(Protocol):
-    """A pure, differentiable function of the scene, its rendering, and the observed frame."""
+and, where it names them as keyword-only arguments without defaults, of
 
-    def __call__(self, scene: Any, rendered: Rendered, frame: Frame) -> Float[Array, ""]:
-        """A scalar to be minimised.
+- `index`: the position of the photograph or frame among those that the method was given,
+- `camera`: the position of its camera (`parts`),
+- `progress`: the share of the steps that are done, 0 to 1; of one frame's steps, or of the refinement's, in
+  `parts`.
 
-        Args:
-            scene: the method's scene, with `scene.gaussians` [N] as they were drawn; see the method for its
-                other fields.
-            rendered: colours, depths and alphas of C cameras; [C,H,W] and channels.
-            frame: what these cameras saw: images [C,H,W,3], 0 to 1, and depths [C,H,W], metres, 0 where
-                unknown, or None.
-        """
-        ...
-
+The tracker, whose frames come one by one, gives none of the three.
+"""
 
 _DIGESTED = 2**20  # bytes up to which an array is known by its content, not by its identity
 
@@ -196,17 +198,26 @@ def _library_folders() -> tuple[str, ...]:
     return tuple(f"{folder}{os.sep}" for folder in folders)
 
 
-def extra_terms(losses: Any, scene: Any, rendered: Any, frame: Any) -> dict[str, Float[Array, ""]]:
+def extra_terms(
+    losses: Any,
+    scene: Any,
+    rendered: Any,
+    frame: Any,
+    **told: Float[Array, ""] | Int[Array, ""] | float | int,
+) -> dict[str, Float[Array, ""]]:
     """The value of each loss, by name.
 
     Args:
         losses: functions of scene, rendered and frame.
         scene, rendered, frame: their arguments.
+        told: what each is given by keyword, if it asks; see `ExtraLoss`.
 
     Raises:
-        ValueError: as for `named_losses`, or a loss returns something other than a scalar.
+        ValueError: as for `named_losses`, a loss asks for what is not told, or returns something other than a
+            scalar.
     """
-    terms = {name: _value(name, loss, scene, rendered, frame) for name, loss in named_losses(losses).items()}
+    named = named_losses(losses)
+    terms = {name: _value(name, loss, scene, rendered, frame, told) for name, loss in named.items()}
     for name, value in terms.items():
         is_array = isinstance(value, int | float | np.ndarray | np.generic | jax.Array)
         if not is_array or jnp.shape(value) != ():
@@ -217,10 +228,26 @@ def extra_terms(losses: Any, scene: Any, rendered: Any, frame: Any) -> dict[str,
     return terms
 
 
-def _value(name: str, loss: Callable, scene: Any, rendered: Any, frame: Any) -> Any:
-    """The value of a loss; what goes wrong in it says in which, and what is usual."""
+def _asked_for(loss: Callable) -> tuple[str, ...]:
+    """Names of keyword-only arguments without defaults."""
     try:
-        return loss(scene, rendered, frame)
+        given = inspect.signature(loss).parameters.values()
+    except (TypeError, ValueError):  # of a function written in C
+        return ()
+    return tuple(one.name for one in given if one.kind is one.KEYWORD_ONLY and one.default is one.empty)
+
+
+def _value(name: str, loss: Callable, scene: Any, rendered: Any, frame: Any, told: dict[str, Any]) -> Any:
+    """The value of a loss; what goes wrong in it says in which, and what is usual."""
+    asked = _asked_for(loss)
+    if missing := sorted({*asked} - told.keys()):
+        given = f"only {' and '.join(sorted(told))}" if told else "nothing"
+        raise ValueError(
+            f"extra_losses: {name} asks for {' and '.join(missing)} by keyword, and {given} is given here; "
+            "give the argument a default, or leave it out"
+        )
+    try:
+        return loss(scene, rendered, frame, **{one: told[one] for one in asked})
     except Exception as error:
         error.add_note(
             f"This is in the extra loss {name}(scene, rendered, frame). Its arguments are traced: take jnp, "

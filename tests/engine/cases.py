@@ -129,7 +129,9 @@ def refine_step_case():
     scene, rest = given.canonical, at_rest(PARTS)
     poses = jax.tree.map(lambda a: jnp.stack([a, a]), rest)
     params = RefineParams(scene.movable, scene.fixed, poses)
-    batch = RefineBatch(scene, given.weights, given.now, jnp.int32(1), jnp.int32(0), 0.0, given.plan)
+    batch = RefineBatch(
+        scene, given.weights, given.now, jnp.int32(1), jnp.int32(0), jnp.int32(0), 0.0, given.plan
+    )
     return parts_step(PartsConfig()), params, batch, batch._replace(progress=jnp.nan)
 
 

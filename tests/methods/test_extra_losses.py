@@ -221,7 +221,9 @@ class TestOtherMethods:
         scene, config = batch.canonical, PartsConfig()
         poses = jax.tree.map(lambda a: jnp.stack([a, a]), at_rest(len(scene.alive)))
         params = RefineParams(scene.movable, scene.fixed, poses)
-        given = PartsBatch(scene, batch.weights, batch.now, jnp.int32(1), jnp.int32(0), 0.0, batch.plan)
+        given = PartsBatch(
+            scene, batch.weights, batch.now, jnp.int32(1), jnp.int32(0), jnp.int32(0), 0.0, batch.plan
+        )
 
         @partial(jax.jit, static_argnums=0)
         def after(extra):

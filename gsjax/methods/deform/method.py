@@ -197,7 +197,7 @@ class Deform:
         i = problem.first if self.config.warmup_frames == "first" else None
         if i is None or run.step >= self.config.warmup:
             i = shuffled_index(self.config.seed, run.step, len(problem.seen))
-        return batch_of(problem, run, i), (PLAN,)
+        return batch_of(problem, run, i, progress), (PLAN,)
 
     def result(self, problem: Problem, run: Run) -> DeformResult:
         """The scene over time. It shares the arrays of the run, which later steps may donate."""
@@ -212,13 +212,14 @@ class Deform:
         return DeformResult(still, run.kept.moving, meaning, timeline)
 
 
-def batch_of(problem: Problem, run: Run, i: int) -> Batch:
+def batch_of(problem: Problem, run: Run, i: int, progress: float = 0.0) -> Batch:
     """The input of a step on one frame.
 
     Args:
         problem: from `Deform.start`.
         run: the run before the step.
         i: index of the frame.
+        progress: share of the steps that are done, 0 to 1.
     """
     view = None
     if run.params.twists is not None:
@@ -227,7 +228,7 @@ def batch_of(problem: Problem, run: Run, i: int) -> Batch:
     moving, graphs = run.kept
     graph = None if graphs is None else graphs[i]
     given = (problem.codebook, moving, graph, problem.radius, run.plans[PLAN], problem.background)
-    return Batch(problem.seen[i], view, ids, *given)
+    return Batch(problem.seen[i], i, progress, view, ids, *given)
 
 
 def with_field(

@@ -113,6 +113,8 @@ class Batch(NamedTuple):
 
     Attributes:
         frame: frame of one camera, with a mask and a time.
+        index: position of the frame in the recording.
+        progress: share of the steps that are done, 0 to 1.
         view: row of the camera's twist; -1 for a camera that is not refined. None if no poses are.
         ids: row of the codebook for each of the teacher's pixels, -1 for none; None without a teacher.
         codebook: the teacher's features, in the scene's channels.
@@ -124,6 +126,8 @@ class Batch(NamedTuple):
     """
 
     frame: Frame
+    index: Int[Array, ""] | int
+    progress: Float[Array, ""] | float
     view: Int[Array, ""] | None
     ids: Int[Array, "h w"] | None
     codebook: Float[Array, "k channels"] | None
@@ -188,7 +192,8 @@ def deform_loss(config: DeformConfig, extra_losses: ExtraLosses = ()) -> Callabl
             now = SceneAtTime(there, scene, batch.moving)
             rendered = drawn._replace(colors=image)
             seen = Frame(target, frame.depths, camera, frame.masks, frame.time)
-            info["extra"] = extra_terms(extra_losses, now, rendered, seen)
+            told = {"index": batch.index, "progress": batch.progress}
+            info["extra"] = extra_terms(extra_losses, now, rendered, seen, **told)
             return sum(terms.values()) + sum(info["extra"].values()), terms | info
         return sum(terms.values()), terms | info
 

@@ -96,9 +96,9 @@ def fit_loss(config: FitConfig, extra_losses: ExtraLosses = ()) -> Callable:
         }
         if extra_losses:
             rendered = drawn._replace(colors=image)
-            aux["extra"] = extra_terms(
-                extra_losses, model, rendered, Frame(target, frame.depths, camera, frame.masks)
-            )
+            seen = Frame(target, frame.depths, camera, frame.masks)
+            told = {"index": batch.view, "progress": batch.progress}
+            aux["extra"] = extra_terms(extra_losses, model, rendered, seen, **told)
             value += sum(aux["extra"].values())
         return value, aux
 

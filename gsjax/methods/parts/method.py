@@ -137,9 +137,10 @@ class Parts:
         past = tuple(past.tolist()) or (int(discovery.found.argmax()),)
         cameras = problem.sequence.num_cameras
         drawn = draws_of(self.config.seed, discovery.frame, cameras, past, config.past, config.iterations)
-        frame = one_camera(current_frame(problem, discovery, size, config.blend), drawn.cameras[i])
+        t, c = discovery.frame, drawn.cameras[i]
+        frame = one_camera(current_frame(problem, discovery, size, config.blend), c)
         plan = run.plans[size]
-        batch = StreamBatch(canonical, frame, i / config.iterations, plan, discovery.weights)
+        batch = StreamBatch(canonical, frame, t, c, i / config.iterations, plan, discovery.weights)
         if not drawn.past[i]:
             return batch, (size,)
         then = tuple(past_picture(problem, discovery, t, c, config.blend) for t, c in drawn.past[i])
@@ -196,6 +197,7 @@ class Parts:
             discovery.weights,
             any_picture(problem, discovery, t, camera, self._shrink(problem, run)),
             jnp.asarray(t),
+            jnp.asarray(camera),
             jnp.asarray(discovery.anchor),
             i / self.steps_of_refinement(problem),
             run.plans[plan],

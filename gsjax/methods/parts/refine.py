@@ -57,7 +57,7 @@ class RefineBatch(NamedTuple):
         canonical: the handles; its Gaussians are not read.
         weights: weights of the movable Gaussians, which are constant.
         frame: the picture of one camera at frame t; its masks select the pixels that count.
-        t: index of the frame.
+        t, camera: their positions in the recording.
         anchor: index of the canonical frame, at which all handles are at rest.
         held: whether all poses stay as they are.
         shown: 1 for each part that is there in the frame, else 0; None if all are.
@@ -69,6 +69,7 @@ class RefineBatch(NamedTuple):
     weights: Float[Array, "M P"]
     frame: Frame
     t: Int[Array, ""]
+    camera: Int[Array, ""]
     anchor: Int[Array, ""]
     progress: Float[Array, ""] | float
     plan: Plan
@@ -112,7 +113,8 @@ def refine_step(config: PartsConfig, extra_losses: ExtraLosses = ()) -> Step:
             value = picture_loss(drawn, batch.frame, config.stream)
             if extra_losses:
                 scene = PosedScene(moved, batch.weights, pose)
-                info["extra"] = extra_terms(extra_losses, scene, drawn, batch.frame)
+                told = {"index": batch.t, "camera": batch.camera, "progress": batch.progress}
+                info["extra"] = extra_terms(extra_losses, scene, drawn, batch.frame, **told)
                 value += sum(info["extra"].values())
             return value, info
 

@@ -95,7 +95,8 @@ class StreamBatch(NamedTuple):
 
     Attributes:
         canonical: the canonical scene.
-        now: the current frame; its masks select the pixels that count.
+        now: the current frame, of one camera; its masks select the pixels that count.
+        index, camera: their positions in the recording.
         progress: share of the frame's steps that are done, 0 to 1, over which learning rates and
             `tear_weight` fall.
         plan: the render plan of the current frame.
@@ -106,6 +107,8 @@ class StreamBatch(NamedTuple):
 
     canonical: Canonical
     now: Frame
+    index: Int[Array, ""] | int
+    camera: Int[Array, ""] | int
     progress: Float[Array, ""] | float
     plan: Plan
     weights: Float[Array, "M P"]
@@ -251,7 +254,8 @@ def stream_loss(config: StreamConfig, extra_losses: ExtraLosses = ()) -> Callabl
             value += info["past"]
         if extra_losses:
             scene = PosedScene(gaussians, weights, params.pose)
-            info["extra"] = extra_terms(extra_losses, scene, drawn, batch.now)
+            told = {"index": batch.index, "camera": batch.camera, "progress": batch.progress}
+            info["extra"] = extra_terms(extra_losses, scene, drawn, batch.now, **told)
             value += sum(info["extra"].values())
         return value, info
 

@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -73,6 +74,31 @@ def test_a_discovery_is_stored_and_goes_on_to_the_same_bits(boxes, sequence, seg
         np.testing.assert_array_equal(a, b)
     assert now.result.weights.shape == (boxes.gaussians.num, now.result.scene.num_parts)
     assert sorted(now.result.joints()) == list(range(1, now.result.scene.num_parts))
+
+
+@pytest.mark.thorough
+def test_custom_losses_are_told_the_frame_the_camera_and_the_progress(sequence, boxes, segmenter):
+    def centroid(image):
+        """Of brightness, so that it is the same at other sizes and exposures."""
+        shares = [(jnp.arange(size) + 0.5) / size for size in image.shape[:2]]
+        return jnp.stack([shares[0] @ image.sum((1, 2)), shares[1] @ image.sum((0, 2))]) / image.sum()
+
+    tracked = sequence.select(cameras=[5, 6])
+    pictures = jnp.asarray([tracked.frame(t).colors for t in range(FRAMES)], jnp.float32)
+    centroids = jax.vmap(jax.vmap(centroid))(pictures)
+
+    def elsewhere(scene, rendered, frame, *, index, camera):
+        distances = jnp.linalg.norm(centroids - centroid(frame.images[0]), axis=-1)
+        return 1.0 * (distances.argmin() != index * 2 + camera)
+
+    def done(scene, rendered, frame, *, progress):
+        return 1.0 * progress
+
+    given = {"eval_cameras": [HELD_OUT], "anchor": 0, "gaussians": boxes.gaussians, "segmenter": segmenter}
+    told = [now.info["extra"] for now in parts(sequence, CONFIG, extra_losses=(elsewhere, done), **given)]
+    assert not any(one["elsewhere"] for one in told)
+    steps = [np.arange(3) / 3] * (FRAMES - 1) + [np.arange(2) / 2]
+    np.testing.assert_allclose([one["done"] for one in told], np.concatenate(steps), atol=1e-6)
 
 
 @pytest.mark.thorough

@@ -57,7 +57,7 @@ def batch_of(boxes, dtype=jnp.float32, past=True):
     plan = plan_render(boxes.gaussians, frame.cameras, headroom=3)
     rest = jax.tree.map(lambda a: a.astype(dtype), at_rest(PARTS))
     then = ((seen, rest),) if past else ()
-    return StreamBatch(canonical, seen, 0.0, plan, weights, then, plan if past else None), bodies
+    return StreamBatch(canonical, seen, 1, 0, 0.0, plan, weights, then, plan if past else None), bodies
 
 
 def params_of(pose, field, bodies):
