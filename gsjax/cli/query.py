@@ -14,7 +14,6 @@ from rich.console import Console
 from gsjax.engine.distill.file import FOLDER
 from gsjax.engine.distill.saved import Whereabouts, field_of, open_field_run
 from gsjax.engine.folder import DEFORMATION, OF_QUERY, expect_folder, expect_ours, is_run
-from gsjax.engine.locks import LOCK
 from gsjax.engine.messages import Notes, describe, stage
 from gsjax.engine.options import Common, ObjectText
 from gsjax.engine.program import USER_ERRORS
@@ -165,14 +164,11 @@ def _expect_place(out: Path | None) -> None:
         raise ValueError(f"--out {out}: expected a folder of its own, found the current one; name another")
     try:
         expect_ours(out, OF_QUERY)
-        others = sorted(entry.name for entry in out.iterdir() if entry.name[0] == "." and entry.name != LOCK)
-    except FileExistsError:
-        others = ["other files"]
-    if others:
+    except FileExistsError as error:
         raise ValueError(
-            f"--out {out}: expected a new folder, or one with an earlier answer, found one with {others[0]}; "
+            f"--out {out}: expected a new folder, or one with an earlier answer, found other files; "
             "name another"
-        )
+        ) from error
 
 
 def _given(*groups: Any) -> list[str]:

@@ -36,6 +36,8 @@ OF_QUERY = ("query.json", "selection.npz", "over_time.npz", "masks", "frames", "
 OF_QUERY += ("object.ply", "without.ply", "recolored.ply", "moved.ply", f"*{ENDING}")
 """The files that `gsjax query` writes."""
 SCRIPT = "edit.yaml"  # the edits of a film of `gsjax edit`, whose folder it marks
+_NOBODYS = (LOCK, ".*.partial*", ".DS_Store", "._*", ".nfs*", ".directory")
+"""Hidden files that no one misses: of a command that was killed, and of file managers and file systems."""
 _ANEW = "restore it, or replace the run with --overwrite"
 SIGNATURE = "# gsjax run"  # the first line of config.yml: other programs write files of that name too
 
@@ -363,7 +365,7 @@ def expect_ours(path: Path, written: Sequence[str]) -> Path:
     if not path.exists():
         return path
     entries = sorted(entry.name for entry in path.iterdir()) if path.is_dir() else []
-    others = [n for n in entries if not n.startswith(".") and not any(fnmatch(n, w) for w in written)]
+    others = [name for name in entries if not any(fnmatch(name, each) for each in (*written, *_NOBODYS))]
     if path.is_dir() and not others and (not entries or any(fnmatch(n, written[0]) for n in entries)):
         return path
     found = "a file" if not path.is_dir() else (others or [f"no {written[0]}"])[0]

@@ -65,7 +65,7 @@ def test_an_answer_goes_nowhere_where_something_would_be_lost(gsjax, closed, tmp
         folder.mkdir(exist_ok=True)
         (folder / file).write_text("{}")
     monkeypatch.chdir(here)
-    for out, found in ((field, "other files"), (other, "one with .git"), (".", "the current one")):
+    for out, found in ((field, "other files"), (other, "other files"), (".", "the current one")):
         code, said = gsjax("query", field, "can", "--out", out)
         assert code == 2
         assert f"--out {out}: expected " in said

@@ -219,7 +219,8 @@ def test_what_stood_there_comes_back_where_the_new_cannot_take_its_place(tmp_pat
 
 
 @pytest.mark.parametrize(
-    "there", [("answer.json", "notes.txt"), ("masks",), ("picture_1.png", "picture_2.png")]
+    "there",
+    [("answer.json", "notes.txt"), ("answer.json", ".git"), ("masks",), ("picture_1.png", "picture_2.png")],
 )
 def test_a_folder_with_something_else_is_not_replaced(tmp_path, there):
     folder = tmp_path / "answer"
@@ -234,15 +235,15 @@ def test_a_folder_with_something_else_is_not_replaced(tmp_path, there):
     assert listed(folder) == sorted(there)
 
 
-def test_a_link_stays_one_and_an_empty_folder_and_hidden_files_are_nobodys(tmp_path):
+def test_a_link_stays_one_and_an_empty_folder_and_files_of_file_managers_are_nobodys(tmp_path):
     (tmp_path / "elsewhere").mkdir()
     (tmp_path / "answer").symlink_to(tmp_path / "elsewhere")
     for _ in range(2):
         with replaced_folder(tmp_path / "answer", OURS) as new:
             (new / "answer.json").touch()
-        (tmp_path / "elsewhere" / ".hidden").touch()
+        (tmp_path / "elsewhere" / ".DS_Store").touch()
     assert (tmp_path / "answer").is_symlink()
-    assert listed(tmp_path / "elsewhere") == [".hidden", "answer.json"]
+    assert listed(tmp_path / "elsewhere") == [".DS_Store", "answer.json"]
     (tmp_path / "file").touch()
     with pytest.raises(FileExistsError, match="found a file"):
         fresh_folder(tmp_path / "file", OURS)
