@@ -5,31 +5,26 @@ from collections.abc import Callable, Collection
 from contextlib import suppress
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, TypeVar
 from urllib.parse import parse_qsl
 
 import numpy as np
 
 from gsjax.data import clip, colmap, poses_bounds, transforms
-from gsjax.data.bop import read_bop
 from gsjax.data.duplicates import without_duplicates
-from gsjax.data.endonerf import is_endonerf, is_unambiguous_endonerf, read_endonerf
-from gsjax.data.endovis import LEFT, is_endovis, read_endovis
+from gsjax.data.endonerf import is_unambiguous_endonerf
 from gsjax.data.errors import COMPLETE, DataError
-from gsjax.data.open3d_rgbd import is_open3d, read_open3d, without_poses
-from gsjax.data.panoptic import read_panoptic
-from gsjax.data.paris import Split, read_paris
+from gsjax.data.layouts import PHOTOGRAPHS, RECORDINGS, Layout, in_words, layout_of
+from gsjax.data.open3d_rgbd import without_poses
+from gsjax.data.paris import Split
 from gsjax.data.photographs import Photographs, photographs_of
 from gsjax.data.pictures import is_picture, refuse_unread
-from gsjax.data.push_t import read_push_t
 from gsjax.data.realsense import read_realsense
-from gsjax.data.record3d import EXPORT_THIS, is_record3d, read_record3d
+from gsjax.data.record3d import EXPORT_THIS
 from gsjax.data.sequence import Sequence
-from gsjax.data.seven_scenes import read_seven_scenes
 from gsjax.data.simulated import articulated, bar, cabinet, hard_parts, tabletop, tissue
 from gsjax.data.through_lenses import Fisheye
 from gsjax.data.tool_masks import Tool
-from gsjax.data.tum import read_tum
 from gsjax.geometry.cameras import NEAR
 from gsjax.io.brief import shortened
 
@@ -42,22 +37,6 @@ SIMULATED_SCENES = {
     "hard_parts": hard_parts,
     "tissue": tissue,
 }
-
-# Glob pattern that only a folder of that layout matches -> the layout and its reader.
-_LAYOUTS = {
-    "train_meta.json": ("Panoptic", read_panoptic),
-    "sample_demos": ("push-T", read_push_t),
-    "rgb.txt": ("TUM RGB-D", read_tum),
-    "frame-*.pose.txt": ("7-Scenes", read_seven_scenes),
-    "frame-*.color.*": ("7-Scenes", read_seven_scenes),
-    "seq-*": ("7-Scenes", read_seven_scenes),
-    "scene_camera*.json": ("BOP", read_bop),
-    "*/scene_camera.json": ("BOP", read_bop),
-    "start/camera_*.json": ("PARIS", read_paris),
-}
-_RECORDINGS = {mark: layout for mark, (layout, _) in _LAYOUTS.items()} | {LEFT: "EndoVis"}
-_RECORDINGS |= {"poses_bounds.npy and depth or masks": "EndoNeRF", "poses_bounds.npy and cam*.mp4": "DyNeRF"}
-_RECORDINGS |= {"rgb and depth/*.exr": "Record3D", "color, depth and a trajectory (.log)": "Open3D"}
 
 # Option -> what it is about, and whether data that were read have that.
 _ABOUT = {
@@ -145,26 +124,30 @@ def _sequence(path: str | Path, options: ReadOptions) -> Sequence:
     if root.is_file() and _is_bag(root):
         return _read("RealSense", read_realsense, root, options)
     root = _folder(path)
-    for mark, (layout, read) in _LAYOUTS.items():
-        if next(root.glob(mark), None):
-            return _read(layout, read, root, options)
-    if is_open3d(root):
-        return _read("Open3D", read_open3d, root, options)
-    if is_record3d(root):
-        return _read("Record3D", read_record3d, root, options)
-    if poses_bounds.find(root) and next(root.glob("cam*.mp4"), None):
-        return _read("DyNeRF", poses_bounds.read_dynerf, root, options)
-    if is_endonerf(root, options.images):
-        return _read("EndoNeRF", read_endonerf, root, options, axes=_axes(root, options))
-    if is_endovis(root):
-        return _read("EndoVis", read_endovis, root, options)
-    photographs = _photograph_layout(root)
-    if photographs:
-        found = f"photographs ({photographs.name} layout), which are not ordered in time"
+    if (layout := layout_of(root, RECORDINGS, options.images)) is not None:
+        return _read_layout(layout, root, options)
+    if (layout := layout_of(root, PHOTOGRAPHS)) is not None:
+        found = f"photographs ({layout.name} layout), which are not ordered in time"
         raise DataError(root, "a recording over time", found, "Use gsjax fit for photographs.")
     if clip.is_clip(root, options.images, options.masks):
         return _read("clip", clip.read_clip, root, options)
-    raise _unknown(root, _RECORDINGS, options)
+    raise _unknown(root, RECORDINGS, options)
+
+
+def _read_layout(layout: Layout, root: Path, options: ReadOptions) -> Any:
+    settled = {"axes": _axes(root, options)} if layout.needs_axes else {}
+    return _read(layout.name, layout.read, root, options, **settled)
+
+
+def _axes(root: Path, options: ReadOptions) -> poses_bounds.Axes:
+    if options.axes is None and is_unambiguous_endonerf(root, options.images):
+        return "endonerf"
+    if options.axes is None:
+        raise ValueError(
+            f"{root}: poses_bounds.npy does not state the meaning of its columns; set axes (--read.axes) "
+            "to llff (down, right, back) or endonerf (right, up, back)"
+        )
+    return options.axes
 
 
 def _read(
@@ -223,20 +206,17 @@ def _photographs(path: str | Path, options: ReadOptions) -> Photographs:
     if _is_bag(Path(path)):
         return photographs_of(open_sequence(path, options))
     root = _folder(path)
-    if (layout := _photograph_layout(root)) is not None:
-        settled = {"axes": _axes(root, options)} if layout.read is poses_bounds.read_llff else {}
-        return without_duplicates(_read(layout.name, layout.read, root, options, **settled))
+    if (layout := layout_of(root, PHOTOGRAPHS)) is not None:
+        return without_duplicates(_read_layout(layout, root, options))
     if is_recording(root):
         return photographs_of(open_sequence(root, options))
-    raise _unknown(root, {layout.mark: layout.name for layout in _PHOTOGRAPHS} | _RECORDINGS, options)
+    raise _unknown(root, PHOTOGRAPHS + RECORDINGS, options)
 
 
 def is_recording(path: str | Path) -> bool:
     """Whether a path holds a recording over time, judged by its files."""
     root = Path(path)
-    known = _is_bag(root) or any(next(root.glob(mark), None) for mark in _LAYOUTS)
-    known = known or any(layout(root) for layout in (is_open3d, is_record3d, is_endonerf, is_endovis))
-    return str(path).startswith(SIMULATED_PREFIX) or known or next(root.glob("cam*.mp4"), None) is not None
+    return str(path).startswith(SIMULATED_PREFIX) or _is_bag(root) or layout_of(root, RECORDINGS) is not None
 
 
 def _is_bag(path: Path) -> bool:
@@ -250,66 +230,13 @@ def is_photographs(path: str | Path) -> bool:
         return False
     root = Path(path)
     return (root.is_file() and root.suffix == ".json") or (
-        root.is_dir() and _photograph_layout(root) is not None
+        root.is_dir() and layout_of(root, PHOTOGRAPHS) is not None
     )
 
 
 def is_dataset_file(path: Path) -> bool:
     """Whether a file by itself may be a dataset: a video, a recording, a list of photographs."""
     return _is_bag(path) or clip.is_clip(path) or path.suffix.lower() in (".json", ".r3d")
-
-
-class _PhotographLayout(NamedTuple):
-    """A layout of photographs: its name, the file that marks it, whether a folder has it, and its reader."""
-
-    name: str
-    mark: str
-    is_layout_of: Callable[[Path], bool]
-    read: Callable[..., Photographs]
-
-
-_PHOTOGRAPHS = (
-    _PhotographLayout(
-        "nerfstudio",
-        "transforms.json",
-        lambda root: (root / "transforms.json").is_file(),
-        transforms.read_transforms,
-    ),
-    _PhotographLayout(
-        "Blender",
-        "transforms_train.json",
-        lambda root: next(root.glob("transforms_*.json"), None) is not None,
-        transforms.read_transforms,
-    ),
-    _PhotographLayout(
-        "COLMAP",
-        "sparse/0/cameras.bin",
-        lambda root: bool(colmap.find_models(root)),
-        colmap.read_colmap,
-    ),
-    _PhotographLayout(
-        "LLFF",
-        "poses_bounds.npy",
-        lambda root: bool(poses_bounds.find(root)) and not next(root.glob("cam*.mp4"), None),
-        poses_bounds.read_llff,
-    ),
-)
-
-
-def _photograph_layout(root: Path) -> _PhotographLayout | None:
-    """The layout of a folder of photographs, judged by its files; None if it has none."""
-    return next((layout for layout in _PHOTOGRAPHS if layout.is_layout_of(root)), None)
-
-
-def _axes(root: Path, options: ReadOptions) -> poses_bounds.Axes:
-    if options.axes is None and is_unambiguous_endonerf(root, options.images):
-        return "endonerf"
-    if options.axes is None:
-        raise ValueError(
-            f"{root}: poses_bounds.npy does not state the meaning of its columns; set axes (--read.axes) "
-            "to llff (down, right, back) or endonerf (right, up, back)"
-        )
-    return options.axes
 
 
 def _folder(path: str | Path) -> Path:
@@ -330,7 +257,7 @@ def _find_poses(images: Path) -> str:
     return f"Find them first: gsjax poses {images} --out DATASET, then give DATASET."
 
 
-def _unknown(root: Path, marks: dict[str, str], options: ReadOptions) -> DataError:
+def _unknown(root: Path, layouts: tuple[Layout, ...], options: ReadOptions) -> DataError:
     if (missing := colmap.find_missing_file(root)) is not None:
         return DataError(missing, "a file of the reconstruction", "no such file", COMPLETE)
     from gsjax.io.sequences import scenes_in_words, scenes_within  # slow to import
@@ -338,7 +265,8 @@ def _unknown(root: Path, marks: dict[str, str], options: ReadOptions) -> DataErr
     if not any(root.iterdir()):
         return DataError(root, "a dataset", "an empty folder", "Check the path.")
     scenes = scenes_within(root)
-    expected = f"poses of the photographs ({', '.join(layout.mark for layout in _PHOTOGRAPHS)})"
+    of_photographs = ", ".join(mark for layout in PHOTOGRAPHS for mark in layout.marks)
+    expected = f"poses of the photographs ({of_photographs})"
     for folder in (root, root / options.images):
         files = [*folder.iterdir()] if folder.is_dir() else []
         count = sum(map(is_picture, files))
@@ -350,17 +278,12 @@ def _unknown(root: Path, marks: dict[str, str], options: ReadOptions) -> DataErr
         return DataError(root, "a dataset", scenes_in_words(scenes), advice)
     if (lacking := without_poses(root)) is not None:
         return lacking
-    by_layout: dict[str, list[str]] = {}
-    for mark, layout in marks.items():
-        by_layout.setdefault(layout, []).append(mark)
-    expected = ", ".join(f"{layout} ({' or '.join(several)})" for layout, several in by_layout.items())
     names = sorted(entry.name for entry in root.iterdir())
     found = shortened(names, 8)
     advice = "Give the folder that holds them."
-    if not any(layout.mark in marks for layout in _PHOTOGRAPHS):
-        photographs = ", ".join(layout.mark for layout in _PHOTOGRAPHS)
-        advice = f"Give the folder that holds them; photographs ({photographs}) are for gsjax fit."
-    return DataError(root, f"the files of a known layout: {expected}", found, advice)
+    if layouts == RECORDINGS:
+        advice = f"Give the folder that holds them; photographs ({of_photographs}) are for gsjax fit."
+    return DataError(root, f"the files of a known layout: {in_words(*layouts)}", found, advice)
 
 
 def _simulate(text: str) -> Sequence:
