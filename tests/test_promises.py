@@ -15,10 +15,46 @@ def test_it_is_guarded(promise, guards):
     for guard in re.findall(r"`(.+?)`", guards):
         name, _, test = guard.partition("::")
         tree = ast.parse((HERE / name).read_text(encoding="utf-8"))
-        found = [node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef) and node.name == test]
-        assert found or not test, guard
-        marks = [ast.unparse(mark) for node in found for mark in node.decorator_list]
-        assert "pytest.mark.slow" not in marks, guard
+        found = [is_slow(marks) for marks in marks_of(tree, test)]
+        assert found or not test, f"{guard}: no such test"
+        assert not all(found or [False]), f"{guard}: slow, so CI leaves it out"
+
+
+def marks_of(tree, test):
+    """The marks of each test of that name: its own, its class's and its file's."""
+    of_file = [ast.unparse(line) for line in tree.body if isinstance(line, ast.Assign)]
+    of_file = [line.removeprefix("pytestmark = ") for line in of_file if line.startswith("pytestmark")]
+    marks = []
+    for within in (tree, *(node for node in tree.body if isinstance(node, ast.ClassDef))):
+        for node in within.body:
+            if isinstance(node, ast.FunctionDef) and node.name == test:
+                decorators = node.decorator_list + getattr(within, "decorator_list", [])
+                marks.append([ast.unparse(each) for each in decorators] + of_file)
+    return marks
+
+
+def is_slow(marks):
+    """Whether all of a test is; a case of its own in `parametrize` may be."""
+    return any(mark.lstrip("[").startswith("pytest.mark.slow") for mark in marks)
+
+
+@pytest.mark.parametrize(
+    ("text", "slow"),
+    [
+        ("def test_a(): ...", False),
+        ("@pytest.mark.slow\ndef test_a(): ...", True),
+        ("@pytest.mark.slow\nclass TestIt:\n    def test_a(self): ...", True),
+        ("pytestmark = pytest.mark.slow\ndef test_a(): ...", True),
+        ("@pytest.mark.slow\ndef test_b(): ...\ndef test_a(): ...", False),
+        (
+            "@pytest.mark.parametrize('x', [pytest.param(1, marks=pytest.mark.slow)])\ndef test_a(x): ...",
+            False,
+        ),
+    ],
+)
+def test_marks_of_classes_and_files_count(text, slow):
+    (marks,) = marks_of(ast.parse(text), "test_a")
+    assert is_slow(marks) == slow
 
 
 def test_there_are_promises():
