@@ -203,11 +203,17 @@ def page(shown: dict[str, str]) -> str:
         lines += [f"## {title}", ""]
         if picture is not None:
             folder, says = SAYS[picture]
-            command = shlex.join(COMMANDS[folder].replace(f"{RUNS}/", "runs/gallery/").split())
-            lines += [f"![{title}]({shown[picture]})", "", f"*{says}* `gsjax {command}`", ""]
+            lines += [f"![{title}]({shown[picture]})", "", f"*{says}*", ""]
+            lines += ["```sh", *commands_of(folder), "```", ""]
         for name in experiments:
             lines += [f"![{name}](../experiments/{name}/figure.png)", "", f"*{CAPTIONS[name]}* `{name}`", ""]
     return "\n".join(lines)
+
+
+def commands_of(folder: str) -> list[str]:
+    """The commands that leave a folder: its own, after those of the runs that it lies in."""
+    needed = [command for name, command in COMMANDS.items() if f"{folder}/".startswith(f"{name}/")]
+    return [f"gsjax {shlex.join(each.replace(f'{RUNS}/', 'runs/gallery/').split())}" for each in needed]
 
 
 # -- speed against accuracy ----------------------------------------------------------------------------------
