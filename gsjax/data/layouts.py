@@ -58,7 +58,7 @@ RECORDINGS = (
     Layout("Panoptic", ("train_meta.json",), read_panoptic),
     Layout("push-T", ("sample_demos",), read_push_t),
     Layout("TUM RGB-D", ("rgb.txt",), read_tum),
-    Layout("7-Scenes", ("frame-*.pose.txt", "frame-*.color.*", "seq-*"), read_seven_scenes),
+    Layout("7-Scenes", ("frame-*.pose.txt", "frame-*.color.*", "seq-*/"), read_seven_scenes),
     Layout("BOP", ("scene_camera*.json", "*/scene_camera.json"), read_bop),
     Layout("PARIS", ("start/camera_*.json",), read_paris),
     Layout("Open3D", ("color, depth and a trajectory (.log)",), read_open3d, lambda root, _: is_open3d(root)),

@@ -306,7 +306,7 @@ def _parse(text: str, key: str, value: str, kind: type) -> int | float | bool | 
         return value.lower() in ("true", "1")
     if kind is str:
         return value
-    if kind is int and value.lstrip("-").isdecimal():
+    if kind is int and value.removeprefix("-").isdecimal():
         return int(value)
     if kind is float:
         with suppress(ValueError):

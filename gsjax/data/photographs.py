@@ -11,7 +11,13 @@ from jaxtyping import Bool, Float, Int, Integer, UInt8
 from gsjax.data.errors import DataError
 from gsjax.data.resizing import area_resized, check_scale, nearest_resized
 from gsjax.data.sequence import Sequence
-from gsjax.data.validation import check_intrinsics, check_poses, check_shape
+from gsjax.data.validation import (
+    check_background,
+    check_intrinsics,
+    check_poses,
+    check_shape,
+    positions_of,
+)
 from gsjax.geometry.cameras import NEAR, Camera, on_device
 from gsjax.scene.frame import Frame
 
@@ -29,15 +35,17 @@ class Cloud:
         colors: RGB, 0 to 1, [M,3].
 
     Raises:
-        ValueError: shapes disagree.
+        ValueError: shapes disagree, or colours are bytes.
     """
 
     points: Float[np.ndarray, "..."]
-    colors: Float[np.ndarray, "..."]
+    colors: Float[np.ndarray, "..."] | UInt8[np.ndarray, "..."]
 
     def __post_init__(self):
         check_shape("points", self.points, (len(self.points), 3))
         check_shape("colors", self.colors, (len(self.points), 3))
+        if np.issubdtype(self.colors.dtype, np.integer):
+            raise ValueError(f"colors: expected RGB from 0 to 1, found {self.colors.dtype}; divide by 255")
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,7 +80,8 @@ class Photographs:
             folder.
 
     Raises:
-        ValueError: shapes disagree, a pose is not a rigid motion, or there is no photograph.
+        ValueError: shapes disagree, a pose is not a rigid motion, the background is not from 0 to 1, or there
+            is no photograph.
     """
 
     name: str
@@ -109,6 +118,7 @@ class Photographs:
         for name in ("times", "splits"):
             if getattr(self, name) is not None:
                 check_shape(name, np.asarray(getattr(self, name)), (count,))
+        check_background(self.background)
         check_intrinsics(self.Ks[:, None], lambda i, _: self.names[i])
         check_poses("viewmat", self.viewmats[:, None], lambda i, _: self.names[i], _POSE_ADVICE)
 
@@ -185,9 +195,14 @@ class Photographs:
         """
         return self._optional(self.load_labels, "labels", i, np.integer)
 
-    def select(self, indices: Indices[int]) -> "Photographs":
-        """The photographs at these indices, in this order."""
-        chosen = [int(i) for i in indices]
+    def select(self, indices: Indices[int] | np.ndarray) -> "Photographs":
+        """The photographs at these indices, in this order, or where a mask is True.
+
+        Raises:
+            ValueError: a mask has another length, or there is no photograph left.
+            IndexError: there is no such photograph.
+        """
+        chosen = positions_of(indices, self.num)
         locate = self.locate
         return replace(
             self,

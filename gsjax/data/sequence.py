@@ -13,7 +13,15 @@ from jaxtyping import Float, Int, UInt8
 from gsjax.data.errors import DataError, DataWarning
 from gsjax.data.objects import PointModel, Truth
 from gsjax.data.resizing import area_resized, check_scale, nearest_resized
-from gsjax.data.validation import check_depth, check_intrinsics, check_poses, check_shape, check_times
+from gsjax.data.validation import (
+    check_background,
+    check_depth,
+    check_intrinsics,
+    check_poses,
+    check_shape,
+    check_times,
+    positions_of,
+)
 from gsjax.geometry.cameras import NEAR, Camera
 from gsjax.scene.frame import Frame
 
@@ -59,7 +67,8 @@ class Sequence:
         background: RGB, 0 to 1, composited behind transparent images; None if none is transparent.
 
     Raises:
-        ValueError: shapes disagree, a pose is not a rigid motion, or times do not increase.
+        ValueError: shapes disagree, a pose is not a rigid motion, times do not increase, or the background is
+            not from 0 to 1.
     """
 
     name: str
@@ -103,6 +112,7 @@ class Sequence:
             check_shape("origin", self.origin, (3,))
         if self.splits is not None:
             check_shape("splits", np.asarray(self.splits), (frames,))
+        check_background(self.background)
         check_intrinsics(self.Ks, self._camera_in_frame)
         check_poses("viewmat", self.viewmats, self._camera_in_frame, _POSE_ADVICE)
         if self.truth is not None:
@@ -236,14 +246,15 @@ class Sequence:
         return flow
 
     def select(
-        self, frames: slice | Indices[int] = slice(None), cameras: Indices[int] | None = None
+        self, frames: slice | Indices[int] | np.ndarray = slice(None), cameras: Indices[int] | None = None
     ) -> "Sequence":
-        """The sequence of some frames (positions from 0) and some cameras (by camera id; None = all).
+        """The sequence of some frames (positions from 0, or a mask) and cameras (by camera id; None = all).
 
         Raises:
             ValueError: a camera or frame does not exist, none is left, or frames do not increase.
         """
-        chosen = np.arange(self.num_frames)[frames] if isinstance(frames, slice) else np.asarray(frames, int)
+        every = np.arange(self.num_frames)
+        chosen = every[frames] if isinstance(frames, slice) else positions_of(frames, self.num_frames)
         outside = [int(t) for t in chosen if not 0 <= t < self.num_frames]
         if outside or len(chosen) == 0:
             found = f"no frame {outside[0]}" if outside else f"no frame in {frames}"

@@ -2,6 +2,7 @@
 
 import warnings
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -27,6 +28,26 @@ def check_shape(name: str, array: np.ndarray, shape: tuple[int, ...]) -> None:
     """
     if np.shape(array) != shape:
         raise ValueError(f"{name} must have shape {shape}, got {np.shape(array)}")
+
+
+def check_background(background: tuple[float, float, float] | None) -> None:
+    """Raises a ValueError unless a colour behind pictures is RGB from 0 to 1, or None."""
+    if background is not None and not (len(background) == 3 and all(0 <= c <= 1 for c in background)):
+        raise ValueError(f"background: expected RGB from 0 to 1, found {background}; divide bytes by 255")
+
+
+def positions_of(indices: Any, count: int) -> list[int]:
+    """Positions in a list of `count`, from positions or from a mask.
+
+    Raises:
+        ValueError: a mask has another length.
+    """
+    found = np.asarray(indices)
+    if found.dtype != bool:
+        return [int(i) for i in found]
+    if found.shape != (count,):
+        raise ValueError(f"expected positions, or a mask of length {count}, found a mask of {found.shape}")
+    return np.flatnonzero(found).tolist()
 
 
 def check_poses(

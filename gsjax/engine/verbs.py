@@ -61,7 +61,7 @@ def fit(
     config, cloud = start_from(photographs, frames, FitConfig() if config is None else config)
     method = Fit(config, extra_losses)
     problem, run = method.start(frames, cloud, photographs.background)
-    return drive(method, problem, run if after is None else _going_on(after, method))
+    return drive(method, problem, run if after is None else _going_on(after, method, run))
 
 
 def deform(
@@ -110,7 +110,7 @@ def deform(
 
     given = (sequence, teacher, tools, tool_values, first, gaussians)
     method, problem, run = start_from(config, extra_losses, *given)
-    return drive(method, problem, run if after is None else _going_on(after, method))
+    return drive(method, problem, run if after is None else _going_on(after, method, run))
 
 
 def distill(
@@ -183,8 +183,8 @@ def parts(
         ticks, whose `result` is a `PartsResult`: the scene with its parts, `weights`, `poses(t)`, `joints()`.
 
     Raises:
-        ValueError: there are fewer than two cameras or frames, Gaussians are given without an anchor, two
-            states have no depth, or nothing is found that moves.
+        ValueError: there are fewer than two cameras or frames, a camera to hold out does not exist, Gaussians
+            are given without an anchor, two states have no depth, or nothing is found that moves.
         DataError: a picture cannot be read.
     """
     from gsjax.engine.parts.start import FIT, detect_motion, discover, has_two_states
@@ -192,6 +192,10 @@ def parts(
 
     method = Parts(PartsConfig() if config is None else config, extra_losses)
     config, eval_cameras = method.config, tuple(eval_cameras)
+    if unknown := [c for c in eval_cameras if c not in sequence.camera_ids]:
+        raise ValueError(
+            f"eval_cameras: expected ids of cameras, {list(sequence.camera_ids)}, found {unknown[0]}"
+        )
     tracked = sequence.select(cameras=[c for c in sequence.camera_ids if c not in eval_cameras])
     if after is not None:
         problem = PartsProblem(tracked, at_once=has_two_states(tracked))
@@ -210,14 +214,25 @@ def parts(
     return drive(method, problem, run, headroom=config.headroom)
 
 
-def _going_on(after: Tick, method: Method) -> Run:
+_TRAINED = {"exposures": "exposure", "twists": "refine_poses"}  # what a setting adds to what is trained
+
+
+def _going_on(after: Tick, method: Method, begun: Run | None = None) -> Run:
     """A copy of an earlier tick's run, as steps donate its arrays, and one may go on from a tick twice. With
-    other settings or losses, its losses are not compared with those before."""
+    other settings or losses, its losses are not compared with those before. What is trained must be what a
+    run that has just begun would train."""
     warn_of_lost(after, getattr(method, "extra_losses", ()))
     run = after.run
     held = run.params, run.state
     if any(leaf.is_deleted() for leaf in jax.tree.leaves(held) if isinstance(leaf, jax.Array)):
         raise ValueError("after: expected a tick whose loop has taken no further step, found an earlier one")
+    for name, setting in _TRAINED.items() if begun is not None else ():
+        had, has = (getattr(one, name, None) is not None for one in (run.params, begun.params))
+        if had != has:
+            raise ValueError(
+                f"after: expected a run with {setting}={has}, as in the config, found one with "
+                f"{setting}={had}; change the config, or begin a run of its own"
+            )
     params, state = jax.tree.map(lambda leaf: leaf.copy() if isinstance(leaf, jax.Array) else leaf, held)
     run = run.having(params=params, state=state)
     return run if after.method == method else run.having(guard=None)

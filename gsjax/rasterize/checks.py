@@ -25,6 +25,16 @@ def _expect(name: str, array, want: tuple, meaning: str) -> None:
         raise ValueError(f"{name} must have shape {wanted}, {meaning}; got {tuple(shape)}")
 
 
+def check_tile(means2d, conics, opacities, values, pixels) -> None:
+    """Raises a ValueError that names the argument of `composite_tile` whose shape is wrong."""
+    length = len(values) if jnp.ndim(values) else None
+    _expect("splats.values", values, (length, None), "a row per Gaussian")
+    _expect("splats.means2d", means2d, (length, 2), "the centre of each Gaussian")
+    _expect("splats.conics", conics, (length, 3), "xx, xy, yy of each Gaussian")
+    _expect("splats.opacities", opacities, (length,), "one per Gaussian")
+    _expect("pixels", pixels, (None, 2), "the position of each pixel")
+
+
 def check_inputs(
     plan: Plan,
     means,

@@ -18,6 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from gsjax.rasterize.checks import check_tile
 from gsjax.rasterize.plan import DEFAULT_LIMITS, FEW_CHANNELS, Limits, Plan
 from gsjax.rasterize.sorting import argsort_keys
 from gsjax.rasterize.tiles import tile_pixels, untile, write_tiles
@@ -168,7 +169,7 @@ def _weights_of_many_jvp(limits: Limits, primals, tangents):
 
 def composite_tile(
     splats: Splats,
-    pixels: Float[Array, "pixels 2"],
+    pixels: Float[Array, "..."],
     state: TileState | None = None,
     *,
     limits: Limits = DEFAULT_LIMITS,
@@ -181,13 +182,17 @@ def composite_tile(
 
     Args:
         splats: the list, [L] of each field.
-        pixels: positions of the pixels, in the same coordinates as `splats.means2d`.
+        pixels: positions of the pixels [P, 2], in the same coordinates as `splats.means2d`.
         state: the state after an earlier piece of the list (default: an empty tile).
         limits: where contributions start and saturate (their opacity then gets no gradient) and pixels end.
 
     Returns:
         The new state: values `sum_i w_i v_i` and the transmittance left for a background.
+
+    Raises:
+        ValueError: a shape is wrong; the message names the argument.
     """
+    check_tile(splats.means2d, splats.conics, splats.opacities, splats.values, pixels)
     length, channels = splats.values.shape
     dtype = splats.opacities.dtype
     if state is None:

@@ -65,8 +65,10 @@ def freeze_views(
     that cannot be drawn are in no list.
 
     Raises:
-        ValueError: as `gsjax.plan`.
+        ValueError: there is no Gaussian; or as `gsjax.plan`.
     """
+    if len(means) == 0:
+        raise ValueError("means: expected at least one Gaussian to see, found none")
     scene = (means, quats, scales, opacities)
     plan = _plan(*scene, viewmats, Ks, width, height, headroom=1.0, fisheye=fisheye, **options)
     cameras = zip(

@@ -94,7 +94,7 @@ def part_of(frame: Frame, cameras: tuple[int, ...] = (), shrink: int = 1) -> Fra
             f"shrink: expected at most the sides of the pictures, {frame.cameras.width}x"
             f"{frame.cameras.height}, found {shrink}"
         )
-    images = frame.images[:, : height * shrink, : width * shrink]
+    images = frame.colors[:, : height * shrink, : width * shrink]
     images = images.reshape(-1, height, shrink, width, shrink, 3).mean((2, 4))
     middle = slice(shrink // 2, None, shrink)
 
@@ -108,6 +108,7 @@ def part_of(frame: Frame, cameras: tuple[int, ...] = (), shrink: int = 1) -> Fra
 def without_broken(frame: Frame) -> tuple[Frame, Int[Array, ""]]:
     """The frame with pixels that are not finite made black and without depth, as `Sequence` reads them, and
     their number. Such a pixel would otherwise turn every sum that it enters into NaN."""
+    frame = Frame(frame.colors, frame.depths, frame.cameras, frame.masks, frame.time)
     broken = ~jnp.isfinite(frame.images).all(-1)
     if frame.depths is not None:
         broken |= ~jnp.isfinite(frame.depths)

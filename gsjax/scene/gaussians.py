@@ -145,12 +145,14 @@ def gaussians_from_activated(
         dtype: type of all fields.
 
     Raises:
-        ValueError: a shape is wrong; the message names the argument.
+        ValueError: a shape is wrong, or colours are bytes; the message names the argument.
     """
     count = np.shape(means)[0] if np.ndim(means) else None
     wanted = {"means": 3, "quats": 4, "scales": 3, "opacities": None, "colors": 3}
     arrays = dict(zip(wanted, (means, quats, scales, opacities, colors), strict=True))
     arrays = {name: _on_device(value, dtype) for name, value in arrays.items()}
+    if np.issubdtype(np.asarray(colors).dtype, np.integer):
+        raise ValueError(f"colors: expected RGB from 0 to 1, found {np.asarray(colors).dtype}; divide by 255")
     for name, columns in wanted.items():
         _check_array(name, arrays[name], (count,) if columns is None else (count, columns))
     extra = {"shN": shN, "features": features}
@@ -209,11 +211,21 @@ Tree = TypeVar("Tree", Gaussians, Tags)
 
 
 def take(tree: Tree, indices: Integer[ArrayLike, "M"] | Bool[ArrayLike, "N"]) -> Tree:
-    """The rows `indices` (or, outside a trace, those where a boolean mask is True) of Gaussians or Tags."""
+    """The rows `indices` (or, outside a trace, those where a boolean mask is True) of Gaussians or Tags.
+
+    Raises:
+        ValueError: outside a trace, a mask has another length, or there is no such row.
+    """
     if not isinstance(indices, jax.core.Tracer):
-        indices = np.asarray(indices)
-    if indices.dtype == bool:
-        indices = np.flatnonzero(indices)
+        indices, count = np.asarray(indices), min((len(leaf) for leaf in jax.tree.leaves(tree)), default=0)
+        if indices.dtype == bool:
+            if indices.shape != (count,):
+                raise ValueError(f"indices: expected a mask of shape ({count},), found {indices.shape}")
+            indices = np.flatnonzero(indices)
+        elif ((indices < -count) | (indices >= count)).any():
+            raise ValueError(
+                f"indices: expected rows below {count}, found {indices[np.abs(indices).argmax()]}"
+            )
     return _rows(tree, indices)
 
 

@@ -94,6 +94,7 @@ def render(
         backgrounds=backgrounds,
         roi=roi,
         means2d_offset=means2d_offset,
+        **({"near_plane": cameras.near} if plan is None else {}),
     )
     return _rendered(images, alphas, meta, visibility is not None)
 

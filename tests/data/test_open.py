@@ -25,6 +25,7 @@ def test_built_in_scenes_take_arguments():
         ("simulated:tabletop?sed=3", "no argument 'sed'; it has: seed, frames"),
         ("simulated:tabletop?seed=x", "seed must be an integer, got 'x'"),
         ("simulated:tabletop?seed=", "seed must be an integer, got ''"),
+        ("simulated:tabletop?seed=--5", "seed must be an integer, got '--5'"),
         ("simulated:tabletop?hide=2", "hide must be true or false"),
         ("simulated:tabletop?frames=0", "frames must be at least 1"),
         ("simulated:tabletop?hide=1&leave=1", "at most one"),

@@ -62,6 +62,10 @@ def test_a_selection_in_another_order():
     assert bare.where("image", 0) == "three, image b"
     with pytest.raises(ValueError, match="three: expected at least one photograph, found none"):
         photographs().select([])
+    mask = np.array([False, True, True])
+    assert photographs().select(mask).names == photographs().select([1, 2]).names
+    with pytest.raises(ValueError, match=r"a mask of length 3, found a mask of \(2,\)"):
+        photographs().select(mask[:2])
 
 
 def test_smaller_colours_are_means_and_depths_and_masks_are_not():
@@ -141,6 +145,10 @@ def test_clouds_have_one_colour_per_point():
     assert Cloud(np.zeros((0, 3)), np.zeros((0, 3))).points.shape == (0, 3)
     with pytest.raises(ValueError, match=r"colors must have shape \(2, 3\), got \(1, 3\)"):
         Cloud(np.zeros((2, 3)), np.zeros((1, 3)))
+    with pytest.raises(ValueError, match="colors: expected RGB from 0 to 1, found uint8"):
+        Cloud(np.zeros((2, 3)), np.full((2, 3), 255, np.uint8))
+    with pytest.raises(ValueError, match="background: expected RGB from 0 to 1, found"):
+        photographs(background=(255.0, 255.0, 255.0))
     with pytest.raises(ValueError, match=r"points must have shape \(2, 3\), got \(2, 2\)"):
         Cloud(np.zeros((2, 2)), np.zeros((2, 3)))
 

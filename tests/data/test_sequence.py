@@ -344,3 +344,11 @@ def test_the_near_distance_is_kept_by_everything_derived_from_a_sequence():
     assert open_sequence("simulated:articulated?width=48&height=36&cameras=2", read).near == 0.3
     with pytest.raises(ValueError, match="near: expected 0 or more, found -1"):
         ReadOptions(near=-1)
+
+
+def test_frames_are_selected_by_a_mask_too():
+    sequence = make()
+    mask = np.array([False, True, True, False])
+    assert sequence.select(mask).frame_ids == sequence.select([1, 2]).frame_ids
+    with pytest.raises(ValueError, match=r"a mask of length 4, found a mask of \(2,\)"):
+        sequence.select(mask[:2])

@@ -134,3 +134,22 @@ def test_an_untouched_tile_is_transparent():
     state = start_tile(4, 2)
     assert state.values.shape == (2, 4)
     np.testing.assert_array_equal(state.transmittance, 1)
+
+
+@pytest.mark.parametrize(
+    ("changes", "says"),
+    [
+        ({"values": jnp.ones(4)}, r"splats.values must have shape \(4, any\).*got \(4,\)"),
+        ({"means2d": jnp.ones((3, 2))}, r"splats.means2d must have shape \(4, 2\).*got \(3, 2\)"),
+        ({"conics": jnp.ones((4, 2, 2))}, r"splats.conics must have shape \(4, 3\).*got \(4, 2, 2\)"),
+        ({"opacities": jnp.ones((4, 1))}, r"splats.opacities must have shape \(4,\).*got \(4, 1\)"),
+    ],
+)
+def test_a_wrong_shape_is_named(changes, says):
+    with pytest.raises(ValueError, match=says):
+        composite_tile(random_list(4)._replace(**changes), grid())
+
+
+def test_pixels_without_two_coordinates_are_named():
+    with pytest.raises(ValueError, match=r"pixels must have shape \(any, 2\).*got \(36,\)"):
+        composite_tile(random_list(4), grid()[:, 0])

@@ -156,3 +156,9 @@ def test_a_view_that_sees_nothing_is_empty(small, geometry):
     image, alphas = painted(view_of(views, 0), np.ones((len(away["means"]), 2), np.float32), plan)
     np.testing.assert_array_equal(image, 0)
     np.testing.assert_array_equal(alphas, 0)
+
+
+def test_of_no_gaussians_there_is_no_view(small, geometry):
+    _, scene = small(5)
+    with pytest.raises(ValueError, match="means: expected at least one Gaussian"):
+        freeze_views(*geometry({name: value[:0] for name, value in scene.items()}), 33, 17)

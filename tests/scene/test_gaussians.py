@@ -122,6 +122,19 @@ def test_take_by_index_and_by_mask():
     chosen = take(tags, np.array([True, False, True, False, False]))
     np.testing.assert_array_equal(chosen.labels, [0, 2])
     assert chosen.alive is None
+    assert take(Tags(), np.arange(0)).labels is None
+    for wrong, says in (
+        (np.array([True, False]), r"a mask of shape \(5,\), found \(2,\)"),
+        (np.array([0, 5]), "rows below 5, found 5"),
+        (np.array([-6, 1]), "rows below 5, found -6"),
+    ):
+        with pytest.raises(ValueError, match=says):
+            take(gaussians, wrong)
+
+
+def test_colors_in_bytes_are_refused():
+    with pytest.raises(ValueError, match="colors: expected RGB from 0 to 1, found uint8; divide by 255"):
+        gaussians_from_activated(**activated() | {"colors": np.full((5, 3), 255, np.uint8)})
 
 
 @pytest.mark.parametrize("poison", [np.nan, np.inf, -np.inf])

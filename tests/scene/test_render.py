@@ -179,7 +179,7 @@ def test_a_plan_is_made_kept_and_grown_as_needed(scene, cameras):
 
 @pytest.mark.thorough
 def test_nothing_before_the_cameras_near_plane_is_drawn():
-    """A plan takes the near plane from the cameras that it is made for."""
+    """A plan takes the near plane from the cameras that it is made for, and so does a call without one."""
     means = jnp.array([[0.0, 0.0, 0.3], [0.0, 0.0, 2.0]])  # the first is right in front of the camera
     scene = gaussians_from_activated(
         means, np.tile([1.0, 0, 0, 0], (2, 1)), np.full((2, 3), 0.2), np.full(2, 0.99), np.eye(3)[:2]
@@ -187,6 +187,7 @@ def test_nothing_before_the_cameras_near_plane_is_drawn():
     viewmat, K = jnp.eye(4)[None], jnp.array([[[20.0, 0, 8], [0, 20.0, 8], [0, 0, 1]]])
     for near, color in ((0.01, 0), (0.5, 1)):
         camera = Camera(viewmat, K, 16, 16, near)
-        drawn = render(scene, camera, plan_render(scene, camera))
-        assert int(drawn.colors[0, 8, 8].argmax()) == color
+        for plan in (plan_render(scene, camera), None):
+            drawn = render(scene, camera, plan)
+            assert int(drawn.colors[0, 8, 8].argmax()) == color
         assert resized(camera, 0.5, 8, 8).near == near

@@ -150,10 +150,18 @@ def _begun(
         shape, run = method.start_at(after.run.params, first)
         return shape, _looked(method, shape, run, first).having(step=after.run.step)
     run = after.run
-    if after.method.config != method.config:  # and thus perhaps another plan
-        _, planned = method.start_at(run.params, first)
+    if after.method.config != method.config:
+        shape, planned = method.start_at(run.params, first)
+        if not _alike(planned.state, run.state):
+            return shape, _looked(method, shape, planned, first).having(step=run.step)
         run = run.having(plans=planned.plans, kept=planned.kept)
     return shape_of(first), run
+
+
+def _alike(state: Any, other: Any) -> bool:
+    """Whether both are states of settings under which the same things are remembered, in the same sizes."""
+    same = jax.tree.structure(state) == jax.tree.structure(other)
+    return same and all(map(lambda a, b: a.shape == b.shape, *map(jax.tree.leaves, (state, other))))
 
 
 def _looked(method: Track, shape: FrameShape, run: Run, first: Frame) -> Run:

@@ -128,8 +128,9 @@ class FitConfig:
     background: Literal["data", "black", "white", "random"] = "data"
     """Colour behind the scene; data: the colour that the photographs were composited on, else black."""
     prune: float = 0.002
-    """At the end, remove the least needed Gaussians, which together contribute at most this share of the
-    light of any photograph."""
+    """At the end of a command, and of the fits of `gsjax.parts`, remove the least needed Gaussians, which
+    together contribute at most this share of the light of any photograph. After `gsjax.fit` call
+    `gsjax.methods.fit.prune`."""
     exposure: bool = False
     """Learn an affine colour transform for each photograph, for sets of varying exposure or white balance."""
     refine_poses: bool = False

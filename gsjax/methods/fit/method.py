@@ -183,9 +183,10 @@ class Fit:
         when = config.growth if config.strategy == "relocate" else config.split
         if step < when.begin or step % when.every or progress >= when.end:
             return run
+        room = config.cap  # which is more than there are where a run goes on with more
         if config.strategy == "split":
-            room = min(config.cap, rung(int(slots_wanted(run.params, run.state, config))))
-            run = self._enlarged(run, slots=room)
+            room = min(room, rung(int(slots_wanted(run.params, run.state, config))))
+        run = self._enlarged(run, slots=room)
         key = jax.random.fold_in(jax.random.fold_in(jax.random.key(config.seed), _GROWTH), step)
         seen = _all_seen_since(config, step, len(problem.frames))
         params, state = _compiled_growth(config)(

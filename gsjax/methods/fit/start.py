@@ -114,7 +114,8 @@ def _at_random(frames, count, random):
         looks = rays(np.stack([column + 0.5, row + 0.5], axis=-1), camera.K, camera.fisheye)
         looks = np.where(np.isfinite(looks), looks, [0.0, 0.0, 1.0])  # the edges of a fisheye's photograph
         points[rows] = (looks * depth[:, None] - shift) @ rotation
-        colors[rows] = frame.images[0][row, column] / 255
+        picked = frame.images[0][row, column]
+        colors[rows] = picked / 255 if picked.dtype == np.uint8 else picked
     return points, colors
 
 

@@ -28,6 +28,15 @@ class FrameShape:
     near: float = NEAR
 
 
+def expect_pinholes(frame: Frame) -> None:
+    """Raises a ValueError where the frame's cameras are fisheyes, whose pixels the tracker cannot match."""
+    if frame.cameras.fisheye is not None:
+        raise ValueError(
+            "cameras: expected pinholes, found fisheyes, which the tracker does not follow; undistort the "
+            "pictures (`fisheye: undistort`, the default of the readers)"
+        )
+
+
 def shape_of(frame: Frame) -> FrameShape:
     """The shape of a frame."""
     return FrameShape(len(frame.images), frame.cameras.width, frame.cameras.height, frame.cameras.near)

@@ -9,7 +9,7 @@ import numpy as np
 from gsjax.losses.extra import ExtraLosses, named_losses
 from gsjax.methods.track.budget import Chosen
 from gsjax.methods.track.config import TrackConfig
-from gsjax.methods.track.frames import FrameShape, prepared, shape_of
+from gsjax.methods.track.frames import FrameShape, expect_pinholes, prepared, shape_of
 from gsjax.methods.track.grow import with_slots
 from gsjax.methods.track.motion import first_pose
 from gsjax.methods.track.plan import plan_tracker
@@ -71,7 +71,11 @@ class Track:
             params: the scene and the pose.
             frame: of all cameras.
             like: see `start`; a plan that is too small for this scene grows in the first update.
+
+        Raises:
+            ValueError: the cameras are fisheyes.
         """
+        expect_pinholes(frame)
         if like is None:
             plan = plan_tracker(params.scene, params.pose, frame, self.config)
         else:

@@ -13,6 +13,7 @@ from gsjax.geometry.cameras import camera_centers
 from gsjax.geometry.neighbors import voxel_thin
 from gsjax.geometry.rotations import quats_to_matrices
 from gsjax.methods.track.config import StartConfig
+from gsjax.methods.track.frames import expect_pinholes
 from gsjax.scene.frame import Frame
 from gsjax.scene.gaussians import Gaussians, concatenate, take
 from gsjax.scene.initialize import estimate_normals, gaussians_from_points, points_from_rgbd, valid_depth
@@ -74,9 +75,10 @@ def labelled_cloud(
     that it saw to near neighbours.
 
     Raises:
-        ValueError: the frame has no depth or no valid depth, the mask is missing or has another size, or the
-            camera does not exist.
+        ValueError: the frame has no depth or no valid depth, the mask is missing or has another size, the
+            camera does not exist, or cameras are fisheyes.
     """
+    expect_pinholes(frame)
     if frame.depths is None:
         raise ValueError(
             "depths: expected those of the first frame, found None; without depth cameras, give models of "
@@ -175,9 +177,11 @@ def assemble(
     Raises:
         ValueError: there is no object.
     """
-    gaussians, group = concatenate(parts), np.concatenate(labels)
     if len(label_ids) == 1:
-        raise ValueError("mask: expected an object, found none, or none that has depth")
+        raise ValueError(
+            "expected an object to track, found none: none in the mask has depth, or no shape a label"
+        )
+    gaussians, group = concatenate(parts), np.concatenate(labels)
     order = np.argsort(group == 0, kind="stable")
     num_moving = int((group != 0).sum())
     normals = np.zeros((num_moving, 3), np.float32)

@@ -26,13 +26,14 @@ from gsjax.geometry.spherical_harmonics import rgb_to_sh0
 from gsjax.methods.track.align import bilinear, pixel_position
 from gsjax.methods.track.config import TrackConfig
 from gsjax.methods.track.first_fit import fit_scene
+from gsjax.methods.track.frames import expect_pinholes
 from gsjax.methods.track.layers import render_labels
 from gsjax.methods.track.motion import Motion, first_pose, move, place
 from gsjax.methods.track.refine import RefineBatch, refine
 from gsjax.methods.track.scene import TrackedScene, assemble
 from gsjax.optim.compiler import host_options
 from gsjax.rasterize.plan import with_room
-from gsjax.scene.frame import Frame
+from gsjax.scene.frame import Frame, without_broken
 from gsjax.scene.gaussians import Gaussians, gaussians_from_activated
 from gsjax.scene.region import tiles_to_pixels, touched_tiles
 from gsjax.scene.render import plan_render
@@ -105,10 +106,17 @@ def scene_from_shapes(
         config: see `TrackConfig`.
 
     Raises:
-        ValueError: there is no object, or an object has neither a pose nor a plane to rest on.
+        ValueError: there is no object, an object has neither a pose nor a plane to rest on, a background has
+            no pose, or cameras are fisheyes.
     """
     config = TrackConfig() if config is None else config
+    expect_pinholes(frame)
+    frame, _ = without_broken(frame)
     background = [s for s in shapes if not s.label]
+    if any(s.pose is None for s in background):
+        raise ValueError(
+            "shapes: expected a pose of each shape of label 0, the background, found one without"
+        )
     extent = np.concatenate([_placed(s, s.pose).means for s in background]) if background else None
     parts, labels, label_ids = [], [], [0]
     for shape in shapes:
@@ -161,7 +169,8 @@ def find_pose(shape: Shape, frame: Frame, extent: np.ndarray | None) -> Float[np
         standing = shape.means @ base.as_matrix().T
         lift = -offset - np.quantile(standing @ normal, 0.02)
         center = standing.mean(0)
-        x, y = np.meshgrid(np.arange(low[0], high[0], _GRID_STEP), np.arange(low[1], high[1], _GRID_STEP))
+        ends = np.maximum(high, low + _GRID_STEP)  # at least one place, on a background of one Gaussian too
+        x, y = np.meshgrid(np.arange(low[0], ends[0], _GRID_STEP), np.arange(low[1], ends[1], _GRID_STEP))
         places = np.stack([x.ravel(), y.ravel()], axis=-1)
         headings = np.linspace(0, 2 * np.pi, _HEADINGS, endpoint=False)
         step, turn = _GRID_STEP, headings[1]

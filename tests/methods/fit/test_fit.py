@@ -292,6 +292,14 @@ def test_starts_that_the_data_does_not_have_are_refused(views):
     assert start_points(views, cloud, StartConfig(), 0)[2] == "cloud"
 
 
+def test_a_start_at_random_has_the_colours_of_bytes_and_of_floats(views):
+    config = StartConfig(source="random", count=50)
+    floats = [replace(frame, images=frame.colors) for frame in views]
+    colors = [start_points(frames, None, config, 0)[1] for frames in (views, floats)]
+    np.testing.assert_allclose(*colors, atol=1e-6)
+    assert colors[0].max() > 0.1
+
+
 def test_points_that_no_photograph_shows_are_no_start(views):
     random = np.random.default_rng(0)
     points, colors = random.uniform(-0.5, 0.5, (50, 3)), np.full((50, 3), 0.5)

@@ -101,6 +101,11 @@ def test_custom_losses_are_told_the_frame_the_camera_and_the_progress(sequence, 
     np.testing.assert_allclose([one["done"] for one in told], np.concatenate(steps), atol=1e-6)
 
 
+def test_a_camera_to_hold_out_that_is_not_there_is_named(sequence):
+    with pytest.raises(ValueError, match=r"eval_cameras: expected ids of cameras, \[5, 6, 7\], found 9"):
+        parts(sequence, CONFIG, eval_cameras=[9])
+
+
 @pytest.mark.thorough
 def test_gaussians_need_their_frame_named(boxes, sequence):
     with pytest.raises(ValueError, match="anchor: expected the frame that the given Gaussians show"):

@@ -1,6 +1,6 @@
 """Known shapes are found on their plane and coloured; a scene without depth starts so."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from gsjax.geometry.cameras import Camera, intrinsics, look_at
-from gsjax.methods.track import scene_from_shapes
+from gsjax.methods.track import StartConfig, TrackConfig, scene_from_shapes, start_scene
 from gsjax.methods.track.shapes import Shape, find_pose
 from gsjax.scene.frame import Frame
 from gsjax.scene.gaussians import concatenate, gaussians_from_activated
@@ -130,3 +130,34 @@ def test_a_shape_with_nothing_to_rest_on_is_told(frame):
         scene_from_shapes([ground(), block()], frame)
     with pytest.raises(ValueError, match="'block': expected a pose"):
         scene_from_shapes([block(plane=np.array([0, 0, 1.0, 0]))], frame)
+
+
+def test_what_cannot_be_placed_is_told(frame):
+    standing = {"plane": np.array([0, 0, 1.0, 0])}
+    with pytest.raises(ValueError, match="expected an object to track, found none"):
+        scene_from_shapes([], frame)
+    with pytest.raises(ValueError, match="expected a pose of each shape of label 0"):
+        scene_from_shapes([replace(ground(), pose=None), block(**standing)], frame)
+    bent = eqx.tree_at(
+        lambda f: f.cameras.fisheye, frame, jnp.zeros((2, 4)), is_leaf=lambda leaf: leaf is None
+    )
+    with pytest.raises(ValueError, match="cameras: expected pinholes, found fisheyes"):
+        scene_from_shapes([ground(), block(**standing)], bent)
+    with pytest.raises(ValueError, match="cameras: expected pinholes, found fisheyes"):
+        start_scene(bent, np.ones((96, 128), np.int32), 0)
+
+
+@pytest.mark.thorough
+def test_a_background_of_one_gaussian_is_a_place(frame):
+    pose = find_pose(block(plane=np.array([0, 0, 1.0, 0])), frame, np.zeros((1, 3)))
+    assert np.isfinite(pose).all()
+
+
+@pytest.mark.thorough
+def test_pictures_in_bytes_are_pictures(frame):
+    shapes = [ground(), replace(block(), pose=TRUE_POSE)]
+    config = TrackConfig(start=StartConfig(iterations=0))
+    images = np.round(np.clip(np.asarray(frame.images), 0, 1) * 255).astype(np.uint8)
+    in_bytes = replace(frame, images=images)
+    scenes = [scene_from_shapes(shapes, one, config).gaussians.sh0 for one in (frame, in_bytes)]
+    np.testing.assert_allclose(*scenes, atol=0.01)

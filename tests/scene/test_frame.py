@@ -1,0 +1,36 @@
+"""Frames of bytes and of floats are the same to all that takes a frame."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from gsjax.geometry.cameras import Camera
+from gsjax.scene.frame import Frame, part_of, without_broken
+
+
+def frame_of(images: np.ndarray) -> Frame:
+    return Frame(images, None, Camera(np.eye(4)[None], np.eye(3)[None], images.shape[2], images.shape[1]))
+
+
+@pytest.fixture
+def images():
+    return np.random.default_rng(0).integers(256, size=(1, 6, 8, 3)).astype(np.uint8)
+
+
+@pytest.mark.parametrize("shrink", [1, 2])
+def test_smaller_pictures_of_bytes_are_those_of_floats(images, shrink):
+    whole = frame_of(images.astype(np.float32) / 255)
+    found = part_of(frame_of(images), (), shrink).colors
+    np.testing.assert_allclose(found, part_of(whole, (), shrink).colors, atol=1e-6)
+    assert found.max() <= 1
+
+
+def test_bytes_are_never_broken_and_floats_may_be(images):
+    found, count = without_broken(frame_of(images))
+    np.testing.assert_allclose(found.images, images / 255, atol=1e-6)
+    assert count == 0
+    poisoned = images.astype(np.float32) / 255
+    poisoned[0, 2, 3, 1] = np.nan
+    found, count = without_broken(frame_of(jnp.asarray(poisoned)))
+    assert count == 1
+    np.testing.assert_array_equal(found.images[0, 2, 3], 0)
