@@ -226,8 +226,9 @@ def _going_on(after: Tick, method: Method, begun: Run | None = None) -> Run:
     held = run.params, run.state
     if any(leaf.is_deleted() for leaf in jax.tree.leaves(held) if isinstance(leaf, jax.Array)):
         raise ValueError("after: expected a tick whose loop has taken no further step, found an earlier one")
-    for name, setting in _TRAINED.items() if begun is not None else ():
-        had, has = (getattr(one, name, None) is not None for one in (run.params, begun.params))
+    would = run.params if begun is None else begun.params
+    for name, setting in _TRAINED.items():
+        had, has = (getattr(one, name, None) is not None for one in (run.params, would))
         if had != has:
             raise ValueError(
                 f"after: expected a run with {setting}={has}, as in the config, found one with "
