@@ -26,7 +26,12 @@ def _expect(name: str, array, want: tuple, meaning: str) -> None:
 
 
 def check_tile(means2d, conics, opacities, values, pixels) -> None:
-    """Raises a ValueError that names the argument of `composite_tile` whose shape is wrong."""
+    """Raises a ValueError that names the argument of `gsjax.composite_tile` whose shape is wrong.
+
+    Args:
+        means2d, conics, opacities, values: the fields of its `Splats`, [L, ...].
+        pixels: positions [P, 2].
+    """
     length = len(values) if jnp.ndim(values) else None
     _expect("splats.values", values, (length, None), "a row per Gaussian")
     _expect("splats.means2d", means2d, (length, 2), "the centre of each Gaussian")
