@@ -17,6 +17,7 @@ mean of the features of the pixels that show it, as in Occam's LGS (Cheng et al.
 al. 2024). The second pass gives the residual, and each further one an iteration.
 """
 
+from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -281,25 +282,26 @@ def _ids(batch: Batch, first, high: int) -> Int[Array, "high width"]:
 
 def _after_pass(field: FeatureField, state: SolveState, batch: SolveBatch, config: DistillConfig):
     """The field and the state after the last view of a pass."""
-    branches = (_voted,) if state.conjugate is None else (_voted, _begun, _advanced)
+    branches = [partial(_voted, smoothness=config.solve.smoothness)]
+    branches += [] if state.conjugate is None else [_begun, _advanced]
     turn = jnp.clip(jnp.asarray(batch.turn), 0, len(branches) - 1)
     given = field, state, batch.neighbors
-    field, state = jax.lax.switch(turn, [lambda f=f: f(*given, config) for f in branches])
+    field, state = jax.lax.switch(turn, [lambda f=f: f(*given) for f in branches])
     return field, state._replace(total=jnp.zeros_like(state.total))
 
 
-def _voted(field: FeatureField, state: SolveState, neighbors, config: DistillConfig):
+def _voted(field: FeatureField, state: SolveState, neighbors, smoothness: float):
     """After the vote: it is the first guess, and what no pixel shows has the mean of its neighbours. What
     pixels show that have no teacher has nothing: it lies beside things, but is none of them."""
     seen = state.mass > _LEAST
     votes = jnp.where(seen[:, None], state.total / jnp.maximum(state.mass, _LEAST)[:, None], 0.0)
-    tie = config.solve.smoothness * state.mass.sum() / jnp.maximum(seen.sum(), 1)
+    tie = smoothness * state.mass.sum() / jnp.maximum(seen.sum(), 1)
     found = _spread(votes, seen | _untold(state), neighbors)
     field = eqx.tree_at(lambda f: f.encoding, field, _without_untold(found, state))
     return field, state._replace(wanted=state.total, tie=tie)
 
 
-def _begun(field: FeatureField, state: SolveState, neighbors, config: DistillConfig):
+def _begun(field: FeatureField, state: SolveState, neighbors):
     """After the product with the first guess: the residual, along which the first iteration goes."""
     x = field.encoding
     residual = state.wanted - state.total - state.tie * _laplacian(x, neighbors)
@@ -308,7 +310,7 @@ def _begun(field: FeatureField, state: SolveState, neighbors, config: DistillCon
     return field, state._replace(conjugate=first, loss=_objective(x, residual, state))
 
 
-def _advanced(field: FeatureField, state: SolveState, neighbors, config: DistillConfig):
+def _advanced(field: FeatureField, state: SolveState, neighbors):
     """After the product with a direction: an iteration of conjugate gradients."""
     assert state.conjugate is not None
     product = state.total + state.tie * _laplacian(state.conjugate.direction, neighbors)
