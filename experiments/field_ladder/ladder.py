@@ -159,6 +159,7 @@ def figure(rows: list[dict[str, Any]], path: Path) -> None:
             axes.axvline(x, color="0.9", lw=0.8, zorder=0)
             axes.annotate(preset, (x, 1.0), xycoords=("data", "axes fraction"), fontsize=8, rotation=45)
         axes.set(xscale="log", xlabel="seconds")
+        axes.xaxis.set_minor_formatter("")
         axes.set_title(scene, fontsize=9, pad=28)
         axes.grid(alpha=0.3, axis="y")
     panels[0].legend(fontsize=8)
