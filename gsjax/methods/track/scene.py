@@ -178,9 +178,7 @@ def assemble(
         ValueError: there is no object.
     """
     if len(label_ids) == 1:
-        raise ValueError(
-            "expected an object to track, found none: none in the mask has depth, or no shape a label"
-        )
+        raise ValueError("mask: expected an object, found none, or none that has depth")
     gaussians, group = concatenate(parts), np.concatenate(labels)
     order = np.argsort(group == 0, kind="stable")
     num_moving = int((group != 0).sum())

@@ -113,6 +113,8 @@ def scene_from_shapes(
     expect_pinholes(frame)
     frame, _ = without_broken(frame)
     background = [s for s in shapes if not s.label]
+    if len(background) == len(shapes):
+        raise ValueError("shapes: expected an object, a shape with a label above 0, found none")
     if any(s.pose is None for s in background):
         raise ValueError(
             "shapes: expected a pose of each shape of label 0, the background, found one without"

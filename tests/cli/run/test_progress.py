@@ -74,9 +74,10 @@ def test_a_log_says_when_a_later_step_compiles(tmp_path):
 
 def test_a_loss_that_is_lost_is_mended_counted_and_told(tmp_path):
     method = Descent(DescentConfig(steep_after=430))
-    schedule = Schedule("descending", 1000, means_of(), lambda row: f"loss {row['loss']:.1f}")
+    schedule = Schedule("descending", 1000, means_of(), lambda row: f"loss {row['loss']}")  # None where lost
     ticks = drive(method, *method.start())
     progress = watch(ticks, Progress(), schedule, RunFolder(tmp_path / "run"), Console(quiet=True))
+    assert progress.stopped is None
     assert progress.returns == ticks.run.guard.returns >= 1
     assert progress.found(1000, 0.0)["returns"] == progress.returns
     assert progress.found(1000, 0.0)["settled"] == ticks.run.guard.is_settled

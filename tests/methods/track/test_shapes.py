@@ -134,7 +134,7 @@ def test_a_shape_with_nothing_to_rest_on_is_told(frame):
 
 def test_what_cannot_be_placed_is_told(frame):
     standing = {"plane": np.array([0, 0, 1.0, 0])}
-    with pytest.raises(ValueError, match="expected an object to track, found none"):
+    with pytest.raises(ValueError, match="shapes: expected an object, a shape with a label above 0"):
         scene_from_shapes([], frame)
     with pytest.raises(ValueError, match="expected a pose of each shape of label 0"):
         scene_from_shapes([replace(ground(), pose=None), block(**standing)], frame)
