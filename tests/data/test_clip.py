@@ -79,6 +79,14 @@ def test_frames_with_masks(folder):
     np.testing.assert_array_equal(black.mask(0, 0), sequence.mask(0, 0))
 
 
+def test_frames_may_be_called_as_the_parts_of_another_layout(tmp_path):
+    """7-Scenes has folders seq-01, seq-02."""
+    for t in range(FRAMES):
+        dots.save(tmp_path / f"seq-{t:02d}.png", grey(t))
+    write_masks(tmp_path / "tools")
+    assert open_sequence(tmp_path, ReadOptions(K=K, masks="tools")).num_frames == FRAMES
+
+
 def test_frames_in_the_folder_itself(folder):
     for path in (folder / "images").iterdir():
         path.rename(folder / path.name)
