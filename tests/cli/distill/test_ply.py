@@ -130,7 +130,7 @@ def test_what_was_distilled_can_be_asked(gsjax, field, pristine):
 
 @pytest.mark.slow
 def test_resumed_it_is_the_same_field(gsjax, interrupted, pristine, scene, distilled, tmp_path):
-    steps = ("--distill.iterations", STEPS, *TABLE)
+    steps = ("--preset", "paper", "--distill.iterations", STEPS, *TABLE)
     told = ("distill", scene, "--out", tmp_path / "again", *images(pristine), *SMALL, *steps)
     with interrupted(105):  # between two rows
         code, said = gsjax(*told)

@@ -148,7 +148,7 @@ def test_a_run_that_was_stopped_goes_on_to_the_same_bits(gsjax_parts, tmp_path, 
     resumed("stopped")
 
     _, said = stopped_after(3 * 30 + 1, "late")
-    assert "refined by 1 of 5 steps, and then stopped by Ctrl-C" in said
+    assert "refined for 1 of 5 steps, then stopped by Ctrl-C" in said
     resumed("late")
 
 
