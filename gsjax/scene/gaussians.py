@@ -151,8 +151,8 @@ def gaussians_from_activated(
     wanted = {"means": 3, "quats": 4, "scales": 3, "opacities": None, "colors": 3}
     arrays = dict(zip(wanted, (means, quats, scales, opacities, colors), strict=True))
     arrays = {name: _on_device(value, dtype) for name, value in arrays.items()}
-    if np.issubdtype(np.asarray(colors).dtype, np.integer):
-        raise ValueError(f"colors: expected RGB from 0 to 1, found {np.asarray(colors).dtype}; divide by 255")
+    if getattr(colors, "dtype", None) == np.uint8:
+        raise ValueError("colors: expected RGB from 0 to 1, found uint8; divide by 255")
     for name, columns in wanted.items():
         _check_array(name, arrays[name], (count,) if columns is None else (count, columns))
     extra = {"shN": shN, "features": features}

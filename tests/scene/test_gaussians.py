@@ -132,6 +132,14 @@ def test_take_by_index_and_by_mask():
             take(gaussians, wrong)
 
 
+def test_colors_may_be_whole_numbers_and_traced():
+    values = activated()
+    values["colors"] = np.eye(5, 3, dtype=int)
+    expected = gaussians_from_activated(**values).sh0
+    traced = jax.jit(lambda colors: gaussians_from_activated(**values | {"colors": colors}).sh0)
+    np.testing.assert_allclose(traced(jnp.asarray(values["colors"], jnp.float32)), expected, atol=1e-6)
+
+
 def test_colors_in_bytes_are_refused():
     with pytest.raises(ValueError, match="colors: expected RGB from 0 to 1, found uint8; divide by 255"):
         gaussians_from_activated(**activated() | {"colors": np.full((5, 3), 255, np.uint8)})

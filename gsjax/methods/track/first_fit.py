@@ -13,13 +13,14 @@ import numpy as np
 from gsjax.geometry.neighbors import on_surfaces
 from gsjax.losses.photometric import photometric_loss, truncated_l1
 from gsjax.methods.track.config import TrackConfig
+from gsjax.methods.track.frames import first_seen
 from gsjax.methods.track.lost import MIN_POINTS
 from gsjax.methods.track.scene import TrackedScene, labelled_cloud, scene_from_cloud
 from gsjax.optim.compiler import host_options
 from gsjax.optim.step import gradient_step, per_field_adam
 from gsjax.optim.traces import jit_once
 from gsjax.rasterize.plan import with_room
-from gsjax.scene.frame import Frame, without_broken
+from gsjax.scene.frame import Frame
 from gsjax.scene.render import plan_render, render
 
 # Depth has measured the means, so they hardly move; the other fields learn to blend into the images.
@@ -48,12 +49,10 @@ def start_scene(
             on shapes, such as a program, can then be made meanwhile.
 
     Raises:
-        ValueError: there is no depth, or the mask does not fit the images.
+        ValueError: there is no depth, the mask does not fit the images, or cameras are fisheyes.
     """
     config = TrackConfig() if config is None else config
-    frame, broken = without_broken(eqx.tree_at(lambda f: f.images, frame, frame.colors))
-    if broken:
-        warnings.warn(f"the first frame has {broken} pixels that are not finite; ignored", stacklevel=2)
+    frame = first_seen(frame)
     if frame.depths is not None:
         frame = eqx.tree_at(lambda f: f.depths, frame, jnp.asarray(_surfaces(np.asarray(frame.depths))))
     scene = scene_from_cloud(labelled_cloud(frame, mask, mask_camera, config.start), config.start)

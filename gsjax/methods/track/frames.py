@@ -1,9 +1,9 @@
 """Preparation of frames: only the tracked cameras, reduced in size, without pixels that are not finite."""
 
+import warnings
 from dataclasses import dataclass
 from functools import partial
 
-import equinox as eqx
 import jax
 from jaxtyping import Array, Int
 
@@ -32,9 +32,23 @@ def expect_pinholes(frame: Frame) -> None:
     """Raises a ValueError where the frame's cameras are fisheyes, whose pixels the tracker cannot match."""
     if frame.cameras.fisheye is not None:
         raise ValueError(
-            "cameras: expected pinholes, found fisheyes, which the tracker does not follow; undistort the "
-            "pictures (`fisheye: undistort`, the default of the readers)"
+            "cameras: expected pinholes, found fisheyes, which the tracker cannot follow; undistort the "
+            "pictures first"
         )
+
+
+def first_seen(frame: Frame) -> Frame:
+    """The first frame, from which a scene starts: in floats, and without pixels that are not finite, which a
+    warning counts. On the host.
+
+    Raises:
+        ValueError: the cameras are fisheyes.
+    """
+    expect_pinholes(frame)
+    frame, broken = without_broken(frame)
+    if broken:
+        warnings.warn(f"the first frame has {broken} pixels that are not finite; ignored", stacklevel=3)
+    return frame
 
 
 def shape_of(frame: Frame) -> FrameShape:
@@ -50,5 +64,4 @@ def prepared(frame: Frame, config: TrackConfig) -> tuple[Frame, Int[Array, ""]]:
     Raises:
         ValueError: a camera does not exist, or nothing is left of the images.
     """
-    frame = eqx.tree_at(lambda f: f.images, frame, frame.colors)
     return without_broken(part_of(frame, config.cameras, config.shrink))

@@ -13,7 +13,6 @@ from gsjax.geometry.cameras import camera_centers
 from gsjax.geometry.neighbors import voxel_thin
 from gsjax.geometry.rotations import quats_to_matrices
 from gsjax.methods.track.config import StartConfig
-from gsjax.methods.track.frames import expect_pinholes
 from gsjax.scene.frame import Frame
 from gsjax.scene.gaussians import Gaussians, concatenate, take
 from gsjax.scene.initialize import estimate_normals, gaussians_from_points, points_from_rgbd, valid_depth
@@ -75,10 +74,9 @@ def labelled_cloud(
     that it saw to near neighbours.
 
     Raises:
-        ValueError: the frame has no depth or no valid depth, the mask is missing or has another size, the
-            camera does not exist, or cameras are fisheyes.
+        ValueError: the frame has no depth or no valid depth, the mask is missing or has another size, or the
+            camera does not exist.
     """
-    expect_pinholes(frame)
     if frame.depths is None:
         raise ValueError(
             "depths: expected those of the first frame, found None; without depth cameras, give models of "

@@ -26,14 +26,14 @@ from gsjax.geometry.spherical_harmonics import rgb_to_sh0
 from gsjax.methods.track.align import bilinear, pixel_position
 from gsjax.methods.track.config import TrackConfig
 from gsjax.methods.track.first_fit import fit_scene
-from gsjax.methods.track.frames import expect_pinholes
+from gsjax.methods.track.frames import first_seen
 from gsjax.methods.track.layers import render_labels
 from gsjax.methods.track.motion import Motion, first_pose, move, place
 from gsjax.methods.track.refine import RefineBatch, refine
 from gsjax.methods.track.scene import TrackedScene, assemble
 from gsjax.optim.compiler import host_options
 from gsjax.rasterize.plan import with_room
-from gsjax.scene.frame import Frame, without_broken
+from gsjax.scene.frame import Frame
 from gsjax.scene.gaussians import Gaussians, gaussians_from_activated
 from gsjax.scene.region import tiles_to_pixels, touched_tiles
 from gsjax.scene.render import plan_render
@@ -110,8 +110,7 @@ def scene_from_shapes(
             no pose, or cameras are fisheyes.
     """
     config = TrackConfig() if config is None else config
-    expect_pinholes(frame)
-    frame, _ = without_broken(frame)
+    frame = first_seen(frame)
     background = [s for s in shapes if not s.label]
     if len(background) == len(shapes):
         raise ValueError("shapes: expected an object, a shape with a label above 0, found none")
