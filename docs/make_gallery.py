@@ -22,7 +22,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator
 from PIL import Image
 
-from gsjax.engine.folder import RunFolder
+from gsjax.engine.folder import is_finished
 from gsjax.io.video import read_video_frames
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -77,7 +77,7 @@ def made(folder: Path, command: str) -> bool:
     if command.startswith("edit"):
         file = folder / "metrics.json"
         return file.is_file() and json.loads(file.read_text(encoding="utf-8"))["complete"]
-    return RunFolder(folder, overwrite=True).finished
+    return is_finished(folder)
 
 
 def pictures() -> dict[str, np.ndarray]:

@@ -2,7 +2,7 @@
 advice of error messages if a file is not as it was written."""
 
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
@@ -44,17 +44,31 @@ def read_arrays(file: Path, wanted: Sequence[str], again: str) -> dict[str, np.n
         raise ValueError(
             f"{file}: expected plain arrays, found a file that cannot be read; {again}"
         ) from error
+    expect_arrays(file, arrays, wanted, again)
+    return arrays
+
+
+def expect_arrays(file: Path, arrays: Mapping[str, np.ndarray], wanted: Iterable[str], again: str) -> None:
+    """Check that a file has arrays of these names.
+
+    Args:
+        file: their file, for the error.
+        arrays: those that it has, by name.
+        wanted, again: as for `read_arrays`.
+
+    Raises:
+        ValueError: one is missing.
+    """
     missing = [name for name in wanted if name not in arrays]
     if missing:
         found = brief(", ".join(arrays)) or "an array without a name"  # which is what an .npy file holds
         raise ValueError(f"{file}: expected an array {missing[0]}, found {found}; {again}")
-    return arrays
 
 
 def check_arrays(
     file: Path, arrays: Mapping[str, np.ndarray], shapes: Mapping[str, Sequence[str | int]], again: str
 ) -> dict[str, int]:
-    """Check that arrays of a file hold finite numbers and have matching shapes.
+    """Check that arrays of a file are there, hold finite numbers and have matching shapes.
 
     Args:
         file: their file, for the error.
@@ -66,8 +80,9 @@ def check_arrays(
         The size of each letter.
 
     Raises:
-        ValueError: an array has another shape, holds no numbers, or is not finite everywhere.
+        ValueError: an array is missing, has another shape, holds no numbers, or is not finite everywhere.
     """
+    expect_arrays(file, arrays, shapes, again)
     sizes: dict[str, int] = {}
     for name, shape in shapes.items():
         array = arrays[name]

@@ -217,7 +217,7 @@ class RunFolder:
                 f"{self.path}: expected a new folder, an empty one or one of a run (whose config.yml begins "
                 f"with {SIGNATURE!r}), found other files; name another folder"
             )
-        if self.finished and not overwrite:
+        if is_finished(self.path) and not overwrite:
             nothing = ", of which nothing is left to resume" if resume else ""
             raise FileExistsError(
                 f"{self.path}: holds a finished run{nothing}; name another folder, or replace it with "
@@ -231,11 +231,6 @@ class RunFolder:
                 f"{self.path}: holds an unfinished run; {advice}replace it with --overwrite"
             )
         self._stale = not resume
-
-    @property
-    def finished(self) -> bool:
-        """Whether a run that was not stopped has written everything: its report comes last."""
-        return is_finished(self.path)
 
     def forget_resume(self) -> None:
         """Remove what only an unfinished run needs."""
@@ -278,13 +273,13 @@ class RunFolder:
 
     def setting(self, name: str) -> Any:
         """A setting of config.yml."""
-        return _flat(read_values(self.config, parse_yaml)).get(name)
+        return flattened(read_values(self.config, parse_yaml)).get(name)
 
     def check_config(self, config: Any, *, but: tuple[str, ...]) -> None:
         """Raises ValueError if config.yml differs from `config` in settings other than `but`, or those that
         an earlier version did not have."""
-        stored = _flat(read_values(self.config, parse_yaml))
-        given = _flat(plain(dataclasses.asdict(config)))
+        stored = flattened(read_values(self.config, parse_yaml))
+        given = flattened(plain(dataclasses.asdict(config)))
         names = [name for name in stored if name.split(".")[0] not in but]
         others = [name for name in names if stored[name] != given.get(name)]
         if others:
@@ -303,8 +298,11 @@ class RunFolder:
         write_npz(self.path / "trajectory.npz", arrays)
 
 
-def fresh_folder(path: Path, written: Sequence[str]) -> Path:
-    """An empty folder; what gsjax left there earlier is removed.
+@contextmanager
+def replaced_folder(path: Path, written: Sequence[str]) -> Iterator[Path]:
+    """A new folder to write into, which replaces what gsjax left at `path` earlier when the block succeeds.
+    Until then, and after an exception (Ctrl-C too), the earlier folder stays as it was. Meanwhile no other
+    process may write a folder of that name, or replace the run that it is in.
 
     Args:
         path: the folder.
@@ -312,24 +310,7 @@ def fresh_folder(path: Path, written: Sequence[str]) -> Path:
 
     Raises:
         FileExistsError: something else is there; nothing of it is touched.
-    """
-    path = expect_ours(path, written)
-    if path.exists():
-        shutil.rmtree(path)
-    path.mkdir(parents=True)
-    return path
-
-
-@contextmanager
-def replaced_folder(path: Path, written: Sequence[str]) -> Iterator[Path]:
-    """A new folder to write into, which replaces what gsjax left at `path` earlier when the block succeeds.
-    Until then, and after an exception (Ctrl-C too), the earlier folder stays as it was. Meanwhile no other
-    process may write a folder of that name, or replace the run that it is in.
-
-    Args, raises: as `fresh_folder`.
-
-    Raises:
-        BlockingIOError: another process does.
+        BlockingIOError: another process writes there.
     """
     path = expect_ours(path, written)
     with locked(path.parent, shared=True), locked(path.parent, path.name):
@@ -379,11 +360,11 @@ def holds_something(folder: Path) -> bool:
     return any(entry.name != LOCK for entry in folder.iterdir())
 
 
-def _flat(settings: Mapping[str, Any], within: str = "") -> dict[str, Any]:
+def flattened(settings: Mapping[str, Any], within: str = "") -> dict[str, Any]:
     """Nested settings by the names of their options on the command line: fit.start.count."""
     flat: dict[str, Any] = {}
     for name, value in settings.items():
-        flat |= _flat(value, f"{within}{name}.") if isinstance(value, Mapping) else {within + name: value}
+        flat |= flattened(value, f"{within}{name}.") if isinstance(value, Mapping) else {within + name: value}
     return flat
 
 

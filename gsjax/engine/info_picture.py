@@ -3,15 +3,14 @@
 from collections.abc import Mapping
 from pathlib import Path
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
 from gsjax.data import Photographs, Sequence
 from gsjax.engine.options import HeldOutFrames
 from gsjax.engine.photographs import split
-from gsjax.geometry.cameras import unproject
 from gsjax.io.atomic import atomic_write
+from gsjax.scene.initialize import points_from_rgbd
 
 _DEPTHS, _PIXELS = 12, 3000  # depth images from which points are made, if there are none, and points of each
 _MOST_COLORS = 8
@@ -80,14 +79,13 @@ def scene_points(
         depth = photographs.depth(i)
         if depth is None or not (depth > 0).any():
             continue
-        rows, columns = np.nonzero(depth)
-        some = random.choice(len(rows), min(_PIXELS, len(rows)), replace=False)
-        rows, columns = rows[some], columns[some]
-        pixels = np.stack([columns + 0.5, rows + 0.5], axis=-1).astype(np.float32)
-        camera = photographs.camera(i)
-        at, depths = jnp.asarray(pixels), jnp.asarray(depth[rows, columns])
-        points.append(np.asarray(unproject(at, depths, camera.viewmat, camera.K), float))
-        colors.append(photographs.image(i)[rows, columns] / 255)
+        fisheye = None if photographs.fisheye is None else photographs.fisheye[i]
+        seen = points_from_rgbd(
+            photographs.image(i), depth, photographs.viewmats[i], photographs.Ks[i], fisheye=fisheye
+        )
+        some = random.choice(len(seen[0]), min(_PIXELS, len(seen[0])), replace=False)
+        points.append(seen[0][some])
+        colors.append(seen[1][some])
     if not points:
         return None, None
     return np.concatenate(points), np.concatenate(colors)

@@ -142,17 +142,11 @@ class ObjectText:
 
 
 @dataclass(frozen=True)
-class OneDataset:
-    """The dataset."""
+class DatasetAndOut:
+    """The dataset, and the folder of the run."""
 
     dataset: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="DATASET")]
     """Folder of a recording or of photographs, or a built-in scene such as simulated:tabletop."""
-
-
-@dataclass(frozen=True)
-class DatasetAndOut(OneDataset):
-    """The dataset, and the folder of the run."""
-
     out: Path
     """Folder for the run: a new one, or that of an earlier run with --resume or --overwrite."""
 

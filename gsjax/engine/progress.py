@@ -273,8 +273,7 @@ def load_run(folder: Path, run: Run, progress: Progress) -> tuple[Run, Progress]
         ValueError: the checkpoint has other inputs.
     """
     wrong, damaged = None, []
-    # An earlier version saved to state.npz, which is refused rather than ignored.
-    for path in reversed(_saved(folder) or sorted(folder.glob("state.npz"))):
+    for path in reversed(_saved(folder)):
         try:
             found, stored = load_checkpoint(path)
         except CheckpointError as error:

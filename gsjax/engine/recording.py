@@ -8,6 +8,7 @@ from collections.abc import Sequence as Indices
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import cache
 from time import perf_counter
 from typing import Any, Generic, TypeVar
 
@@ -165,16 +166,7 @@ def remembered(sequence: Sequence) -> Sequence:
     """The same sequence, with what was loaded kept in memory: simulated pictures are slow to draw."""
 
     def kept(loader: Callable | None) -> Callable | None:
-        if loader is None:
-            return None
-        seen: dict[tuple[int, int], Any] = {}
-
-        def load(t: int, c: int) -> Any:
-            if (t, c) not in seen:
-                seen[t, c] = loader(t, c)
-            return seen[t, c]
-
-        return load
+        return None if loader is None else cache(loader)
 
     return replace(sequence, load_image=kept(sequence.load_image), load_depth=kept(sequence.load_depth))
 

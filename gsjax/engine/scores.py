@@ -104,18 +104,13 @@ def camera_metrics(scores: Scores) -> dict[str, Any]:
         str(camera): {"tracked": not found.held_out} | {name: found.mean(name) for name in CAMERA_SCORES}
         for camera, found in scores.cameras.items()
     }
-    kinds = {kind: _mean_of(cameras, tracked=kind == "tracked") for kind in ("tracked", "held_out")}
-    return {"cameras": cameras, **kinds}
-
-
-def _mean_of(cameras: dict[str, dict], tracked: bool) -> dict[str, float | None]:
-    """Each score's mean over the cameras of one kind."""
-    chosen = [found for found in cameras.values() if found["tracked"] == tracked]
-    means = {}
-    for name in CAMERA_SCORES:
-        there = [found[name] for found in chosen if found[name] is not None]
-        means[name] = float(np.mean(there)) if there else None
-    return means
+    tracked = [found for found in cameras.values() if found["tracked"]]
+    held_out = [found for found in cameras.values() if not found["tracked"]]
+    return {
+        "cameras": cameras,
+        "tracked": mean_scores(tracked, CAMERA_SCORES),
+        "held_out": mean_scores(held_out, CAMERA_SCORES),
+    }
 
 
 def camera_rows(found: dict[str, Any], seen: str = "tracked") -> list[dict[str, Any]]:

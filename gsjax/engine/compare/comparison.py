@@ -1,7 +1,7 @@
 """What several runs have in common and where they differ: the numbers behind `gsjax compare`."""
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from gsjax.engine.compare.data import SCORES, data_in_words, data_of
+from gsjax.engine.folder import flattened
 from gsjax.engine.machine import name as machine_name
 from gsjax.engine.records import Kind, Record
 from gsjax.engine.summary import Score, format_number
@@ -278,7 +279,7 @@ def _best(
 
 def _differing(records: Mapping[str, Record], notes: list[str]) -> dict[str, dict[str, Any]]:
     """Settings that all runs have, and not the same."""
-    flat = {label: dict(_flat(record.config)) for label, record in records.items()}
+    flat = {label: flattened(record.config) for label, record in records.items()}
     names = [n for n in dict.fromkeys(n for s in flat.values() for n in s) if n not in _NOT_COMPARED]
     lacking: dict[tuple[str, ...], list[str]] = {}
     for label, settings in flat.items():
@@ -291,11 +292,3 @@ def _differing(records: Mapping[str, Record], notes: list[str]) -> dict[str, dic
     shared = [name for name in names if all(name in settings for settings in flat.values())]
     found = {name: {label: settings[name] for label, settings in flat.items()} for name in shared}
     return {name: values for name, values in found.items() if len({*map(repr, values.values())}) > 1}
-
-
-def _flat(config: Mapping[str, Any], prefix: str = "") -> Iterable[tuple[str, Any]]:
-    for name, value in config.items():
-        if isinstance(value, dict):
-            yield from _flat(value, f"{prefix}{name}.")
-        else:
-            yield f"{prefix}{name}", value

@@ -1,5 +1,6 @@
 """The summary of a comparison: runs side by side, settings that differ, curves and pictures."""
 
+import shutil
 from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
@@ -7,7 +8,6 @@ from typing import Any
 
 from gsjax.engine.compare.comparison import Comparison, Group
 from gsjax.engine.compare.pictures import write_strip
-from gsjax.engine.folder import fresh_folder
 from gsjax.engine.messages import counted
 from gsjax.engine.summary import Card, Column, Media, Summary, Table
 from gsjax.viz.plots import fit_curves, save
@@ -58,8 +58,10 @@ def _draw(found: Comparison, out: Path) -> tuple[list[Media], list[Media]]:
     """Write the curves and the pictures of held-out views that the runs of a group have in common."""
     plots, strips = [], []
     out.mkdir(parents=True, exist_ok=True)
-    for name, written in FOLDERS.items():
-        fresh_folder(out / name, (written,))
+    for name in FOLDERS:
+        folder = (out / name).resolve()
+        shutil.rmtree(folder, ignore_errors=True)
+        folder.mkdir()
     for i, group in enumerate(found.groups):
         prefix = f"{group.dataset}: " if len(found.groups) > 1 else ""
         if not group.views:

@@ -1,6 +1,5 @@
 """field.npz: a feature field in a file of its own, beside its scene; see `DistillResult.write`."""
 
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -49,7 +48,7 @@ def read_field(path: Path) -> DistillResult:
             f"{len(arrays['lift'])} in all; {_AGAIN}"
         )
     if config is None:
-        _check(path, arrays, {"lift": ("d", "c"), "vectors": ("n", "c")})
+        check_arrays(path, arrays, {"lift": ("d", "c"), "vectors": ("n", "c")}, _AGAIN)
         return DistillResult(_field(arrays["vectors"], arrays["lift"]), None, source, scene)
     widths = [config.levels * config.features, *[config.hidden] * config.depth]
     shapes: dict[str, tuple[str | int, ...]] = {
@@ -60,7 +59,7 @@ def read_field(path: Path) -> DistillResult:
     }
     for i, (before, after) in enumerate(zip(widths, [*widths[1:], "c"], strict=True)):
         shapes |= {f"weight_{i}": (after, before), f"bias_{i}": (after,)}
-    _check(path, arrays, shapes)
+    check_arrays(path, arrays, shapes, _AGAIN)
     rows, entries = arrays["rows"], sum(config.entries)
     if not (np.diff(rows) > 0).all() or not 0 <= rows[0] <= rows[-1] < entries:
         raise ValueError(
@@ -73,15 +72,6 @@ def read_field(path: Path) -> DistillResult:
         tuple(tuple(side) for side in arrays["bounds"].tolist()),
     )
     return DistillResult(_field(grid, arrays["lift"]), rows, source, scene)
-
-
-def _check(path: Path, arrays: Mapping[str, np.ndarray], shapes: Mapping[str, tuple[str | int, ...]]) -> None:
-    missing = [name for name in shapes if name not in arrays]
-    if missing:
-        raise ValueError(
-            f"{path}: expected an array {missing[0]}, found {brief(', '.join(arrays))}; {_AGAIN}"
-        )
-    check_arrays(path, arrays, shapes, _AGAIN)
 
 
 def _field(encoding: Any, lift: np.ndarray) -> FeatureField:

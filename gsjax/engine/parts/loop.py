@@ -11,8 +11,7 @@ from rich.console import Console
 from gsjax.engine.drive import Tick, drive
 from gsjax.engine.folder import RunFolder
 from gsjax.engine.messages import Notes, counted, reason, stage
-from gsjax.engine.progress import Progress, Schedule, load_run, means_of, warn_of_returns, watch
-from gsjax.io.checkpoints import load_checkpoint
+from gsjax.engine.progress import Progress, Schedule, means_of, warn_of_returns, watch
 from gsjax.methods.parts import Discovery, Parts, Problem, RefineParams
 from gsjax.optim.method import Run
 
@@ -113,23 +112,6 @@ class Loop:
             watch(ticks, self.progress, schedule, self.folder, self.console)
         finally:
             self.run = ticks.run
-
-
-def resumed(folder: RunFolder, run: Run, progress: Progress) -> tuple[Run, Progress]:
-    """The newest saved run and its progress; the given ones if none was saved.
-
-    Args:
-        folder: of the run.
-        run, progress: those before the first step.
-
-    Raises:
-        CheckpointError: all are damaged, or of an earlier version of gsjax.
-        ValueError: the run has another canonical scene.
-    """
-    earlier = folder.resume / "parts.npz"  # of versions up to 0.1
-    if earlier.is_file():
-        load_checkpoint(earlier)
-    return load_run(folder.resume, run, progress)
 
 
 def update_seconds(progress: Progress) -> list[float]:

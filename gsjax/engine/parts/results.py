@@ -5,7 +5,7 @@ from collections.abc import Callable
 
 from gsjax.engine.folder import RunFolder
 from gsjax.engine.messages import counted
-from gsjax.engine.scores import CAMERA_COLUMNS, CAMERA_NOTE, camera_rows
+from gsjax.engine.scores import CAMERA_COLUMNS, CAMERA_NOTE, camera_rows, mean_scores
 from gsjax.engine.summary import (
     Column,
     Media,
@@ -22,11 +22,7 @@ from gsjax.viz.colors import label_color
 
 
 def _mean_of_parts(key: str) -> Callable[[Metrics], float | None]:
-    def value(found: Metrics) -> float | None:
-        values = [row[key] for row in found["parts"] if row.get(key) is not None]
-        return sum(values) / len(values) if values else None
-
-    return value
+    return lambda found: mean_scores(found["parts"], (key,))[key]
 
 
 SCORES = (

@@ -16,15 +16,15 @@ from gsjax.engine.ending import exit_code, finish
 from gsjax.engine.files import read_drawable
 from gsjax.engine.fit.run import Options as FitOptions
 from gsjax.engine.fit.run import run as run_fit
-from gsjax.engine.folder import RunFolder, expect_dataset, expect_run, is_run
+from gsjax.engine.folder import RunFolder, expect_dataset, expect_run, is_finished, is_run
 from gsjax.engine.locks import releasing_locks
 from gsjax.engine.messages import Notes, counted, stage
 from gsjax.engine.options import RESUME_MAY_CHANGE, OfRecording, SamWeights, Seeded, checked
-from gsjax.engine.parts.loop import Loop, resumed
+from gsjax.engine.parts.loop import Loop
 from gsjax.engine.parts.outputs import finished
 from gsjax.engine.parts.results import summarize
 from gsjax.engine.parts.start import FIT, detect_motion, discover
-from gsjax.engine.progress import Progress
+from gsjax.engine.progress import Progress, load_run
 from gsjax.engine.recording import Recording, chosen_recording, located, parse_frames
 from gsjax.engine.records import digest
 from gsjax.methods.fit import FitConfig
@@ -110,7 +110,7 @@ def run(options: Options) -> int:
         seconds["discovery"] = perf_counter() - at
         progress = Progress({"the canonical scene": digest(scene)})
         if options.resume:
-            first, progress = resumed(folder, first, progress)
+            first, progress = load_run(folder.resume, first, progress)
             followed = int(method.result(problem, first).done.sum())
             notes.add(f"Resumed after {counted(followed, 'frame')} of an earlier run.")
         loop = Loop(method, problem, first, progress, seconds, folder, notes, console)
@@ -181,7 +181,7 @@ def _fitted(
 ) -> Path | None:
     """The file of the scene at the anchor frame; None if the fit was stopped by Ctrl-C."""
     path = folder.path / "canonical"
-    if not RunFolder(path, overwrite=True).finished:
+    if not is_finished(path):
         console.print("[bold]canonical scene[/]  fitted to the anchor frame", soft_wrap=True)
         code = run_fit(_fit_options(options, path, anchor, recording))
         if code == 130:

@@ -21,18 +21,15 @@ def cache_folder() -> Path | None:
 
 
 class FeatureCache:
-    """A folder of outputs. A damaged one is computed again, and one that cannot be written is not kept.
+    """Outputs kept in the user's cache folder, if there is one. A damaged one is computed again, and one that
+    cannot be written is not kept.
 
     Attributes:
         found, asked: number of outputs that were there, and of those that had to be computed.
     """
 
-    def __init__(self, folder: Path | None = None):
-        """
-        Args:
-            folder: the folder (default: in the user's cache folder; without one, nothing is kept).
-        """
-        self._folder = folder or cache_folder()
+    def __init__(self):
+        self._folder = cache_folder()
         self.found = self.asked = 0
 
     def __call__(self, key: str, inputs: Arrays, compute: Callable[[], Arrays]) -> dict[str, np.ndarray]:

@@ -36,18 +36,18 @@ def photographs(labels, names=None):
     )
 
 
-def taught(shown, indices, asked, folder):
+def taught(shown, indices, asked):
     asked.check()
-    return Teaching(shown, indices, asked, FeatureCache(folder / "cache"), QUIET)
+    return Teaching(shown, indices, asked, FeatureCache(), QUIET)
 
 
 THREE, TWO, OTHER = np.array([[0, 0, 1, 2]] * 3), np.array([[0, 0, 1, 1]] * 3), np.array([[0, 5, 1, 1]] * 3)
 
 
 @pytest.mark.parametrize("features", ["classes", "closed"])
-def test_held_out_views_are_asked_about_in_the_terms_of_those_that_taught(tmp_path, features):
+def test_held_out_views_are_asked_about_in_the_terms_of_those_that_taught(features):
     shown = photographs([THREE, TWO, OTHER, None])
-    said = taught(shown, [0], TeacherChoice(features), tmp_path)
+    said = taught(shown, [0], TeacherChoice(features))
     assert said.source.names == {1: "background", 2: "object 1", 3: "object 2"}
     alone, others, nobody = (said.of(i) for i in (1, 2, 3))
     assert alone.dimension == others.dimension == said.teacher.dimension
@@ -56,12 +56,12 @@ def test_held_out_views_are_asked_about_in_the_terms_of_those_that_taught(tmp_pa
         code = said.source.encoder().embed_text("object 1")
         np.testing.assert_array_equal(others.codebook[others.ids[0][0, 8]], code / np.linalg.norm(code))
         assert others.ids[0][0, 4] == -1  # nobody taught what 5 is
-    one_more = taught(photographs([TWO, THREE]), [0], TeacherChoice(features), tmp_path)
+    one_more = taught(photographs([TWO, THREE]), [0], TeacherChoice(features))
     assert one_more.source.names == {1: "background", 2: "foreground"}
     assert one_more.of(1).dimension == one_more.teacher.dimension
 
 
-def test_outlines_can_be_put_on_edges(tmp_path):
+def test_outlines_can_be_put_on_edges():
     true = np.zeros((12, 16), int)
     true[3:9, 4:12] = 1
     off = np.roll(true, 1, axis=1)  # by a pixel
@@ -71,7 +71,7 @@ def test_outlines_can_be_put_on_edges(tmp_path):
         load_labels=lambda i: off,
     )
     choices = [TeacherChoice("classes", snap=pixels) for pixels in (0, 2)]
-    as_they_are, snapped = (taught(shown, [0], choice, tmp_path).teacher for choice in choices)
+    as_they_are, snapped = (taught(shown, [0], choice).teacher for choice in choices)
     thing = {k: t.ids[0] == t.ids[0][6, 8] for k, t in (("off", as_they_are), ("on", snapped))}
     np.testing.assert_array_equal(thing["off"], off == 1)
     assert (
@@ -83,7 +83,7 @@ def test_outlines_can_be_put_on_edges(tmp_path):
         TeacherChoice(snap=-1).check()
 
 
-def test_numbers_of_labels_cost_nothing(tmp_path, monkeypatch):
+def test_numbers_of_labels_cost_nothing(monkeypatch):
     from gsjax.perception.codebook import ClassCodebook
 
     counts, embed = [], ClassCodebook.embed_objects
@@ -94,7 +94,7 @@ def test_numbers_of_labels_cost_nothing(tmp_path, monkeypatch):
 
     monkeypatch.setattr(ClassCodebook, "embed_objects", counted)
     large = np.array([[0, 26003, 7, 7]] * 3, np.int32)
-    said = taught(photographs([large, THREE], {26003: "car", 7: "road"}), [0], TeacherChoice(), tmp_path)
+    said = taught(photographs([large, THREE], {26003: "car", 7: "road"}), [0], TeacherChoice())
     assert said.source.names == {1: "background", 8: "road", 26004: "car"}
     code = ClassCodebook({1: "car"}).embed_text("car")
     np.testing.assert_allclose(said.teacher.codebook[said.teacher.ids[0][0, 4]], code, atol=1e-6)
@@ -109,7 +109,7 @@ def test_weights_are_read_once_however_many_pictures_there_are(tmp_path, monkeyp
         "gsjax.perception.sam.load_sam", lambda path: lambda image, depth, K: image[..., 0] // 64
     )
     monkeypatch.setattr(field_teacher, "folder_digest", lambda path: digested.append(path) or "digest")
-    said = taught(photographs([None] * 3), [0, 1, 2], TeacherChoice("closed", sam=weights), tmp_path)
+    said = taught(photographs([None] * 3), [0, 1, 2], TeacherChoice("closed", sam=weights))
     assert (said.masks, digested) == ("sam", [weights])
 
 
@@ -129,7 +129,7 @@ def test_masks_of_sam_teach_on_all_levels_or_on_one(tmp_path, monkeypatch):
     monkeypatch.setattr("gsjax.perception.sam.load_sam", lambda path: Found(None, None, None, min_pixels=1))
     shown = photographs([None] * 2)
     taught_by = {
-        level: taught(shown, [0, 1], TeacherChoice("closed", sam=weights, level=level), tmp_path)
+        level: taught(shown, [0, 1], TeacherChoice("closed", sam=weights, level=level))
         for level in ("default", "small", "medium", "large", "each")
     }
     ids = {level: said.teacher.ids[0] for level, said in taught_by.items()}
@@ -166,7 +166,7 @@ def test_masks_of_sam_teach_on_all_levels_or_on_one(tmp_path, monkeypatch):
 def test_features_of_files_are_found_by_all_photographs(tmp_path):
     shown, maps = photographs([None] * 3), np.random.default_rng(0).normal(size=(3, 3, 4, 5))
     np.save(tmp_path / "level_0.npy", maps)  # LERF's: those of all pictures, in order
-    said = taught(shown, [0, 2], TeacherChoice(str(tmp_path)), tmp_path)
+    said = taught(shown, [0, 2], TeacherChoice(str(tmp_path)))
     cosines = np.einsum("hwd,hwd->hw", said.teacher.maps[1], maps[2]) / np.linalg.norm(maps[2], axis=-1)
     np.testing.assert_allclose(cosines, np.linalg.norm(said.teacher.maps[1], axis=-1), rtol=1e-5)
     assert said.of(1).maps[0].shape == (3, 4, 5)
@@ -174,7 +174,7 @@ def test_features_of_files_are_found_by_all_photographs(tmp_path):
     for i in (0, 2):
         (tmp_path / f"cam{i}").mkdir()
         np.save(tmp_path / f"cam{i}/a.npy", maps[i])
-    said = taught(shown, [0, 2], TeacherChoice(str(tmp_path)), tmp_path)  # held-out ones need not be there
+    said = taught(shown, [0, 2], TeacherChoice(str(tmp_path)))  # held-out ones need not be there
     with pytest.raises(FileNotFoundError, match=r"cam1/a\.png"):
         said.of(1)
     (tmp_path / "cam1").mkdir()
@@ -183,12 +183,12 @@ def test_features_of_files_are_found_by_all_photographs(tmp_path):
         said.of(1)
     np.save(tmp_path / "cam2/a.npy", maps[2, :, :1])
     with pytest.raises(ValueError, match=r"cam2/a\.npy: expected features .* cam2/a\.png, 16x12, found 1x3"):
-        taught(shown, [0, 2], TeacherChoice(str(tmp_path)), tmp_path)
+        taught(shown, [0, 2], TeacherChoice(str(tmp_path)))
 
 
-def test_photographs_without_masks_are_named(tmp_path):
+def test_photographs_without_masks_are_named():
     with pytest.warns(DataWarning, match=r"teach nothing: cam1/a\.png, cam3/a\.png$"):
-        said = taught(photographs([THREE, None, TWO, None]), [0, 1, 2, 3], TeacherChoice(), tmp_path)
+        said = taught(photographs([THREE, None, TWO, None]), [0, 1, 2, 3], TeacherChoice())
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert said.of(1) is None

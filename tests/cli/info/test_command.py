@@ -10,7 +10,7 @@ import pytest
 
 import gsjax
 from gsjax.cli import main
-from gsjax.data import DataWarning, open_photographs, open_sequence, photographs_of
+from gsjax.data import DataWarning, Photographs, open_photographs, open_sequence, photographs_of
 from gsjax.engine.info_picture import by_camera, by_split, scene_points
 from gsjax.engine.info_scene import describe_scene
 from gsjax.io.ply import write_ply
@@ -116,6 +116,21 @@ def test_a_recording_is_drawn_by_camera_with_points_of_its_depth(capfd, tmp_path
     text = (tmp_path / "a.svg").read_text()
     assert "camera 2 (2)" in text
     assert "z (m)" in text
+
+
+def test_points_of_a_fisheye_lie_at_their_distances():
+    scene = Photographs(
+        "a shell around the lens",
+        ("a.png",),
+        np.array([[40, 30]]),
+        np.array([[[15.0, 0, 20], [0, 15.0, 15], [0, 0, 1]]]),
+        np.eye(4)[None],
+        load_image=lambda i: np.zeros((30, 40, 3), np.uint8),
+        load_depth=lambda i: np.full((30, 40), 2.0, np.float32),
+        fisheye=np.zeros((1, 4)),
+    )
+    points, _ = scene_points(scene)
+    np.testing.assert_allclose(np.linalg.norm(points, axis=1), 2.0, rtol=1e-5)
 
 
 @pytest.mark.parametrize("kind", ["parts", "distill", "deform"])

@@ -11,14 +11,9 @@ import gsjax.engine.parts.run
 from gsjax.cli import main
 from gsjax.data.video import describe_video
 from gsjax.engine.drive import Drive
-from gsjax.engine.folder import RunFolder
-from gsjax.engine.parts.loop import resumed
-from gsjax.engine.progress import Progress
 from gsjax.engine.recording import chosen_recording
-from gsjax.io.checkpoints import CheckpointError
 from gsjax.io.ply import read_ply
 from gsjax.methods.parts import order_of_frames
-from gsjax.optim.method import Run
 from gsjax.viz.colors import label_color
 
 SCENE = "simulated:hard_parts?case=small&amount=0.05&width=96&height=72&cameras=4"
@@ -150,14 +145,6 @@ def test_a_run_that_was_stopped_goes_on_to_the_same_bits(gsjax_parts, tmp_path, 
     _, said = stopped_after(3 * 30 + 1, "late")
     assert "refined for 1 of 5 steps, then stopped by Ctrl-C" in said
     resumed("late")
-
-
-def test_what_an_earlier_version_left_to_resume_is_refused(tmp_path):
-    folder = RunFolder(tmp_path)
-    folder.resume.mkdir()
-    (folder.resume / "parts.npz").write_bytes(b"of another format")
-    with pytest.raises(CheckpointError, match=r"parts\.npz: expected a checkpoint"):
-        resumed(folder, Run(None, None), Progress())
 
 
 @pytest.mark.thorough

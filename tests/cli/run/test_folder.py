@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import yaml
 
-from gsjax.engine.folder import RunFolder, fresh_folder, replaced_folder
+from gsjax.engine.folder import RunFolder, is_finished, replaced_folder
 
 
 class Mode(enum.Enum):
@@ -58,7 +58,7 @@ def test_layout_is_what_the_docstring_says(finished):
         "trajectory.npz",
         "video_0.mp4",
     ]
-    assert finished.finished
+    assert is_finished(finished.path)
 
 
 def test_config_is_plain_yaml(finished):
@@ -90,10 +90,10 @@ def test_overwriting_clears_the_run_and_nothing_else(finished):
         (finished.path / name).mkdir()
         (finished.path / name / "video.mp4").touch()
     run = RunFolder(finished.path, overwrite=True)
-    assert run.finished  # until there is something to take its place
+    assert is_finished(run.path)  # until there is something to take its place
     run.write_config(Config())
     assert contents(run) == ["config.yml", "my notes.txt"]
-    assert not run.finished
+    assert not is_finished(run.path)
 
 
 def test_unfinished_run_is_replaced_where_it_left_nothing_to_resume(finished):
@@ -204,7 +204,7 @@ def test_what_gsjax_wrote_is_replaced_whole_and_late(tmp_path):
 
 def test_what_stood_there_comes_back_where_the_new_cannot_take_its_place(tmp_path, monkeypatch):
     folder, rename = tmp_path / "answer", Path.rename
-    fresh_folder(folder, OURS)
+    folder.mkdir()
     (folder / "answer.json").write_text("1")
 
     def not_the_new(self, target):
@@ -227,11 +227,9 @@ def test_a_folder_with_something_else_is_not_replaced(tmp_path, there):
     folder.mkdir()
     for name in there:
         (folder / name).touch()
-    for replace in (lambda: replaced_folder(folder, OURS).__enter__(), lambda: fresh_folder(folder, OURS)):
-        with pytest.raises(
-            FileExistsError, match=r"answer: expected nothing, or only what gsjax writes there"
-        ):
-            replace()
+    message = r"answer: expected nothing, or only what gsjax writes there"
+    with pytest.raises(FileExistsError, match=message), replaced_folder(folder, OURS):
+        pass
     assert listed(folder) == sorted(there)
 
 
@@ -245,5 +243,5 @@ def test_a_link_stays_one_and_an_empty_folder_and_files_of_file_managers_are_nob
     assert (tmp_path / "answer").is_symlink()
     assert listed(tmp_path / "elsewhere") == [".DS_Store", "answer.json"]
     (tmp_path / "file").touch()
-    with pytest.raises(FileExistsError, match="found a file"):
-        fresh_folder(tmp_path / "file", OURS)
+    with pytest.raises(FileExistsError, match="found a file"), replaced_folder(tmp_path / "file", OURS):
+        pass
