@@ -29,8 +29,8 @@ from gsjax.methods.distill import (
     Teacher,
     frozen_views,
     full_table,
-    majority_labels,
     teacher_of_objects,
+    voted_labels,
 )
 from gsjax.methods.fit import PRESETS
 from gsjax.optim.compiler import host_options
@@ -259,9 +259,9 @@ def of_field(found: Learned, codes: np.ndarray) -> Int[np.ndarray, "n"]:
 def by_majority(scene: FieldScene, which: Any, ids: list[np.ndarray], count: int) -> Int[np.ndarray, "n"]:
     """Labels of Gaussians by a majority vote of the pixels' labels."""
     cameras = [scene.photographs.camera(i) for i in which]
-    return majority_labels(
-        frozen_views(scene.gaussians, cameras, scene.rasterize_mode), ids, count, scene.gaussians.num
-    )
+    views = frozen_views(scene.gaussians, cameras, scene.rasterize_mode)
+    best, votes = voted_labels(views, ids, count, scene.gaussians.num)
+    return np.where(votes > 0, best, -1)
 
 
 def true_labels(gaussians: Gaussians, photographs: Photographs) -> Int[np.ndarray, "n"]:

@@ -15,7 +15,6 @@ import warnings
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 
 from gsjax.data.errors import COMPLETE, DataError, DataWarning
@@ -28,7 +27,8 @@ from gsjax.data.origin import near_origin
 from gsjax.data.sequence import Sequence
 from gsjax.data.validation import check_intrinsics, check_poses
 from gsjax.geometry.joints import Joint
-from gsjax.io.atomic import atomic_write, write_json, write_npz
+from gsjax.io.atomic import write_json, write_npz
+from gsjax.io.pictures import write_png
 
 DEFAULT_DEPTH_UNIT_M = 0.001
 _JOINTS = {"slide": "prismatic", "hinge": "revolute"}
@@ -121,18 +121,18 @@ def write_panoptic(sequence: Sequence, path: str | Path, depth_unit_m: float = 0
     too_far = 0
     for t, frame in enumerate(names):
         for c, name in enumerate(frame):
-            _write_image(root / "ims" / name, cv2.cvtColor(sequence.image(t, c), cv2.COLOR_RGB2BGR))
+            write_png(root / "ims" / name, sequence.image(t, c))
             depth, mask = sequence.depth(t, c), sequence.mask(t, c)
             if depth is not None:
                 steps = np.round(depth / depth_unit_m)
                 fits = steps < SATURATED_DEPTH
                 too_far += np.sum(~fits)
-                _write_image(root / "depth" / name, np.where(fits, steps, 0).astype(np.uint16))
+                write_png(root / "depth" / name, np.where(fits, steps, 0).astype(np.uint16))
             if mask is not None:
                 if mask.min() < 0 or mask.max() > 65535:
                     found = f"{mask.min()} to {mask.max()} in frame {t}"
                     raise ValueError(f"write_panoptic requires labels from 0 to 65535, got {found}")
-                _write_image(root / "seg" / name, mask.astype(np.uint8 if mask.max() < 256 else np.uint16))
+                write_png(root / "seg" / name, mask.astype(np.uint8 if mask.max() < 256 else np.uint16))
     if too_far:
         farthest = (SATURATED_DEPTH - 1) * depth_unit_m
         message = f"{root}: the depth of {too_far} pixels farther than {farthest:.4g} m is lost"
@@ -332,11 +332,3 @@ def _has_first_mask_only(root: Path, first: str) -> bool:
 def _frame_number(name: str, fallback: int) -> int:
     digits = re.search(r"(\d+)$", Path(name).stem)
     return int(digits.group()) if digits else fallback
-
-
-def _write_image(path: Path, image: np.ndarray) -> None:
-    with atomic_write(path) as temporary:
-        if not cv2.imwrite(str(temporary), image):
-            raise DataError(
-                path, "a writable path for an image", "one that cannot be written", "Choose another folder."
-            )

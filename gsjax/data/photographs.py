@@ -8,12 +8,12 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int, Integer, UInt8
 
-from gsjax.data.errors import DataError
 from gsjax.data.resizing import area_resized, check_scale, nearest_resized
 from gsjax.data.sequence import Sequence
 from gsjax.data.validation import (
     check_background,
     check_intrinsics,
+    check_loaded,
     check_poses,
     check_shape,
     positions_of,
@@ -263,11 +263,7 @@ class Photographs:
 
     def _check(self, kind: str, i: int, array: np.ndarray, channels: tuple[int, ...], dtype: type) -> None:
         width, height = (int(size) for size in self.sizes[i])
-        if array.shape != (height, width, *channels) or not np.issubdtype(array.dtype, dtype):
-            type_name = {np.floating: "floats", np.integer: "integers"}.get(dtype) or np.dtype(dtype).name
-            expected = f"shape {(height, width, *channels)} of {type_name}"
-            found = f"shape {array.shape} of {array.dtype}"
-            raise DataError(self.where(kind, i), expected, found, "Correct the file or its loader.")
+        check_loaded(self.where(kind, i), array, (height, width, *channels), dtype)
 
 
 def photographs_of(sequence: Sequence) -> Photographs:

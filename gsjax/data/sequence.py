@@ -10,13 +10,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
-from gsjax.data.errors import DataError, DataWarning
+from gsjax.data.errors import DataWarning
 from gsjax.data.objects import PointModel, Truth
 from gsjax.data.resizing import area_resized, check_scale, nearest_resized
 from gsjax.data.validation import (
     check_background,
     check_depth,
     check_intrinsics,
+    check_loaded,
     check_poses,
     check_shape,
     check_times,
@@ -195,7 +196,7 @@ class Sequence:
         depth, what = self._load(self.load_depth, "depth", t, c), self.where("depth", t, c)
         if depth is None:
             return None
-        _check_array(what, depth, (self.height, self.width), np.floating, "float metres")
+        check_loaded(what, depth, (self.height, self.width), np.floating)
         if self.float_images:
             depth = np.where(np.isfinite(self._raw_image(t, c)).all(-1), depth, 0)
         return check_depth(depth, what)
@@ -209,7 +210,7 @@ class Sequence:
         mask = self._load(self.load_mask, "mask", t, c)
         if mask is None:
             return None
-        _check_array(self.where("mask", t, c), mask, (self.height, self.width), np.integer, "integer labels")
+        check_loaded(self.where("mask", t, c), mask, (self.height, self.width), np.integer)
         return mask.astype(np.int32)
 
     def frame(self, t: int) -> Frame:
@@ -242,7 +243,7 @@ class Sequence:
         self._check_index(t + 1, c)
         flow = self.load_flow(t, t + 1, c)
         if flow is not None:
-            _check_array(self.where("flow", t, c), flow, (self.height, self.width, 2), np.floating, "floats")
+            check_loaded(self.where("flow", t, c), flow, (self.height, self.width, 2), np.floating)
         return flow
 
     def select(
@@ -313,8 +314,8 @@ class Sequence:
 
     def _raw_image(self, t: int, c: int) -> np.ndarray:
         image = self._load(self.load_image, "image", t, c)
-        kind, type_name = (np.floating, "floats in 0..1") if self.float_images else (np.uint8, "uint8 RGB")
-        _check_array(self.where("image", t, c), image, (self.height, self.width, 3), kind, type_name)
+        kind = np.floating if self.float_images else np.uint8
+        check_loaded(self.where("image", t, c), image, (self.height, self.width, 3), kind)
         assert image is not None
         return image
 
@@ -343,14 +344,6 @@ class Sequence:
         if self.locate is not None:
             return self.locate(kind, t, c)
         return f"{self.name}, {kind} of {self._camera_in_frame(t, c)}"
-
-
-def _check_array(
-    what: str, array: np.ndarray | None, shape: tuple[int, ...], dtype: type, type_name: str
-) -> None:
-    if array is None or array.shape != shape or not np.issubdtype(array.dtype, dtype):
-        found = "nothing" if array is None else f"shape {array.shape} of {array.dtype}"
-        raise DataError(what, f"shape {shape} of {type_name}", found, "Correct the file or its loader.")
 
 
 def _reindex(loader: Callable | None, frames: list[int], cameras: list[int]) -> Callable | None:

@@ -30,6 +30,21 @@ def check_shape(name: str, array: np.ndarray, shape: tuple[int, ...]) -> None:
         raise ValueError(f"{name} must have shape {shape}, got {np.shape(array)}")
 
 
+def check_loaded(where: str, array: np.ndarray | None, shape: tuple[int, ...], kind: type) -> None:
+    """Raises DataError unless what a loader gave has the expected shape and type.
+
+    Args:
+        where: the file, or what it is, for the message.
+        array: what was loaded.
+        shape: the expected shape.
+        kind: the expected type, or a group of them: np.uint8, np.integer, np.floating.
+    """
+    if array is None or array.shape != shape or not np.issubdtype(array.dtype, kind):
+        type_name = {np.floating: "floats", np.integer: "integers"}.get(kind) or np.dtype(kind).name
+        found = "nothing" if array is None else f"shape {array.shape} of {array.dtype}"
+        raise DataError(where, f"shape {shape} of {type_name}", found, "Correct the file or its loader.")
+
+
 def check_background(background: tuple[float, float, float] | None) -> None:
     """Raises a ValueError unless a colour behind pictures is RGB from 0 to 1, or None."""
     if background is not None and not (len(background) == 3 and all(0 <= c <= 1 for c in background)):

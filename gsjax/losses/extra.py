@@ -7,7 +7,7 @@ A method that takes `extra_losses` adds them to its own and trains on the gradie
 
     gsjax.track(scene, first, frames, config, extra_losses=(above_the_table,))
 
-The weight of a loss is a factor inside it. A loss is told by keyword where in a run it is, if it asks:
+The weight of a loss is a factor inside it. A loss is given by keyword where in a run it is, if it asks:
 
     def prior(scene, rendered, frame, *, index, progress):
         return (1 - progress) * jnp.abs(rendered.depths - DEPTHS[index]).mean()
@@ -203,21 +203,20 @@ def extra_terms(
     scene: Any,
     rendered: Any,
     frame: Any,
-    **told: Float[Array, ""] | Int[Array, ""] | float | int,
+    **context: Float[Array, ""] | Int[Array, ""] | float | int,
 ) -> dict[str, Float[Array, ""]]:
     """The value of each loss, by name.
 
     Args:
         losses: functions of scene, rendered and frame.
         scene, rendered, frame: their arguments.
-        told: what each is given by keyword, if it asks; see `ExtraLoss`.
+        context: what each is given by keyword, if it asks; see `ExtraLoss`.
 
     Raises:
-        ValueError: as for `named_losses`, a loss asks for what is not told, or returns something other than a
-            scalar.
+        ValueError: as for `named_losses`; or a loss asks for what is not given, or returns no scalar.
     """
     named = named_losses(losses)
-    terms = {name: _value(name, loss, scene, rendered, frame, told) for name, loss in named.items()}
+    terms = {name: _value(name, loss, scene, rendered, frame, context) for name, loss in named.items()}
     for name, value in terms.items():
         is_array = isinstance(value, int | float | np.ndarray | np.generic | jax.Array)
         if not is_array or jnp.shape(value) != ():
@@ -237,17 +236,17 @@ def _asked_for(loss: Callable) -> tuple[str, ...]:
     return tuple(one.name for one in given if one.kind is one.KEYWORD_ONLY and one.default is one.empty)
 
 
-def _value(name: str, loss: Callable, scene: Any, rendered: Any, frame: Any, told: dict[str, Any]) -> Any:
+def _value(name: str, loss: Callable, scene: Any, rendered: Any, frame: Any, context: dict[str, Any]) -> Any:
     """The value of a loss; what goes wrong in it says in which, and what is usual."""
     asked = _asked_for(loss)
-    if missing := sorted({*asked} - told.keys()):
-        given = f"only {' and '.join(sorted(told))}" if told else "nothing"
+    if missing := sorted({*asked} - context.keys()):
+        given = f"only {' and '.join(sorted(context))}" if context else "nothing"
         raise ValueError(
             f"extra_losses: {name} asks for {' and '.join(missing)} by keyword, and {given} is given here; "
             "give the argument a default, or leave it out"
         )
     try:
-        return loss(scene, rendered, frame, **{one: told[one] for one in asked})
+        return loss(scene, rendered, frame, **{one: context[one] for one in asked})
     except Exception as error:
         error.add_note(
             f"This is in the extra loss {name}(scene, rendered, frame). Its arguments are traced: take jnp, "

@@ -6,14 +6,14 @@ GaussianClin, section 3.3).
     loss = 0.1 * node_loss(features, teacher) + 0.1 * structure_loss(features, wanted, edges, weights)
 
 `features` and `teacher` are projections to the same number of channels. The projection of the Gaussians'
-features may be trained; the teacher's is fixed (`orthonormal_projection`), because two trained projections
-agree best where both are 0. Losses are means and not sums, so that their weights do not depend on the number
-of nodes and edges.
+features may be trained; the teacher's is fixed, say `jax.nn.initializers.orthogonal`, because two trained
+projections agree best where both are 0. Losses are means and not sums, so that their weights do not depend
+on the number of nodes and edges.
 """
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, PRNGKeyArray
+from jaxtyping import Array, Bool, Float
 
 from gsjax.losses.edges import (
     Edges,
@@ -26,18 +26,6 @@ from gsjax.losses.edges import (
     present,
 )
 from gsjax.losses.photometric import weighted_mean
-
-
-def orthonormal_projection(key: PRNGKeyArray, channels: int, width: int) -> Float[Array, "width channels"]:
-    """A random map from `channels` to `width` numbers for a teacher's features: V = F W^T. Its rows are
-    orthonormal, or its columns if `width` is larger than `channels`.
-
-    Args:
-        key: random key.
-        channels: channels of the teacher.
-        width: channels of the projection.
-    """
-    return jax.nn.initializers.orthogonal()(key, (width, channels))
 
 
 def node_loss(

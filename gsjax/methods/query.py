@@ -53,11 +53,13 @@ class Prompt(NamedTuple):
         return _scores(features, jnp.asarray(self.vectors, jnp.float32))
 
     def threshold(self, scores: Float[np.ndarray, "n"], given: float | None = None) -> Threshold:
-        """The score above which Gaussians are selected, and the rule that it comes from.
+        """The score above which Gaussians are selected, and the rule that it comes from: the given one; 1/2
+        with negatives; without, the encoder's own or, where it has none, Otsu's, which splits the scores into
+        two classes of the least variance within each. On the host.
 
         Args:
             scores: scores of all Gaussians.
-            given: the user's threshold (default: the encoder's own without negatives, else `threshold_for`).
+            given: the user's threshold.
 
         Raises:
             ValueError: the given threshold selects everything or nothing, whatever the scores.
@@ -66,10 +68,13 @@ class Prompt(NamedTuple):
         low, what = (-1, "a cosine") if alone else (0, "a share against others")
         if given is not None and not low <= given < 1:
             raise ValueError(f"--threshold: expected {low} to below 1, {what}, found {given:g}")
-        if given is None and alone and self.min_score is not None:
+        if given is not None:
+            return Threshold(float(given), "given")
+        if not alone:
+            return Threshold(EVEN, self.rule)
+        if self.min_score is not None:
             return Threshold(float(self.min_score), "the encoder's own")
-        found = threshold_for(scores, not alone, given)
-        return found if alone or given is not None else found._replace(rule=self.rule)
+        return _otsu(scores[np.isfinite(scores)])
 
 
 def encoded_prompt(
@@ -118,22 +123,7 @@ def relevancy(cosines: Float[Array, "*n q"], temperature: float = TEMPERATURE) -
     return jax.nn.sigmoid(ahead / temperature)
 
 
-def threshold_for(
-    scores: Float[np.ndarray, "n"], against_negatives: bool, given: float | None = None
-) -> Threshold:
-    """The given threshold; else 1/2 with negatives; else Otsu's, which splits the scores into two classes of
-    the least variance within each. On the host.
-
-    Args:
-        scores: scores of Gaussians.
-        against_negatives: whether the scores are shares against negatives.
-        given: threshold to use (default: by the rules above).
-    """
-    if given is not None:
-        return Threshold(float(given), "given")
-    if against_negatives:
-        return Threshold(EVEN, "better than each negative")
-    scores = scores[np.isfinite(scores)]
+def _otsu(scores: Float[np.ndarray, "n"]) -> Threshold:
     if not len(scores) or scores.max() - scores.min() < 1e-6:
         return Threshold(float("inf"), "Otsu; all scores are alike")
     from skimage.filters import threshold_otsu  # slow to import

@@ -7,7 +7,6 @@ section 4.1), and its scores never bear that name. Each finding comes with a rea
 Videos are [T, H, W, 3], RGB, uint8 or floats 0 to 1; regions [T, H, W]. On the host.
 """
 
-from collections.abc import Mapping
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -147,15 +146,6 @@ def place_is_clean(
     ghost = _differ(after, background, tolerance)[vacated] & ~hole
     words = f"vacated pixels show what is behind ({hole.sum()} holes, {ghost.sum()} ghosts)"
     return _finding(~(hole | ghost), words)
-
-
-def worst(findings: Mapping[str, Finding]) -> Finding:
-    """The worst finding on an edit; findings without a score are ignored."""
-    judged = {name: finding for name, finding in findings.items() if not np.isnan(finding.score)}
-    if not judged:
-        return Finding(float("nan"), "nothing was judged")
-    name = min(judged, key=lambda name: judged[name].score)
-    return Finding(judged[name].score, f"{name}: {judged[name].reason}")
 
 
 def _finding(good: Bool[np.ndarray, "judged"], words: str) -> Finding:

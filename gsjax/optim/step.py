@@ -132,7 +132,6 @@ def steady_adam(rate: Any, eps: float = 1e-15, decay: float = 0.0) -> optax.Grad
 
 def per_field_adam(
     rates: dict[str, Any],
-    default: float = 0.0,
     others: Mapping[str, optax.GradientTransformation] = MappingProxyType({}),
     decay: float = 0.0,
 ) -> optax.GradientTransformation:
@@ -140,8 +139,7 @@ def per_field_adam(
     modules.
 
     Args:
-        rates: learning rates by field name.
-        default: learning rate of all other fields; with 0 they do not change.
+        rates: learning rates by field name. All other fields do not change.
         others: transformations, by field name, that replace Adam.
         decay: weight decay of AdamW for the fields in `rates`.
 
@@ -162,8 +160,7 @@ def per_field_adam(
 
         return jax.tree_util.tree_map_with_path(of, params)
 
-    rest = steady_adam(default, eps=1e-8) if default else optax.set_to_zero()
-    return optax.multi_transform(transforms | {"rest": rest}, label)
+    return optax.multi_transform(transforms | {"rest": optax.set_to_zero()}, label)
 
 
 def _fields(module: Any) -> tuple[str, ...]:

@@ -8,19 +8,18 @@ output projection, the final norm and the projection to the text space, with no 
 Needs the extra `foundation`; weights are those of CLIP, local files.
 """
 
-import os
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, Num
 
-from gsjax.perception.clip import ClipEncoder, load_clip
+from gsjax.perception.clip import ClipEncoder
 from gsjax.perception.pictures import in_patches
 
 
 @dataclass(frozen=True)
 class MaskClipEncoder:
-    """Unit vectors of patches and of text; from `load_maskclip`.
+    """Unit vectors of patches and of text, by a model that `gsjax.perception.clip.load_clip` reads.
 
     Attributes:
         clip: the model, also used for text.
@@ -68,16 +67,3 @@ class MaskClipEncoder:
             ValueError: the text is empty.
         """
         return self.clip.embed_text(text)
-
-
-def load_maskclip(path: str | os.PathLike, device: str = "cpu", resolution: int = 448) -> MaskClipEncoder:
-    """CLIP from a folder of weights in the layout of Hugging Face, for patches.
-
-    Args:
-        path, device: as for `gsjax.perception.clip.load_clip`, with its errors.
-        resolution: shorter side of the model's input, pixels.
-
-    Raises:
-        ValueError: the weights are SigLIP's.
-    """
-    return MaskClipEncoder(load_clip(path, device), resolution)

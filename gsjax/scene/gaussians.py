@@ -190,7 +190,7 @@ def concatenate(parts: Sequence[Gaussians]) -> Gaussians:
     if len(sizes) > 1:
         raise ValueError(f"concatenate: features must have one size in all parts or be None, got {sizes}")
     degree = max(part.sh_degree for part in parts)
-    return _joined([_with_sh_degree(part, degree) for part in parts])
+    return _joined([with_sh_degree(part, degree) for part in parts])
 
 
 @partial(jax.jit, inline=True)
@@ -198,8 +198,8 @@ def _joined(parts: list[Gaussians]) -> Gaussians:
     return jax.tree.map(lambda *leaves: jnp.concatenate(leaves, axis=0), *parts)
 
 
-def _with_sh_degree(gaussians: Gaussians, degree: int) -> Gaussians:
-    """The same Gaussians with missing coefficients up to `degree` set to zero."""
+def with_sh_degree(gaussians: Gaussians, degree: int) -> Gaussians:
+    """The same Gaussians with missing coefficients up to `degree`, not below their own, set to zero."""
     missing = num_sh_bases(degree) - num_sh_bases(gaussians.sh_degree)
     if missing == 0:
         return gaussians

@@ -1,7 +1,6 @@
 """Object labels of the points of an initial scene, from one view's mask. All on the host."""
 
 import warnings
-from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Float, Int, Integer, Num
@@ -27,7 +26,6 @@ def lift_labels(
     K: Float[np.ndarray, "3 3"],
     *,
     max_depth_gap: float = 0.015,
-    expected_labels: Sequence[int] = (),
 ) -> Int[np.ndarray, "N"]:
     """Labels of the points that one view sees, from its mask; -1 for the others.
 
@@ -41,7 +39,6 @@ def lift_labels(
         viewmat: world to camera.
         K: intrinsics, pixels.
         max_depth_gap: metres.
-        expected_labels: labels that must be in the mask; a missing one gives a warning.
 
     Raises:
         ValueError: mask and depth differ in size, or no pixel has depth, so that nothing can be lifted.
@@ -61,7 +58,7 @@ def lift_labels(
     seen = inside & valid_depth(there) & (np.abs(there - z) <= max_depth_gap)
     # Widened first: -1 in an array of bytes, as mask files give, would become 255.
     labels = np.where(seen, mask[rows, columns].astype(np.int32), UNKNOWN_LABEL)
-    _warn_of_lost_labels(mask, labels, expected_labels)
+    _warn_of_lost_labels(mask, labels)
     return labels
 
 
@@ -146,12 +143,8 @@ def _path_lengths(points, normals, begins, ends) -> np.ndarray:
     return np.maximum(length, 1e-9)  # a sparse graph treats 0 as "no edge"
 
 
-def _warn_of_lost_labels(mask: np.ndarray, labels: np.ndarray, expected: Sequence[int]) -> None:
-    """Warn of labels that no pixel has and of labels that have pixels but reached no point."""
-    present = set(np.unique(mask).tolist())
-    absent = sorted(set(expected) - present)
-    if absent:
-        warnings.warn(f"mask: no pixel has label {absent}; it holds {sorted(present)}", stacklevel=3)
-    lost = sorted(present - {BACKGROUND_LABEL} - set(np.unique(labels).tolist()))
+def _warn_of_lost_labels(mask: np.ndarray, labels: np.ndarray) -> None:
+    """Warn of labels that have pixels but reached no point."""
+    lost = sorted({*np.unique(mask).tolist()} - {BACKGROUND_LABEL, *np.unique(labels).tolist()})
     if lost:
         warnings.warn(f"mask: label {lost} reached no point (no depth there, or no points)", stacklevel=3)

@@ -270,12 +270,12 @@ def test_a_point_model_checks_its_shapes():
         (
             {"load_image": lambda t, c: np.zeros((3, 6, 3), np.uint8)},
             "image",
-            r"shape \(5, 6, 3\) of uint8 RGB",
+            r"shape \(5, 6, 3\) of uint8",
         ),
         ({"load_image": lambda t, c: np.zeros((5, 6, 3))}, "image", "float64"),
         ({"load_depth": lambda t, c: np.zeros((5, 6), np.uint16)}, "depth", "found shape .* of uint16"),
         ({"load_mask": lambda t, c: np.zeros((4, 6), np.uint8)}, "mask", r"found shape \(4, 6\)"),
-        ({"load_mask": lambda t, c: np.zeros((5, 6))}, "mask", "integer labels"),
+        ({"load_mask": lambda t, c: np.zeros((5, 6))}, "mask", "of integers"),
     ],
 )
 def test_the_result_of_a_loader_is_checked(changes, kind, says):

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 
 from gsjax.losses.edges import Matching, all_edges, edge_affinities, temporal_edges
-from gsjax.losses.graph import node_loss, orthonormal_projection, similarity_loss, structure_loss
+from gsjax.losses.graph import node_loss, similarity_loss, structure_loss
 from tests.losses.graphs import (
     MATCHING,
     SEEDS,
@@ -221,15 +221,6 @@ def test_nan_is_left_out_and_does_not_spread():
 
 
 # -- the rest ------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(("channels", "width"), [(9, 4), (4, 9), (6, 6)])
-def test_a_teachers_projection_is_orthonormal_and_differs_between_keys(channels, width):
-    one, other = (np.asarray(orthonormal_projection(jax.random.key(i), channels, width)) for i in (0, 1))
-    assert one.shape == (width, channels)
-    gram = one @ one.T if width <= channels else one.T @ one
-    np.testing.assert_allclose(gram, np.eye(min(channels, width)), atol=1e-5)
-    assert np.abs(one - other).max() > 0.1
 
 
 @pytest.mark.thorough

@@ -10,12 +10,10 @@ from scipy.ndimage import gaussian_filter
 
 from gsjax.geometry.cameras import intrinsics
 from gsjax.metrics.edit_judge import (
-    Finding,
     place_is_clean,
     requested_displacement,
     requested_motion_is_seen,
     rest_stays,
-    worst,
 )
 
 seeds = st.integers(0, 10_000)
@@ -111,12 +109,6 @@ def test_holes_and_ghosts_are_told_apart():
     left_behind = place_is_clean(before, np.ones(part.shape), behind, part)
     assert left_behind.score < 0.05
     assert math.isnan(place_is_clean(after, alphas, behind, 0 * part == 1).score)
-
-
-def test_an_edit_is_as_good_as_its_worst_side():
-    findings = {"rest": Finding(0.9, "a"), "motion": Finding(0.4, "b"), "place": Finding(float("nan"), "c")}
-    assert worst(findings) == (0.4, "motion: b")
-    assert math.isnan(worst({"place": findings["place"]}).score)
 
 
 def test_a_displacement_follows_from_depth_and_motion():

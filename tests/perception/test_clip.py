@@ -10,7 +10,7 @@ import pytest
 
 from gsjax.methods.protocols import DenseEncoder, LanguageEncoder
 from gsjax.perception.clip import ClipEncoder, load_clip
-from gsjax.perception.maskclip import MaskClipEncoder, load_maskclip
+from gsjax.perception.maskclip import MaskClipEncoder
 from tests.perception.test_foundation import IMAGE, needs_foundation
 
 
@@ -137,7 +137,7 @@ def test_siglip_agrees_with_transformers(siglip_folder):
     np.testing.assert_allclose(chance, 0.01, rtol=1e-4)
     assert encoder.embed_objects(IMAGE, np.zeros(IMAGE.shape[:2], int), 2).shape == (2, 16)
     with pytest.raises(ValueError, match="expected the weights of CLIP, found those of SigLIP"):
-        load_maskclip(siglip_folder)
+        MaskClipEncoder(load_clip(siglip_folder))
 
 
 @needs_foundation
@@ -198,7 +198,7 @@ def test_maskclip_is_the_values_of_clips_last_layer(clip_folder):
     import torch
     from transformers import CLIPImageProcessorPil, CLIPModel
 
-    encoder = load_maskclip(clip_folder, resolution=32)
+    encoder = MaskClipEncoder(load_clip(clip_folder), resolution=32)
     assert isinstance(encoder, DenseEncoder)
     found = encoder(np.stack([IMAGE, IMAGE[:, ::-1]]))
     assert found.shape == (2, 4, 6, 12)  # 37 pixels become 32, and 52 become 48, in patches of 8

@@ -96,7 +96,7 @@ def open_field_scene(options: SceneOptions, read_scene: Read | None = None) -> F
         scene = scene_of_run(path, options.images, read_scene)
     if not scene.gaussians.num:
         raise ValueError(f"{scene.file}: expected Gaussians, found none")
-    return replace(scene, photographs=smaller(scene.photographs, options.scale))
+    return scaled(scene, options.scale)
 
 
 def scene_of_run(path: Path, images: str | None = None, read_scene: Read | None = None) -> FieldScene:
@@ -159,6 +159,15 @@ def scene_of_file(
     photographs = relative_to_origin(choose_photographs(images, read, **chosen), report.origin)
     mode = "antialiased" if report.antialiased else "classic"
     return FieldScene(file, gaussians, photographs, *_split(photographs, test_every), mode)
+
+
+def scaled(scene: FieldScene, scale: float) -> FieldScene:
+    """The scene with smaller photographs.
+
+    Raises:
+        ValueError: `scale` is not above 0 and at most 1, or leaves next to nothing of them.
+    """
+    return replace(scene, photographs=smaller(scene.photographs, scale))
 
 
 def _split(photographs: Photographs, every: int) -> tuple[list[int], list[int]]:

@@ -192,8 +192,8 @@ def deform_loss(config: DeformConfig, extra_losses: ExtraLosses = ()) -> Callabl
             now = SceneAtTime(there, scene, batch.moving)
             rendered = drawn._replace(colors=image)
             seen = Frame(target, frame.depths, camera, frame.masks, frame.time)
-            told = {"index": batch.index, "progress": batch.progress}
-            info["extra"] = extra_terms(extra_losses, now, rendered, seen, **told)
+            context = {"index": batch.index, "progress": batch.progress}
+            info["extra"] = extra_terms(extra_losses, now, rendered, seen, **context)
             return sum(terms.values()) + sum(info["extra"].values()), terms | info
         return sum(terms.values()), terms | info
 

@@ -49,7 +49,7 @@ from gsjax.methods.distill.teacher import Teacher, teacher_of_maps, teacher_of_o
 from gsjax.methods.distill.update import distill_loss
 from gsjax.methods.distill.update import distill_step as step
 from gsjax.methods.distill.views import Batch, frozen_views, view_batch
-from gsjax.methods.distill.votes import label_votes, majority_labels
+from gsjax.methods.distill.votes import label_votes, voted_labels
 
 __all__ = [
     "PRESETS",
@@ -75,7 +75,6 @@ __all__ = [
     "init_field",
     "label_votes",
     "learned_inverse",
-    "majority_labels",
     "pixel_cosines",
     "pixel_features",
     "rendered_features",
@@ -84,5 +83,6 @@ __all__ = [
     "teacher_of_maps",
     "teacher_of_objects",
     "view_batch",
+    "voted_labels",
     "with_maps",
 ]

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from gsjax.methods.distill.teacher import Teacher
-from gsjax.methods.distill.votes import label_votes
+from gsjax.methods.distill.votes import voted_labels
 from gsjax.rasterize.frozen import FrozenView, paint
 from gsjax.rasterize.plan import Plan
 
@@ -43,8 +43,8 @@ def completed(teacher: Teacher, views: Sequence[tuple[FrozenView, Plan]], num: i
     of_gaussians = _kinds_of_gaussians(teacher, views, kinds[place], len(centers), num)
     rows = []  # of the embeddings, and of the centres after them, of each pixel on each level
     for (view, plan), ids, filled in zip(views, teacher.ids, teacher.filled, strict=True):
-        told = np.stack([_drawn(view, plan, each, len(centers)) for each in of_gaussians], axis=-1)
-        row = np.where(filled & (told >= 0), len(embeddings) + told, place[np.maximum(ids, 0)])
+        voted = np.stack([_drawn(view, plan, each, len(centers)) for each in of_gaussians], axis=-1)
+        row = np.where(filled & (voted >= 0), len(embeddings) + voted, place[np.maximum(ids, 0)])
         rows.append(np.where((ids >= 0)[..., None], row, -1))
     return _with_rows(teacher, rows, np.concatenate([embeddings, centers]))
 
@@ -72,39 +72,20 @@ def _kinds_of_gaussians(
     """The kind with the most votes for each Gaussian on each level; where too few pixels have a mask of a
     level, that on the next larger level or, without one, the next smaller. -1 where there is none at all."""
     levels, filled_of = kinds.shape[1], teacher.filled or []
-    _, every = _voted(views, [np.where(ids >= 0, 0, -1) for ids in teacher.ids], 1, num)
+    _, every = voted_labels(views, [np.where(ids >= 0, 0, -1) for ids in teacher.ids], 1, num)
     best = np.full((levels, num), -1)
     for level in range(levels):
         of_level = [
             np.where((ids >= 0) & ~filled[..., level], kinds[np.maximum(ids, 0), level], -1)
             for ids, filled in zip(teacher.ids, filled_of, strict=True)
         ]
-        kind, total = _voted(views, of_level, count, num)
+        kind, total = voted_labels(views, of_level, count, num)
         best[level] = np.where(total > _LEAST * every, kind, -1)
     filled_in = best.copy()
     for level, row in enumerate(filled_in):
         for other in (*range(level + 1, levels), *range(level)[::-1]):
             np.copyto(row, best[other], where=row < 0)
     return filled_in
-
-
-def _voted(
-    views: Sequence[tuple[FrozenView, Plan]], kinds: Sequence[np.ndarray], count: int, num: int
-) -> tuple[Int[np.ndarray, "n"], Float[np.ndarray, "n"]]:
-    """The kind with the most votes for each Gaussian, and the votes for all kinds together."""
-    best, most, total = np.zeros(num, int), np.zeros(num), np.zeros(num)
-    for first in range(0, count, _AT_ONCE):
-        some = min(_AT_ONCE, count)  # one program for all
-        votes = np.zeros((num, some))
-        for (view, plan), pixels in zip(views, kinds, strict=True):
-            here = np.where((pixels >= first) & (pixels < first + some), pixels - first, -1)
-            np.add.at(
-                votes, np.asarray(view.rows), np.asarray(label_votes(view, plan, jnp.asarray(here), some))
-            )
-        better = votes.max(axis=1) > most
-        best[better] = first + votes.argmax(axis=1)[better]
-        most, total = np.maximum(most, votes.max(axis=1)), total + votes.sum(axis=1)
-    return best, total
 
 
 def _drawn(view: FrozenView, plan: Plan, kinds: Int[np.ndarray, "n"], count: int) -> Int[np.ndarray, "h w"]:

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from gsjax.geometry.cameras import Camera
+from gsjax.geometry.neighbors import nearest_neighbors
 from gsjax.methods.distill.config import DistillConfig
 from gsjax.methods.distill.field import (
     FeatureField,
@@ -21,7 +22,7 @@ from gsjax.methods.distill.field import (
 )
 from gsjax.methods.distill.levels import completed
 from gsjax.methods.distill.result import DistillResult
-from gsjax.methods.distill.solve import SolveBatch, graph_of, passes, solve_step, unsolved
+from gsjax.methods.distill.solve import SolveBatch, passes, solve_step, unsolved
 from gsjax.methods.distill.teacher import Teacher, max_rows
 from gsjax.methods.distill.update import contrast_begins, distill_step
 from gsjax.methods.distill.views import Batch, expect_alike, frozen_views, in_basis, view_batch
@@ -136,7 +137,8 @@ class Distill:
         problem = Problem(views, rows, jnp.asarray(gaussians.means), source, about)
         if solved is None:
             return problem, Run(untrained, jax.jit(self.step.init)(untrained))
-        neighbors = graph_of(gaussians.means, config)
+        near = nearest_neighbors(np.asarray(gaussians.means), config.solve.neighbors)
+        neighbors = jnp.asarray(near, jnp.int32)
         solving = tuple(in_basis(view, solved.lift) for view in views)
         problem = problem._replace(solving=solving, neighbors=neighbors, untrained=untrained, located=located)
         return problem, Run(solved, jax.jit(self.step.init)(solved))

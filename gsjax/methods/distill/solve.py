@@ -26,7 +26,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from gsjax.geometry.neighbors import nearest_neighbors
 from gsjax.methods.distill.config import DistillConfig
 from gsjax.methods.distill.field import FeatureField
 from gsjax.methods.distill.teacher import Teacher
@@ -36,7 +35,7 @@ from gsjax.optim.step import Step, all_finite
 from gsjax.rasterize.frozen import paint_shown, rows_within, strip_of
 
 _LEAST = 1e-12
-_TOLD = 0.05  # share of the pixels that show a Gaussian that must have a teacher
+_TAUGHT = 0.05  # share of the pixels that show a Gaussian that must have a teacher
 _SPREAD = 64  # most neighbours over which a vector spreads to Gaussians that no pixel shows
 
 
@@ -189,16 +188,6 @@ def basis_of(teacher: Teacher, config: DistillConfig) -> Float[np.ndarray, "d r"
     return np.ascontiguousarray(vectors[:, : min(rank, config.channels, teacher.dimension)])
 
 
-def graph_of(means: Float[Array, "n 3"], config: DistillConfig) -> Int[Array, "n k"]:
-    """The neighbours of each Gaussian; itself where there are too few. On the host.
-
-    Args:
-        means: centres of the Gaussians, metres; one that is not finite is its own neighbour.
-        config: the number of neighbours.
-    """
-    return jnp.asarray(nearest_neighbors(np.asarray(means), config.solve.neighbors), jnp.int32)
-
-
 def _targets_drawn_back(batch: Batch, config: DistillConfig) -> _Sums:
     """W^T M alpha e, W^T M alpha and W^T alpha of a view."""
     features = batch.map if batch.codebook is None else batch.codebook
@@ -296,8 +285,8 @@ def _voted(field: FeatureField, state: SolveState, neighbors, smoothness: float)
     seen = state.mass > _LEAST
     votes = jnp.where(seen[:, None], state.total / jnp.maximum(state.mass, _LEAST)[:, None], 0.0)
     tie = smoothness * state.mass.sum() / jnp.maximum(seen.sum(), 1)
-    found = _spread(votes, seen | _untold(state), neighbors)
-    field = eqx.tree_at(lambda f: f.encoding, field, _without_untold(found, state))
+    found = _spread(votes, seen | _untaught(state), neighbors)
+    field = eqx.tree_at(lambda f: f.encoding, field, _without_untaught(found, state))
     return field, state._replace(wanted=state.total, tie=tie)
 
 
@@ -316,18 +305,18 @@ def _advanced(field: FeatureField, state: SolveState, neighbors):
     product = state.total + state.tie * _laplacian(state.conjugate.direction, neighbors)
     scale = _preconditioner(state, neighbors)
     x, after = advanced(field.encoding, state.conjugate, product, scale)
-    field = eqx.tree_at(lambda f: f.encoding, field, _without_untold(x, state))
+    field = eqx.tree_at(lambda f: f.encoding, field, _without_untaught(x, state))
     return field, state._replace(conjugate=after, loss=_objective(x, after.residual, state))
 
 
-def _untold(state: SolveState) -> Bool[Array, "n"]:
+def _untaught(state: SolveState) -> Bool[Array, "n"]:
     """The Gaussians that pixels show, but hardly any that has a teacher."""
-    return (state.shown > _LEAST) & (state.mass <= _TOLD * state.shown)
+    return (state.shown > _LEAST) & (state.mass <= _TAUGHT * state.shown)
 
 
-def _without_untold(x: Float[Array, "n r"], state: SolveState) -> Float[Array, "n r"]:
-    """The vectors, zeros for those that nobody has told anything of."""
-    return jnp.where(_untold(state)[:, None], 0.0, x)
+def _without_untaught(x: Float[Array, "n r"], state: SolveState) -> Float[Array, "n r"]:
+    """The vectors, zeros for those that no pixel has taught."""
+    return jnp.where(_untaught(state)[:, None], 0.0, x)
 
 
 def _preconditioner(state: SolveState, neighbors: Int[Array, "n k"]) -> Float[Array, "n"]:

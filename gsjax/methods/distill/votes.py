@@ -16,6 +16,8 @@ from jaxtyping import Array, Float, Int
 from gsjax.rasterize.frozen import FrozenView, paint_shown
 from gsjax.rasterize.plan import Plan
 
+_AT_ONCE = 32  # labels that are counted at once
+
 
 @partial(jax.jit, static_argnames=("plan", "count"))
 def label_votes(
@@ -34,10 +36,11 @@ def label_votes(
     return back(ballots)[0]
 
 
-def majority_labels(
+def voted_labels(
     views: Sequence[tuple[FrozenView, Plan]], ids: Sequence[np.ndarray], count: int, num: int
-) -> Int[np.ndarray, "n"]:
-    """The label with the most votes over all views, for each of `num` Gaussians; -1 for one without votes.
+) -> tuple[Int[np.ndarray, "n"], Float[np.ndarray, "n"]]:
+    """The label with the most votes over all views, for each of `num` Gaussians, and the votes for all labels
+    together, which are 0 where no pixel votes.
 
     Args:
         views: frozen views with their plans.
@@ -45,7 +48,16 @@ def majority_labels(
         count: number of labels.
         num: number of Gaussians.
     """
-    votes = np.zeros((num, count))
-    for (view, plan), one in zip(views, ids, strict=True):
-        np.add.at(votes, np.asarray(view.rows), np.asarray(label_votes(view, plan, jnp.asarray(one), count)))
-    return np.where(votes.max(axis=1) > 0, votes.argmax(axis=1), -1)
+    best, most, total = np.zeros(num, int), np.zeros(num), np.zeros(num)
+    for first in range(0, count, _AT_ONCE):
+        some = min(_AT_ONCE, count)  # one program for all
+        votes = np.zeros((num, some))
+        for (view, plan), pixels in zip(views, ids, strict=True):
+            here = np.where((pixels >= first) & (pixels < first + some), pixels - first, -1)
+            np.add.at(
+                votes, np.asarray(view.rows), np.asarray(label_votes(view, plan, jnp.asarray(here), some))
+            )
+        better = votes.max(axis=1) > most
+        best[better] = first + votes.argmax(axis=1)[better]
+        most, total = np.maximum(most, votes.max(axis=1)), total + votes.sum(axis=1)
+    return best, total

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from functools import lru_cache, partial
+from functools import partial
 from typing import NamedTuple
 
 import cv2
@@ -21,7 +21,7 @@ from gsjax.methods.fit.padding import with_common_sizes
 from gsjax.methods.fit.start import initial_gaussians, start_points
 from gsjax.methods.fit.update import Batch, fit_step, grow, slots_wanted, split
 from gsjax.methods.sampling import shuffled_index
-from gsjax.optim.compiler import host_options
+from gsjax.optim.compiler import host_jit
 from gsjax.optim.densification import is_alive
 from gsjax.optim.method import Run
 from gsjax.optim.step import Step
@@ -183,31 +183,24 @@ class Fit:
         when = config.growth if config.strategy == "relocate" else config.split
         if step < when.begin or step % when.every or progress >= when.end:
             return run
-        room = config.cap  # which is more than there are where a run goes on with more
+        room = config.cap  # a run that goes on with a larger one has fewer slots until here
         if config.strategy == "split":
             room = min(room, rung(int(slots_wanted(run.params, run.state, config))))
         run = self._enlarged(run, slots=room)
         key = jax.random.fold_in(jax.random.fold_in(jax.random.key(config.seed), _GROWTH), step)
         seen = _all_seen_since(config, step, len(problem.frames))
-        params, state = _compiled_growth(config)(
-            run.params, run.state, key, step, seen, problem.extent.radius
-        )
+        params, state = _densified(run.params, run.state, key, step, seen, problem.extent.radius, config)
         return run.having(params=params, state=state)
 
 
-@lru_cache(maxsize=2)
-def _compiled_growth(config: FitConfig) -> Callable:
-    """The jitted relocation or splitting, which donates its buffers."""
-
-    @partial(jax.jit, compiler_options=host_options(), donate_argnums=(0, 1))
-    def densify(model, optimizer, key, step, all_seen, radius):
-        if config.strategy == "relocate":
-            return grow(model, optimizer, key, config.cap, config.growth.factor, all_seen)
-        every, between = config.split.reset_every, config.split.every
-        reset = step // every > jnp.maximum(step - between, 0) // every
-        return split(model, optimizer, key, config, radius, reset, step > every, all_seen)
-
-    return densify
+@partial(host_jit, static_argnames="config", donate_argnums=(0, 1))
+def _densified(model, optimizer, key, step, all_seen, radius, config: FitConfig):
+    """The model and its optimizer after relocation or splitting."""
+    if config.strategy == "relocate":
+        return grow(model, optimizer, key, config.cap, config.growth.factor, all_seen)
+    every, between = config.split.reset_every, config.split.every
+    reset = step // every > jnp.maximum(step - between, 0) // every
+    return split(model, optimizer, key, config, radius, reset, step > every, all_seen)
 
 
 def shrink_at(config: FitConfig, progress: float) -> int:

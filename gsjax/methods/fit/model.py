@@ -9,10 +9,9 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from gsjax.geometry.cameras import perturbed
-from gsjax.geometry.spherical_harmonics import num_sh_bases
 from gsjax.methods.fit.config import FitConfig
 from gsjax.optim.densification import EMPTY_LOGIT
-from gsjax.scene.gaussians import Gaussians
+from gsjax.scene.gaussians import Gaussians, with_sh_degree
 
 
 class Model(eqx.Module):
@@ -82,13 +81,9 @@ def refined(
 
 def with_degree(model: Model, degree: int) -> Model:
     """The model with spherical harmonics up to a degree; new coefficients are zero."""
-    gaussians = model.gaussians
-    missing = num_sh_bases(degree) - num_sh_bases(gaussians.sh_degree)
-    if missing <= 0:
+    if degree <= model.gaussians.sh_degree:
         return model
-    zeros = jnp.zeros((gaussians.num, missing, 3), gaussians.sh0.dtype)
-    shN = zeros if gaussians.shN is None else jnp.concatenate([gaussians.shN, zeros], axis=1)
-    return eqx.tree_at(lambda m: m.gaussians.shN, model, shN, is_leaf=lambda leaf: leaf is None)
+    return eqx.tree_at(lambda m: m.gaussians, model, with_sh_degree(model.gaussians, degree))
 
 
 def with_slots(model: Model, count: int) -> Model:

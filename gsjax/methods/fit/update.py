@@ -97,8 +97,8 @@ def fit_loss(config: FitConfig, extra_losses: ExtraLosses = ()) -> Callable:
         if extra_losses:
             rendered = drawn._replace(colors=image)
             seen = Frame(target, frame.depths, camera, frame.masks)
-            told = {"index": batch.view, "progress": batch.progress}
-            aux["extra"] = extra_terms(extra_losses, model, rendered, seen, **told)
+            context = {"index": batch.view, "progress": batch.progress}
+            aux["extra"] = extra_terms(extra_losses, model, rendered, seen, **context)
             value += sum(aux["extra"].values())
         return value, aux
 
@@ -224,10 +224,13 @@ def split(
     moved = keep_if(jnp.asarray(reset), reset_opacities(moved), moved)
     every = jnp.full_like(touched, True)
 
+    def is_masked(node):  # another part of the optimizer has that field
+        return isinstance(node, optax.MaskedNode)
+
     def reset_moments(moments: Gaussians) -> Gaussians:
         moments = reset_rows(moments, touched)
         logits = reset_rows(moments.logit_opacities, every & reset)
-        return eqx.tree_at(lambda g: g.logit_opacities, moments, logits, is_leaf=_is_masked)
+        return eqx.tree_at(lambda g: g.logit_opacities, moments, logits, is_leaf=is_masked)
 
     state = _map_nodes(Gaussians, reset_moments, state)
     state = _map_nodes(Pull, lambda pull: reset_rows(pull, every), state)
@@ -248,11 +251,6 @@ def _map_nodes(kind: type, function: Callable, tree: Any) -> Any:
         return isinstance(node, kind)
 
     return jax.tree.map(lambda node: function(node) if is_kind(node) else node, tree, is_leaf=is_kind)
-
-
-def _is_masked(node: Any) -> bool:
-    """Whether a node stands for a field that another part of the optimizer handles."""
-    return isinstance(node, optax.MaskedNode)
 
 
 def _pull_of(state: Any) -> Pull:

@@ -1,9 +1,8 @@
 """Parts that are not there in some frames: they have left, or are yet to come. There, the pictures show other
 colours in their places, and are explained better without them."""
 
-from functools import lru_cache, partial
+from functools import partial
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
@@ -14,7 +13,7 @@ from gsjax.methods.parts.pictures import Problem, coarse_frame, with_part_masks
 from gsjax.methods.parts.search import POINTS, color_differences, colors_of, most_visible
 from gsjax.methods.parts.stream import Canonical, picture_loss, posed
 from gsjax.methods.parts.trajectory import BACKGROUND
-from gsjax.optim.compiler import host_options
+from gsjax.optim.compiler import host_jit
 from gsjax.rasterize.plan import Plan, with_room
 from gsjax.scene.frame import Frame, one_camera
 from gsjax.scene.handles import skin
@@ -101,7 +100,7 @@ class _Explained:
 
     def __init__(self, problem: Problem, discovery: Discovery, config: PartsConfig):
         self._discovery, self._weights, self._blend = discovery, discovery.weights, config.stream.blend
-        self._loss, self._headroom = loss_of_picture(config.stream), 2 * config.headroom
+        self._config, self._headroom = config.stream, 2 * config.headroom
         self._plan: Plan | None = None
         self._cameras = problem.sequence.num_cameras
 
@@ -130,8 +129,10 @@ class _Explained:
         return losses[0.0] < losses[1.0]
 
     def _of(self, frame: Frame, pose, shown: Float[Array, "P"]) -> float:
-        draw = partial(self._loss, self._discovery.canonical, self._weights, pose, frame, opacities=shown)
-        loss, self._plan = with_room(lambda plan: draw(plan=plan), self._plan, self._headroom)
+        scene = self._discovery.canonical, self._weights, pose
+        loss, self._plan = with_room(
+            lambda plan: loss_of_picture(*scene, frame, plan, self._config, shown), self._plan, self._headroom
+        )
         return float(loss)
 
     def _chosen(self, t: int) -> list[int]:
@@ -140,18 +141,19 @@ class _Explained:
         return sorted({(t + k * self._cameras // count) % self._cameras for k in range(count)})
 
 
-@lru_cache(maxsize=2)
-def loss_of_picture(config: StreamConfig):
-    """The jitted loss of a picture of one camera, and what drawing it needed.
+@partial(host_jit, static_argnames=("plan", "config"))
+def loss_of_picture(
+    canonical: Canonical, weights, pose, frame: Frame, plan: Plan, config: StreamConfig, opacities=None
+):
+    """The loss of a picture of one camera, and what drawing it needed.
 
     Args:
+        canonical, weights, pose: the scene; see `posed`.
+        frame: the camera and its picture.
+        plan: capacities of the picture.
         config: settings.
+        opacities: factors of the parts' opacities, or None.
     """
-
-    @partial(jax.jit, static_argnames="plan", compiler_options=host_options())
-    def loss(canonical: Canonical, weights, pose, frame, plan, opacities=None):
-        scene = posed(canonical, weights, pose, config.blend, opacities=opacities)
-        drawn = render(scene, frame.cameras, plan, roi=frame.masks)
-        return picture_loss(drawn, frame, config), drawn.meta
-
-    return loss
+    scene = posed(canonical, weights, pose, config.blend, opacities=opacities)
+    drawn = render(scene, frame.cameras, plan, roi=frame.masks)
+    return picture_loss(drawn, frame, config), drawn.meta

@@ -14,7 +14,7 @@ from gsjax.methods.parts.discover import Start, radii_of
 from gsjax.methods.parts.screws import pose_from
 from gsjax.methods.parts.stream import Canonical, StreamParams, skinning_weights, stream_step
 from gsjax.methods.parts.trajectory import BACKGROUND
-from gsjax.methods.parts.unify import Motions, best_cut, motions_of, unified
+from gsjax.methods.parts.unify import Motions, best_cut, scene_motions, unified
 from gsjax.methods.parts.weights import fit_field_to_weights
 from gsjax.optim.method import Run
 from gsjax.optim.step import copied
@@ -89,7 +89,7 @@ class Discovery(NamedTuple):
         """The motions of all parts, in the order in which frames were found."""
         order = np.argsort(self.found)[-self.count - 1 :]
         rotations = np.asarray(quats_to_matrices(jax.device_put(self.quats[order])))
-        return motions_of(rotations, self.translations[order], np.asarray(self.canonical.centers))
+        return scene_motions(rotations, self.translations[order], np.asarray(self.canonical.centers))
 
 
 def order_of_frames(frames: int, anchor: int) -> list[int]:

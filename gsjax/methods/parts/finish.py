@@ -111,7 +111,7 @@ class _MeanLoss:
         weights: Float[np.ndarray, "M P"],
         config: PartsConfig,
     ):
-        self._loss = loss_of_picture(config.stream)
+        self._loss = partial(loss_of_picture, config=config.stream)
         self._canonical, self._headroom = discovery.canonical, 2 * config.headroom
         done, count = np.flatnonzero(discovery.done), problem.sequence.num_cameras
         most = min(_PICTURES // _CAMERAS, len(done))

@@ -98,9 +98,9 @@ def with_what_moves(
     means, weights = np.asarray(gaussians.means), weights.copy()
     known = weights[:, BACKGROUND] < 1 - _LEAST_WEIGHT
     for group in _connected(gaussians, np.flatnonzero(moves)):
-        told, untold = group[known[group]], group[~known[group]]
-        if len(told):
-            weights[untold] = weights[told[cKDTree(means[told]).query(means[untold])[1]]]
+        placed, stray = group[known[group]], group[~known[group]]
+        if len(placed):
+            weights[stray] = weights[placed[cKDTree(means[placed]).query(means[stray])[1]]]
     belongs = moves & (weights[:, BACKGROUND] < 1 - _LEAST_WEIGHT)
     weights[belongs, BACKGROUND] = 0
     return weights / weights.sum(-1, keepdims=True)

@@ -113,8 +113,8 @@ def refine_step(config: PartsConfig, extra_losses: ExtraLosses = ()) -> Step:
             value = picture_loss(drawn, batch.frame, config.stream)
             if extra_losses:
                 scene = PosedScene(moved, batch.weights, pose)
-                told = {"index": batch.t, "camera": batch.camera, "progress": batch.progress}
-                info["extra"] = extra_terms(extra_losses, scene, drawn, batch.frame, **told)
+                context = {"index": batch.t, "camera": batch.camera, "progress": batch.progress}
+                info["extra"] = extra_terms(extra_losses, scene, drawn, batch.frame, **context)
                 value += sum(info["extra"].values())
             return value, info
 

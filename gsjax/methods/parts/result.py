@@ -10,7 +10,7 @@ from gsjax.geometry.joints import FittedJoint, fit_joint
 from gsjax.geometry.rotations import quats_to_matrices
 from gsjax.methods.parts.film import Layer
 from gsjax.methods.parts.trajectory import BACKGROUND, PartScene, Trajectory, gaussians_at, moment
-from gsjax.methods.parts.unify import motions_of
+from gsjax.methods.parts.unify import scene_motions
 from gsjax.scene.gaussians import Gaussians
 from gsjax.scene.handles import Blend, HandlePose
 
@@ -90,5 +90,5 @@ def motions_in_world(scene: PartScene, trajectory: Trajectory) -> Float[np.ndarr
         np.asarray(array, np.float64) for array in (quats_to_matrices(quats), translations, scene.centers)
     )
     motions = np.broadcast_to(np.eye(4), (*rotations.shape[:2], 4, 4)).copy()
-    motions[..., :3, :3], motions[..., :3, 3] = motions_of(rotations, shifts, centers)
+    motions[..., :3, :3], motions[..., :3, 3] = scene_motions(rotations, shifts, centers)
     return motions

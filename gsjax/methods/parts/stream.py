@@ -254,8 +254,8 @@ def stream_loss(config: StreamConfig, extra_losses: ExtraLosses = ()) -> Callabl
             value += info["past"]
         if extra_losses:
             scene = PosedScene(gaussians, weights, params.pose)
-            told = {"index": batch.index, "camera": batch.camera, "progress": batch.progress}
-            info["extra"] = extra_terms(extra_losses, scene, drawn, batch.now, **told)
+            context = {"index": batch.index, "camera": batch.camera, "progress": batch.progress}
+            info["extra"] = extra_terms(extra_losses, scene, drawn, batch.now, **context)
             value += sum(info["extra"].values())
         return value, info
 

@@ -33,7 +33,7 @@ class Motions(NamedTuple):
         return Motions(self.rotations[frame:], self.offsets[frame:])
 
 
-def motions_of(
+def scene_motions(
     rotations: Float[np.ndarray, "T P 3 3"],
     translations: Float[np.ndarray, "T P 3"],
     centers: Float[np.ndarray, "P 3"],

@@ -7,9 +7,8 @@ is optimised photometrically, like a scene from depth: shapes too wide for their
 """
 
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-from functools import cache
 from types import SimpleNamespace
 from typing import Protocol, runtime_checkable
 
@@ -31,7 +30,7 @@ from gsjax.methods.track.layers import render_labels
 from gsjax.methods.track.motion import Motion, first_pose, move, place
 from gsjax.methods.track.refine import RefineBatch, refine
 from gsjax.methods.track.scene import TrackedScene, assemble
-from gsjax.optim.compiler import host_options
+from gsjax.optim.compiler import host_jit
 from gsjax.rasterize.plan import with_room
 from gsjax.scene.frame import Frame
 from gsjax.scene.gaussians import Gaussians, gaussians_from_activated
@@ -291,7 +290,7 @@ def _refined(scene: TrackedScene, frame: Frame, config: TrackConfig) -> TrackedS
 
     def refined(plan):
         batch = RefineBatch(scene, frame, plan, pose, centers, roi)
-        motion, _, info = _refine_rigidly()(still, batch, rates)
+        motion, _, info = _refine_rigidly(still, batch, rates)
         return motion, SimpleNamespace(**info)
 
     motion, _ = with_room(refined, plan, config.headroom)
@@ -299,7 +298,4 @@ def _refined(scene: TrackedScene, frame: Frame, config: TrackConfig) -> TrackedS
     return eqx.tree_at(lambda s: s.gaussians, scene, moved)
 
 
-@cache
-def _refine_rigidly() -> Callable:
-    """The jitted refinement, made on first use, because its compiler options depend on the machine."""
-    return jax.jit(refine, static_argnums=2, compiler_options=host_options())
+_refine_rigidly = host_jit(refine, static_argnums=2)

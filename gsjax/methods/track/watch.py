@@ -100,7 +100,7 @@ class Watch(NamedTuple):
             elsewhere: groups of which more shows in another place than in their own.
             relocated: those of them that were moved there.
             searches: number of searches elsewhere that a group on probation has to pass; 0 where none is
-                possible, so that it passes once its turn is told.
+                possible, so that it passes once its turn is known.
         """
         agreement, conclusive = confidence.agreement, confidence.conclusive
         there = is_found(confidence, self.showed)
@@ -112,13 +112,13 @@ class Watch(NamedTuple):
         lost = jnp.where(self.lost | relocated, ~found, (agreement < least) | dropped)
         lost = jnp.where(conclusive, lost, self.lost)
 
-        told = (self.probation == 1) & jnp.isfinite(result.leads) & conclusive
-        told &= agreement > _FOUND_TURN_AGREEMENT
+        confirmed = (self.probation == 1) & jnp.isfinite(result.leads) & conclusive
+        confirmed &= agreement > _FOUND_TURN_AGREEMENT
         passed = (self.probation > 1) & result.relocation_tried & ~elsewhere
-        probation = self.probation - (passed | told)
+        probation = self.probation - (passed | confirmed)
         probation = jnp.where(self.lost | relocated, 1.0 + searches, probation)
         probation = jnp.where(lost, 0.0, probation)
-        turn_known = (self.turn_known | told) & (probation == 0) & (result.leads > TURN_KNOWN) & ~lost
+        turn_known = (self.turn_known | confirmed) & (probation == 0) & (result.leads > TURN_KNOWN) & ~lost
 
         found_elsewhere = elsewhere & is_found(result.relocation.confidence, self.showed)
         residuals = jnp.maximum(residuals, _RESIDUAL_FLOOR)

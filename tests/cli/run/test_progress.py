@@ -45,7 +45,7 @@ def test_what_a_version_before_saved_is_refused(tmp_path):
     run, progress = Run(jnp.zeros(2), None), Progress({"the scene": "1"})
     assert load_run(tmp_path, run, progress)[0] is run
     header = json.dumps({"format": 1, "metadata": {}, "sha256": ""})
-    np.savez(tmp_path / "state.npz", __header__=np.array(header))
+    np.savez(tmp_path / "step-00000002.npz", __header__=np.array(header))
     with pytest.raises(
         CheckpointError, match="found format 1, written by another version of gsjax; start again"
     ):

@@ -22,14 +22,14 @@ from gsjax.methods.distill import (
     init_field,
     label_votes,
     learned_inverse,
-    majority_labels,
     pixel_cosines,
     pixel_features,
     rendered_features,
     teacher_of_maps,
     teacher_of_objects,
+    voted_labels,
 )
-from gsjax.methods.query import relevancy, threshold_for
+from gsjax.methods.query import EVEN, Prompt, relevancy
 from gsjax.rasterize.frozen import paint_shown
 from gsjax.scene.feature_grid import FeatureGridConfig, locate
 from tests.methods.distill.two_balls import BOOK, DIMENSION, HEIGHT, WIDTH, cameras, painted, two_balls
@@ -174,7 +174,7 @@ def test_2d_and_3d_agree_and_occluded_objects_are_selected_whole(two_balls, lear
     assert hidden
     query = BOOK[[2, 0, 1]]
     scores = relevancy(cosines_now(learned, given.views[0].located, query))
-    selected = np.asarray(scores > threshold_for(np.asarray(scores), True).value)
+    selected = np.asarray(scores > EVEN)
     assert (selected == (labels == 2)).mean() > 0.97
     for v, (view, plan) in enumerate(frozen_views(scene, cameras(8))):
         parts = rendered_now(learned, given.views[0].located, view.rows)
@@ -225,13 +225,16 @@ def test_the_pseudo_inverse_is_exact_up_to_a_factor_for_orthonormal_columns(lear
 
 def test_a_threshold_names_its_rule():
     scores = np.concatenate([np.full(50, 0.1), np.full(10, 0.8)])
-    assert threshold_for(scores, False, 0.3) == (0.3, "given")
-    assert threshold_for(scores, True) == (0.5, "better than each negative")
-    value, rule = threshold_for(scores, False)
+    alone, against = Prompt(BOOK[:1]), Prompt(BOOK[:2], ("a ball",))
+    assert alone.threshold(scores, 0.3) == against.threshold(scores, 0.3) == (0.3, "given")
+    assert against.threshold(scores) == (0.5, "better than each negative")
+    assert against._replace(rule="nearest name").threshold(scores) == (0.5, "nearest name")
+    assert alone._replace(min_score=0.2).threshold(scores) == (0.2, "the encoder's own")
+    value, rule = alone.threshold(scores)
     assert 0.1 <= value < 0.8
     assert rule == "Otsu"
-    assert threshold_for(np.full(9, 0.4), False).value == np.inf  # nothing tells them apart
-    assert threshold_for(np.full(9, np.nan), False).value == np.inf
+    assert alone.threshold(np.full(9, 0.4)).value == np.inf  # nothing tells them apart
+    assert alone.threshold(np.full(9, np.nan)).value == np.inf
 
 
 def test_the_share_is_a_half_where_query_and_negative_match_equally():
@@ -284,8 +287,8 @@ def test_votes_are_the_light_that_gaussians_send_to_labels(two_balls):
 
 def test_a_majority_of_true_masks_is_the_truth(two_balls):
     scene, labels, masks = two_balls
-    found = majority_labels(frozen_views(scene, cameras(8)), masks, 3, scene.num)
-    seen = found >= 0
+    found, votes = voted_labels(frozen_views(scene, cameras(8)), masks, 3, scene.num)
+    seen = votes > 0
     assert seen.mean() > 0.9
     assert (found[seen] == labels[seen]).mean() > 0.97
 

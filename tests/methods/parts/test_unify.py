@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from gsjax.methods.parts.unify import best_cut, extent, gap, motions_of, unified
+from gsjax.methods.parts.unify import best_cut, extent, gap, scene_motions, unified
 
 T = 6
 seeds = st.integers(0, 10_000)
@@ -17,7 +17,7 @@ def motions(*bodies):
     still = np.zeros((T, 3)), np.zeros((T, 3))
     turns, shifts = zip(still, *bodies, strict=True)
     rotations = np.stack([Rotation.from_rotvec(turn).as_matrix() for turn in turns], axis=1)
-    return motions_of(rotations, np.stack(shifts, axis=1), np.zeros((len(turns), 3)))
+    return scene_motions(rotations, np.stack(shifts, axis=1), np.zeros((len(turns), 3)))
 
 
 def ramp(*end):
@@ -50,7 +50,7 @@ def test_the_pivot_does_not_matter(points):
     centers = np.array([[0, 0, 0], [-0.05, 0, 0], [0.05, 0, 0]])
     shifts = np.stack([rotations @ c - c for c in centers], axis=1)
     every = np.stack([np.tile(np.eye(3), (T, 1, 1)), rotations, rotations], axis=1)
-    found = motions_of(every, shifts, centers)
+    found = scene_motions(every, shifts, centers)
     np.testing.assert_allclose(found.offsets, 0, atol=1e-12)
     assert np.abs(shifts[-1, 1] - shifts[-1, 2]).max() > 0.05
     assert len(set(joined(found, *points))) == 2

@@ -56,13 +56,13 @@ def costs_of(
         frame: all cameras of the other state.
         spacing: between the points, metres.
     """
-    said = evidence(moved(motion, surface.points), turned(motion, surface.normals), frame, 4 / 3 * spacing)
+    found = evidence(moved(motion, surface.points), turned(motion, surface.normals), frame, 4 / 3 * spacing)
     match = matched(motion, surface, target, spacing)
     fits = (match.far < spacing) & (match.cosines > _SAME_WAY)
     off = np.maximum(match.unlike / _SAME_COLOR, (match.off / spacing) ** 2)
-    unsure = np.where(said.there > 0, _THERE, _UNKNOWN)
+    unsure = np.where(found.there > 0, _THERE, _UNKNOWN)
     cost = np.where(fits, 0.5 * _UNKNOWN * np.minimum(off, 1), unsure)
-    return np.where(said.seen, cost + (1 - _UNKNOWN) * np.minimum(3 * said.share, 1), _UNKNOWN)
+    return np.where(found.seen, cost + (1 - _UNKNOWN) * np.minimum(3 * found.share, 1), _UNKNOWN)
 
 
 def labels_of(

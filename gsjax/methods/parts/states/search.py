@@ -106,8 +106,8 @@ def states_of(before: Frame, after: Frame, seed: int = 0) -> States:
 
 def _seen_through(surface: Surface, other: Frame, pixel: float) -> Bool[np.ndarray, "n"]:
     """The points of a state that are not there in the other."""
-    said = evidence(surface.points, None, other, _TOLERANCE * pixel)
-    away = (said.through >= _LEAST_THROUGH[0]) & (said.share > _LEAST_THROUGH[1])
+    seen = evidence(surface.points, None, other, _TOLERANCE * pixel)
+    away = (seen.through >= _LEAST_THROUGH[0]) & (seen.share > _LEAST_THROUGH[1])
     near = cKDTree(surface.points).query(surface.points, k=min(_SMOOTH, len(away)))[1]
     return away[near.reshape(len(away), -1)].mean(1) > 0.5
 
@@ -182,7 +182,7 @@ def _explaining(
     those before have not used; of motions that explain as much, the shorter. What goes where no camera sees
     is explained in part."""
 
-    def said(motion: Float[np.ndarray, "4 4"]) -> Evidence:
+    def evidence_for(motion: Float[np.ndarray, "4 4"]) -> Evidence:
         return evidence(moved(motion, some.points), turned(motion, some.normals), after, _TOLERANCE * pixel)
 
     def explained(motion: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "n"]:
@@ -190,7 +190,7 @@ def _explaining(
         fits = np.maximum(fits, likeness(motion, some, new, _TOLERANCE * pixel, _COLOR))
         if fits.mean() < _EXPLAINS:
             return np.zeros_like(fits)
-        return fits * (said(motion).share <= _BLOCKED)
+        return fits * (evidence_for(motion).share <= _BLOCKED)
 
     def worth(motion: Float[np.ndarray, "4 4"], mine: Bool[np.ndarray, "n"]) -> float:
         way = np.linalg.norm(moved(motion, some.points[mine]) - some.points[mine], axis=-1).mean()
@@ -228,7 +228,7 @@ def _explaining(
         motions.append(motion)
         mine = explained(motion) > 0
         beside = cKDTree(some.points[mine]).query(some.points)[0] < _ALONGSIDE * pixel
-        known, hidden = known | mine, hidden | (beside & ~said(motion).seen)
+        known, hidden = known | mine, hidden | (beside & ~evidence_for(motion).seen)
         there = cKDTree(moved(motion, some.points[mine]))
         used |= there.query(new.surface.points, distance_upper_bound=2 * _SPACING * pixel)[0] < np.inf
     return motions
