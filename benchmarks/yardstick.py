@@ -196,7 +196,7 @@ def _needed(case: Case, chosen: Sequence[Case], runs: Path) -> bool:
 def _environment(out: Path, optimized: bool) -> dict[str, str]:
     """Environment of all processes: this checkout, a cache of its own for features, and XLA's flags."""
     return {
-        "JAX_COMPILATION_CACHE_DIR": str(out / "programs"),
+        "JAX_COMPILATION_CACHE_DIR": str((out / "programs").resolve()),
         "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
         "JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES": "0",
         **os.environ,

@@ -6,7 +6,6 @@ from tests.docs.blocks import ROOT
 
 PRIVATE = re.compile("papers" + r"/00\d|" + "METHODS" + r"\.md")
 """Names of files that only the first authors had: `SurstSplat, eq. 13` says where to look instead."""
-NOT_YET = ("gsjax/cli",)  # still being mended: remove this line and the `if` below that reads it
 FOLDERS = ("gsjax", "experiments", "benchmarks", "docs", "tests")
 TEXTS = (".py", ".md", ".toml", ".yml", ".yaml", ".json", ".bib", ".txt")
 
@@ -17,7 +16,5 @@ def test_no_file_names_papers_that_only_their_authors_have():
     assert len(files) > 500
     for path in files:
         name = path.relative_to(ROOT).as_posix()
-        if name.startswith(NOT_YET):
-            continue
         found = PRIVATE.search(path.read_text(encoding="utf-8", errors="ignore"))
         assert not found, f"{name}: expected a paper as in docs/references.md, found {found[0]}"
