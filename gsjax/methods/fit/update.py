@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
+from gsjax.geometry.cameras import Camera
 from gsjax.losses.extra import ExtraLosses, extra_terms, named_losses
 from gsjax.losses.photometric import photometric_loss, weighted_mean
 from gsjax.methods.fit.config import FitConfig
@@ -20,7 +21,7 @@ from gsjax.optim.step import Step, all_finite, gradient_step, keep_if, per_field
 from gsjax.rasterize.plan import Plan
 from gsjax.scene.frame import Frame
 from gsjax.scene.gaussians import Gaussians
-from gsjax.scene.render import render
+from gsjax.scene.render import Rendered, render
 
 _FINAL_RATE = 0.01  # learning rates of means and twists in the last step, relative to the first
 
@@ -59,36 +60,22 @@ def fit_loss(config: FitConfig, extra_losses: ExtraLosses = ()) -> Callable:
     """
 
     def loss(model: Model, batch: Batch, *, step: Any, key: Any):
-        frame, radius = batch.frame, batch.radius
-        gaussians, camera = model.gaussians, frame.cameras
-        if model.twists is not None:
-            viewmat = refined(camera.viewmat, model.twists, batch.view, radius)
-            camera = eqx.tree_at(lambda c: c.viewmat, camera, viewmat)
-        # Relative to half the image, so that one threshold suits images of any size.
-        half = jnp.array([camera.width / 2, camera.height / 2], model.nudges.dtype)
-        nudges = model.nudges * (half if batch.share is None else half * batch.share)
-        drawn = render(gaussians, camera, batch.plan, backgrounds=batch.background, means2d_offset=nudges)
-        image = drawn.colors
-        if model.exposures is not None:
-            image = exposed(image, model.exposures, batch.view)
-        target = frame.colors
+        frame, gaussians = batch.frame, model.gaussians
+        drawn, camera = _photographed(model, batch)
+        image, target = drawn.colors, frame.colors
         if frame.masks is not None:  # masked pixels are as photographed: no gradient, no edge
             image = jnp.where(frame.masks[..., None], image, target)
         value = photometric_loss(image, target, config.dssim_weight)
         if batch.share is not None:
             value /= batch.share.prod()
+        if config.depth_weight and frame.depths is not None:
+            value += config.depth_weight * _depth_error(drawn, frame.depths, frame.masks) / batch.radius
+        if config.strategy == "relocate":
+            alive = is_alive(gaussians).astype(value.dtype)
+            value += config.growth.opacity_cost * weighted_mean(gaussians.opacities, alive)
+            value += config.growth.scale_cost * weighted_mean(gaussians.scales.mean(-1), alive) / batch.radius
         counted = 1.0 if frame.masks is None else frame.masks.mean()
         mse = jnp.square(image - target).mean() / counted
-        if config.depth_weight and frame.depths is not None:
-            known = (frame.depths > 0) & jax.lax.stop_gradient(drawn.alphas > 0.5)
-            if frame.masks is not None:
-                known &= frame.masks
-            off = weighted_mean(jnp.abs(drawn.depths - frame.depths), known.astype(value.dtype))
-            value += config.depth_weight * off / radius
-        if config.strategy == "relocate":
-            alive = jax.lax.stop_gradient(is_alive(gaussians).astype(value.dtype))
-            value += config.growth.opacity_cost * weighted_mean(gaussians.opacities, alive)
-            value += config.growth.scale_cost * weighted_mean(gaussians.scales.mean(-1), alive) / radius
         aux = {
             "psnr": -10 * jnp.log10(mse),
             "overflow": drawn.meta.overflow.any(),
@@ -103,6 +90,30 @@ def fit_loss(config: FitConfig, extra_losses: ExtraLosses = ()) -> Callable:
         return value, aux
 
     return loss
+
+
+def _photographed(model: Model, batch: Batch) -> tuple[Rendered, Camera]:
+    """The scene from the photograph's refined pose, at its refined exposure; and the camera there."""
+    camera = batch.frame.cameras
+    if model.twists is not None:
+        viewmat = refined(camera.viewmat, model.twists, batch.view, batch.radius)
+        camera = eqx.tree_at(lambda c: c.viewmat, camera, viewmat)
+    # Relative to half the image, so that one threshold suits images of any size.
+    half = jnp.array([camera.width / 2, camera.height / 2], model.nudges.dtype)
+    nudges = model.nudges * (half if batch.share is None else half * batch.share)
+    behind = batch.background
+    drawn = render(model.gaussians, camera, batch.plan, backgrounds=behind, means2d_offset=nudges)
+    if model.exposures is not None:
+        drawn = drawn._replace(colors=exposed(drawn.colors, model.exposures, batch.view))
+    return drawn, camera
+
+
+def _depth_error(drawn: Rendered, depths: Any, masks: Any) -> Float[Array, ""]:
+    """The mean error of the rendered depth where there is depth, and a scene that is not transparent."""
+    known = (depths > 0) & jax.lax.stop_gradient(drawn.alphas > 0.5)
+    if masks is not None:
+        known &= masks
+    return weighted_mean(jnp.abs(drawn.depths - depths), known.astype(drawn.depths.dtype))
 
 
 def fit_step(config: FitConfig, extra_losses: ExtraLosses = ()) -> Step:
