@@ -30,6 +30,14 @@ _RIGHT = 1.25  # a smaller factor may be noise, or a calibration that is slightl
 _LEAST_SHARE = 0.2  # of the points must agree with some factor, for a verdict
 _TIMES_AS_MANY = 2.0  # as without it
 _ANGLE = np.deg2rad(40)  # between views that may see the same surface
+_FLIP = np.diag([1.0, -1.0, -1.0, 1.0])  # between the axes of OpenCV's and of OpenGL's cameras
+_MISREAD = {
+    "from the camera to the world": np.linalg.inv,
+    "in OpenGL's axes": lambda viewmats: _FLIP @ viewmats,
+    "from the camera to the world, in OpenGL's axes": lambda viewmats: _FLIP @ np.linalg.inv(viewmats),
+}
+"""What poses may be that are read as from the world to the camera in OpenCV's axes, and how to mend them."""
+_MEANT = 0.2, 3.0  # share of the points that must agree with mended poses, and times as many as without
 _JUMP, _FEW = 20.0, 0.1  # in median steps; of all steps
 _SAME_PLACE = 1e-6  # of their distance from the origin
 _LEAST_LEFT = 0.02  # of what masks are asked about: the points in view or, without points, the pixels
@@ -46,8 +54,9 @@ class _View(NamedTuple):
 def check_recording(sequence: Sequence) -> None:
     """Look for mistakes in a recording that no part of it shows by itself.
 
-    Warns with DataWarning if depth is in another unit than the poses; if cameras look away from each other or
-    stand at one place; if time jumps; or if a picture is listed for several frames.
+    Warns with DataWarning if depth is in another unit than the poses, or fits them only if they are inverted
+    or in OpenGL's axes; if cameras look away from each other or stand at one place; if time jumps; or if a
+    picture is listed for several frames.
     """
     name, cameras = sequence.name, sequence.num_cameras
     _check_clock(name, sequence)
@@ -62,7 +71,11 @@ def check_recording(sequence: Sequence) -> None:
         if cameras == 1
         else _simultaneous_pairs(Ks[0], viewmats[0], partial(load, 0))
     )
-    _warn_of_factor(name, _factor_of_pairs(list(pairs)), "that of other views")
+    pairs = list(pairs)
+    factor = _factor_of_pairs(pairs)
+    _warn_of_factor(name, factor, "that of other views")
+    if factor is None and pairs and cameras > 1:
+        _check_conventions(name, pairs)
 
 
 def check_photographs(photographs: Photographs) -> None:
@@ -155,6 +168,22 @@ def _factor_of_pairs(pairs: list[tuple[_View, _View]]) -> float | None:
     fine = coarse * np.linspace(0.94, 1.06, 25)
     best = fine[np.mean([_shares(a, b, fine, 0.3 * _AGREES) for a, b in both], axis=0).argmax()]
     return _verdict(best, shares.mean(0))
+
+
+def _check_conventions(name: str, pairs: list[tuple[_View, _View]]) -> None:
+    """Warns if depth of the cameras agrees only with poses that mean something else."""
+
+    def agree(mended: Callable[[np.ndarray], np.ndarray]) -> float:
+        views = [[view._replace(viewmat=mended(view.viewmat)) for view in pair] for pair in pairs]
+        both = [(a, b) for pair in views for a, b in (pair, pair[::-1])]
+        return float(np.mean([_shares(a, b, np.ones(1)) for a, b in both]))
+
+    as_they_are, shares = agree(np.asarray), {what: agree(mended) for what, mended in _MISREAD.items()}
+    what = max(shares, key=lambda what: shares[what])
+    if shares[what] > max(_MEANT[0], _MEANT[1] * as_they_are):
+        found = f"depth of the cameras agrees in {as_they_are:.0%} of the pixels, and in {shares[what]:.0%}"
+        advice = "give poses from the world to the camera, in OpenCV's axes (x right, y down, z forward)"
+        warnings.warn(f"{name}: {found} if their poses are {what}; {advice}", DataWarning, stacklevel=3)
 
 
 def _verdict(best: float, shares: Float[np.ndarray, "factors"]) -> float | None:

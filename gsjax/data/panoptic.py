@@ -1,7 +1,7 @@
 """The Panoptic layout of Dynamic 3D Gaussians (Luiten et al. 2024), with depth, times and truth added.
 
 train_meta.json        w, h, k[t][c] 3x3, w2c[t][c] 4x4 (OpenCV axes), fn[t][c], cam_id[t][c];
-                       gsjax adds time[t] in seconds and depth_unit_m
+                       gsjax adds time[t] in seconds, depth_unit_m, and label_names {"3": "cup"}
 test_meta.json         the same for held-out cameras, optional; both are merged
 ims/CAM/FRAME.jpg      named in fn
 seg/CAM/FRAME.png      labels, optional, possibly for some cameras only, or only for the first frame
@@ -28,6 +28,7 @@ from gsjax.data.sequence import Sequence
 from gsjax.data.validation import check_intrinsics, check_poses
 from gsjax.geometry.joints import Joint
 from gsjax.io.atomic import write_json, write_npz
+from gsjax.io.brief import brief
 from gsjax.io.pictures import write_png
 
 DEFAULT_DEPTH_UNIT_M = 0.001
@@ -94,6 +95,7 @@ def read_panoptic(path: str | Path, *, depth_unit_m: float | None = None) -> Seq
         load_depth=load_depth if any(_has(root, "depth", name) for name in names[0]) else None,
         load_mask=load_mask if any(_has(root, "seg", name) for name in names[0]) else None,
         truth=_read_truth(root, frames, present),
+        label_names=_names_of_labels(root / META_NAMES[0], meta.get("label_names", {})),
         locate=locate,
     )
 
@@ -101,7 +103,8 @@ def read_panoptic(path: str | Path, *, depth_unit_m: float | None = None) -> Seq
 def write_panoptic(sequence: Sequence, path: str | Path, depth_unit_m: float = 0.0001) -> None:
     """Save a sequence in this layout, with a single train_meta.json and lossless PNG images.
 
-    Truth is saved too; its labels must be those of a tabletop: 2, 3, ... for objects, 1 for a robot.
+    Names of labels are saved too, and truth, whose labels must be those of a tabletop: 2, 3, ... for objects,
+    1 for a robot.
 
     Args:
         sequence: the sequence; all its frames are loaded.
@@ -147,6 +150,8 @@ def write_panoptic(sequence: Sequence, path: str | Path, depth_unit_m: float = 0
         "time": sequence.times.tolist(),
         "depth_unit_m": depth_unit_m,
     }
+    if sequence.label_names:
+        meta["label_names"] = {str(label): name for label, name in sequence.label_names.items()}
     if truth is not None:
         write_npz(root / "truth.npz", {"T_wo": truth.poses})
         write_json(root / "meta.json", {"objects": truth.names, "seg": "0 scene, 1 robot, 2+i objects[i]"})
@@ -253,6 +258,16 @@ def _present_frames(root: Path, names: list[list[str]]) -> list[int]:
         message = f"{root}: {np.sum(~every)} of {len(every)} frames have no image and are left out"
         warnings.warn(message, DataWarning, stacklevel=3)
     return [int(t) for t in np.flatnonzero(every)]
+
+
+def _names_of_labels(path: Path, names: Any) -> dict[int, str]:
+    """Names of mask values, which JSON has as text."""
+    if not isinstance(names, dict) or not all(
+        label.isascii() and label.isdigit() and isinstance(name, str) for label, name in names.items()
+    ):
+        expected = 'label_names to be names of mask values, as in {"3": "cup"}'
+        raise DataError(path, expected, brief(repr(names)), _ADVICE_META)
+    return {int(label): name for label, name in names.items()}
 
 
 def _read_truth(root: Path, frames: int, present: list[int]) -> Truth | None:

@@ -45,8 +45,10 @@ class Sequence:
         height: pixels.
         times: seconds, increasing, [T] float64; if `shared_times`, neighbours may be equal.
         frame_ids: the data's own frame numbers, T of them.
-        Ks: intrinsics in pixels, pixel centres at +0.5, [T,C,3,3] float64.
-        viewmats: world to camera, OpenCV axes, metres, [T,C,4,4] float64.
+        Ks: intrinsics in pixels, pixel centres at +0.5, [T,C,3,3] float64; given as [C,3,3], the same in all
+            frames.
+        viewmats: world to camera, OpenCV axes, metres, [T,C,4,4] float64; given as [C,4,4], the same in all
+            frames.
         load_image: (t, c) -> RGB, [H,W,3] uint8; or floats in 0..1 if `float_images`.
         load_depth: (t, c) -> metres, [H,W], 0 = invalid; or None for a camera without depth.
         load_mask: (t, c) -> labels, [H,W] integers; or None for a camera without masks.
@@ -100,6 +102,10 @@ class Sequence:
         for name in ("times", "Ks", "viewmats"):
             object.__setattr__(self, name, np.asarray(getattr(self, name), np.float64))
         frames, cameras = self.num_frames, self.num_cameras
+        for name, side in (("Ks", 3), ("viewmats", 4)):  # of cameras that do not change
+            if getattr(self, name).shape == (cameras, side, side):
+                of_frames = np.tile(getattr(self, name), (frames, 1, 1, 1))
+                object.__setattr__(self, name, of_frames)
         if cameras == 0:
             raise ValueError("a sequence needs at least one camera, got none. Choose other cameras.")
         if len(set(self.camera_ids)) != cameras:

@@ -42,7 +42,10 @@ def check_loaded(where: str, array: np.ndarray | None, shape: tuple[int, ...], k
     if array is None or array.shape != shape or not np.issubdtype(array.dtype, kind):
         type_name = {np.floating: "floats", np.integer: "integers"}.get(kind) or np.dtype(kind).name
         found = "nothing" if array is None else f"shape {array.shape} of {array.dtype}"
-        raise DataError(where, f"shape {shape} of {type_name}", found, "Correct the file or its loader.")
+        advice = "Correct the file or its loader."
+        if kind is np.floating and array is not None and np.issubdtype(array.dtype, np.integer):
+            advice = "Give metres as floats: divide millimetres by 1000."
+        raise DataError(where, f"shape {shape} of {type_name}", found, advice)
 
 
 def check_background(background: tuple[float, float, float] | None) -> None:

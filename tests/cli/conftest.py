@@ -102,6 +102,7 @@ def standing_still(scene, first, frames, config, **how):
     for t, _ in enumerate(frames, 1):
         seen = np.ones(scene.num_objects, bool)
         info = {"visible": seen, "lost": ~seen, "turn_known": seen, "looked_for": ~seen}
+        info["agrees"] = seen.astype(np.float32)
         yield still_tick(scene, t, info | {"joined": 0, "skipped": False})
 
 

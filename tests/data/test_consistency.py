@@ -116,6 +116,24 @@ def test_cameras_that_look_away_from_each_other(table, moving):
         check_recording(turned)
 
 
+@pytest.mark.parametrize(
+    ("given", "says"),
+    [
+        (np.linalg.inv, "from the camera to the world;"),
+        (lambda right: np.diag([1.0, -1, -1, 1]) @ right, "in OpenGL's axes;"),
+        (
+            lambda right: np.linalg.inv(right) @ np.diag([1.0, -1, -1, 1]),
+            "from the camera to the world, in OpenGL",
+        ),
+    ],
+)
+def test_poses_that_mean_something_else(table, given, says):
+    with warnings.catch_warnings(record=True) as found:
+        warnings.simplefilter("always")
+        check_recording(replace(table, viewmats=given(table.viewmats)))
+    assert any(f"if their poses are {says}" in str(one.message) for one in found)
+
+
 def test_points_that_no_camera_sees(moving):
     scene = photographs_of(moving)
     cloud = cloud_of(scene)

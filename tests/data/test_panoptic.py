@@ -337,6 +337,19 @@ def test_real_recording_with_held_out_cameras(shared_data):
     assert set(np.unique(sequence.mask(0, 0))) == {0, 255}
 
 
+def test_names_of_labels_survive_the_disk_and_others_are_refused(tmp_path):
+    sequence = open_sequence("simulated:tabletop?frames=1&width=32&height=24").select(cameras=[0])
+    write_panoptic(replace(sequence, truth=None, label_names={1: "robot", 3: "cup"}), tmp_path)
+    found = open_sequence(tmp_path)
+    assert found.names_of_labels == {1: "robot", 3: "cup"}
+    meta = json.loads((tmp_path / "train_meta.json").read_text())
+    message = r"train_meta.json: expected label_names to be names of mask values"
+    for names in (["cup"], {"three": "cup"}, {"3": 3}, {"²": "cup"}):
+        (tmp_path / "train_meta.json").write_text(json.dumps(meta | {"label_names": names}))
+        with pytest.raises(DataError, match=message):
+            open_sequence(tmp_path)
+
+
 def test_writing_needs_the_labels_of_a_tabletop(tmp_path):
     scene = tabletop(frames=1, width=16, height=12, cameras=1)
     truth = replace(scene.truth, label_ids=np.array([1, 2, 3, 4]))

@@ -273,7 +273,11 @@ def test_a_point_model_checks_its_shapes():
             r"shape \(5, 6, 3\) of uint8",
         ),
         ({"load_image": lambda t, c: np.zeros((5, 6, 3))}, "image", "float64"),
-        ({"load_depth": lambda t, c: np.zeros((5, 6), np.uint16)}, "depth", "found shape .* of uint16"),
+        (
+            {"load_depth": lambda t, c: np.zeros((5, 6), np.uint16)},
+            "depth",
+            "found shape .* of uint16. Give metres",
+        ),
         ({"load_mask": lambda t, c: np.zeros((4, 6), np.uint8)}, "mask", r"found shape \(4, 6\)"),
         ({"load_mask": lambda t, c: np.zeros((5, 6))}, "mask", "of integers"),
     ],
@@ -281,6 +285,17 @@ def test_a_point_model_checks_its_shapes():
 def test_the_result_of_a_loader_is_checked(changes, kind, says):
     with pytest.raises(DataError, match=f"toy, {kind} of camera 7 in frame 20: .*{says}"):
         getattr(make(**changes), kind)(1, 0)
+
+
+def test_cameras_that_do_not_change_are_given_once():
+    K, viewmats = np.diag([10.0, 10.0, 1.0]), poses(1)[0]
+    viewmats[1, 0, 3] = 0.5
+    fixed = make(Ks=np.stack([K, 2 * K / [1, 1, 2]]), viewmats=viewmats)
+    assert fixed.viewmats.shape == (FRAMES, CAMERAS, 4, 4)
+    np.testing.assert_array_equal(fixed.viewmats[3], viewmats)
+    np.testing.assert_array_equal(fixed.Ks[2, 0], K)
+    with pytest.raises(ValueError, match=r"Ks must have shape \(4, 2, 3, 3\), got \(3, 3\)"):
+        make(Ks=K)
 
 
 def test_messages_name_the_file_where_it_is_known():

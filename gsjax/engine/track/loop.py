@@ -40,14 +40,14 @@ class Tracking:
         joined: number of Gaussians that had joined by each frame.
         update_s: seconds of each update; 0 for the first frame, which is initialisation.
         compile_s: seconds spent compiling, since the run began or was resumed.
-        planning_s: seconds spent on the plan before the first update, including compiling the planner and, of
-            the update, what is not compiled by the end of the first fit.
+        planning_s: seconds spent on the plan and the first look before the first update, without compiling.
         loading_s: seconds that the loop waited for images.
         loop_s: seconds of the whole loop.
         plans: number of plans; more than one means that a plan had become too small.
         visible: [K] per update: which objects some camera saw.
         lost: [K] per update: which objects were not where they were believed to be.
         turn_known: [K] per update: whether the rotation of each object since the first frame is known.
+        agrees: [K] per update: the share of what is seen of each object that agrees with the pictures.
         skipped: number of updates that changed nothing, because a number in them was not finite.
         everywhere: number of groups that each update turned or searched for.
         resumed: number of frames that an earlier run had tracked; 0 without one.
@@ -67,6 +67,7 @@ class Tracking:
     visible: list[np.ndarray] = field(default_factory=list)
     lost: list[np.ndarray] = field(default_factory=list)
     turn_known: list[np.ndarray] = field(default_factory=list)
+    agrees: list[np.ndarray] = field(default_factory=list)
     skipped: int = 0
     everywhere: list[int] = field(default_factory=list)
     resumed: int = 0
@@ -83,6 +84,7 @@ class Tracking:
         self.visible.append(np.asarray(info["visible"]))
         self.lost.append(np.asarray(info["lost"]))
         self.turn_known.append(np.asarray(info["turn_known"]))
+        self.agrees.append(np.asarray(info["agrees"]))
         self.skipped += int(info["skipped"])
 
     @property

@@ -41,6 +41,7 @@ def write_tracking(
         poses=_poses_of(tracking, labels, origin),
         lost=_of_objects(tracking.lost, label_of),
         turn_known=~_of_objects([~known for known in tracking.turn_known], label_of),
+        agrees=_least_of_objects(tracking.agrees, label_of),
         times=times[: tracking.num_frames],
         update_s=np.asarray(tracking.update_s),
     )
@@ -67,6 +68,14 @@ def _of_objects(flags: list[np.ndarray], label_of: np.ndarray) -> Bool[np.ndarra
     rows = np.zeros((1 + len(flags), label_of.max()), bool)
     for t, row in enumerate(flags, 1):
         np.logical_or.at(rows[t], label_of[1:] - 1, row)
+    return rows
+
+
+def _least_of_objects(values: list[np.ndarray], label_of: np.ndarray) -> Float[np.ndarray, "T K"]:
+    """The least value of an update for any part of each object; 1 in the first frame."""
+    rows = np.ones((1 + len(values), label_of.max()), np.float32)
+    for t, row in enumerate(values, 1):
+        np.minimum.at(rows[t], label_of[1:] - 1, row)
     return rows
 
 

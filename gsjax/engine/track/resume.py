@@ -13,7 +13,7 @@ from gsjax.io.atomic import write_npz
 from gsjax.io.checkpoints import CheckpointError, load_checkpoint, save_checkpoint
 from gsjax.methods.track import Pose, Track, TrackConfig, first_pose
 
-_PER_UPDATE = ("visible", "lost", "turn_known")
+_PER_UPDATE = ("visible", "lost", "turn_known", "agrees")
 
 
 class Saver:

@@ -55,6 +55,7 @@ from gsjax.engine.track.scoring import (
 from gsjax.engine.track.views import views
 from gsjax.io.pictures import write_png
 from gsjax.methods.track import PRESETS, TrackConfig, TrackedScene, scene_from_shapes, start_scene
+from gsjax.methods.track.lost import DOUBTFUL
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -197,7 +198,7 @@ def _judge(
     found = _what_ran(tracking, recording, mask, scores, budget_ms)
     found |= metrics(tracking, recording, mask, scores, motion, values, true_labels)
     _note_what_is_missing(found, tracking, recording, mask, values, notes)
-    _note_what_was_lost(tracking, values, names, notes)
+    _note_what_was_lost(found, tracking, values, names, notes)
     media = {
         "plots": write_plots(folder, tracking, recording, scores, motion, names, labels),
         "images": write_first_mask(folder, recording, mask),
@@ -277,8 +278,12 @@ def _note_what_is_missing(
         notes.add("Motion was not scored: the recording has no true poses.")
     elif not (recording.tracked.has_masks and recording.tracked.has_depth):
         notes.add("Motion was not scored: assigning Gaussians to true objects requires masks and depth.")
-    if mask.source != PICTURE and (values is None or not sequence.has_masks):
+    if mask.source != PICTURE and not sequence.has_masks:
         notes.add("Labels were not scored: the recording has no masks.")
+    elif mask.source != PICTURE and values is None:
+        notes.add(f"Labels were not scored: the recording has no first mask of camera {mask.camera}.")
+    elif tracking.num_frames > 1 and mask.source != PICTURE and not found["iou"]:
+        notes.add("Labels were not scored: the recording has masks of the first frame alone.")
     if not sequence.has_depth:
         notes.add("Depth was not scored: the recording has none.")
     for name, scored in found["objects"].items():
@@ -298,9 +303,13 @@ def _note_what_is_missing(
 
 
 def _note_what_was_lost(
-    tracking: Tracking, values: np.ndarray | None, names: dict[int, str], notes: Notes
+    found: dict[str, Any],
+    tracking: Tracking,
+    values: np.ndarray | None,
+    names: dict[int, str],
+    notes: Notes,
 ) -> None:
-    """Note when each object was lost, its rotation unknown, or no camera saw it."""
+    """Note when each object was lost, its rotation unknown, in doubt in the end, or seen by no camera."""
     groups = labels_of_groups(tracking, values)[1:]
     unseen = (~np.asarray(tracking.visible, bool).reshape(len(tracking.visible), len(groups))).sum(axis=0)
     labels = sorted({*groups.tolist()} - {0})
@@ -316,6 +325,12 @@ def _note_what_was_lost(
         if unknown is not None and (not to_the_end or unknown < begins[-1]):
             why = "it was lost then" if unknown in lost else "other rotations agree as well"
             notes.say(f"{names[label]}: its rotation is unknown from frame {unknown} on: {why}.")
+        agrees = found["objects"][names[label]]["agrees_last"]
+        if agrees is not None and agrees < DOUBTFUL and not to_the_end:
+            notes.say(
+                f"{names[label]}: in the end only {agrees:.0%} of what is seen of it, or of a part of it, "
+                "agree with the pictures; it may not be where it is drawn."
+            )
     for label in sorted({*groups.tolist()}):
         frames = unseen[groups == label].max()
         if frames:

@@ -3,7 +3,7 @@
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Int
+from jaxtyping import Bool, Int, Shaped
 
 from gsjax.engine.first_mask import FirstMask, label_names
 from gsjax.engine.recording import Recording
@@ -105,6 +105,7 @@ def metrics(
             if centroids is None
             else 1e3 * float(np.linalg.norm(centroids - centroids[0], axis=-1).max()),
             "frames_lost": int(lost_over_frames(tracking, values, label).sum()) if is_tracked else None,
+            **_agreement(tracking, values, label),
             "turn_unknown_from": turn_unknown_from(tracking, values, label),
             **motion_metrics(motion.get(label) if is_tracked else None),
             "pose": poses.get(label),
@@ -149,6 +150,9 @@ def object_names(tracking: Tracking, recording: Recording, values: np.ndarray | 
 
 
 def _iou(scores: Scores, names: dict[int, str], held_out: bool) -> dict[str, float]:
+    """IoU of each object; none where only the first of several frames has masks, which is no test."""
+    if scores.num_frames > 1 and not scores.later_masks:
+        return {}
     overlap = scores.overlaps[held_out]
     return {name: overlap.iou(label) for label, name in names.items() if label in overlap.labels}
 
@@ -164,6 +168,16 @@ def lost_over_frames(
         label: the object's.
     """
     return np.any(_of_object(tracking, tracking.lost, values, label), axis=1)
+
+
+def _agreement(tracking: Tracking, values: np.ndarray | None, label: int) -> dict[str, float | None]:
+    """The share of what is seen of an object, or of the part of it where that is least, that agrees with the
+    pictures: the least of all updates, and that of the last one; None if it is not tracked."""
+    shares = _of_object(tracking, tracking.agrees, values, label, float)
+    if not shares.size:
+        return {"agrees_least": None, "agrees_last": None}
+    least = shares.min(axis=1)
+    return {"agrees_least": float(least.min()), "agrees_last": float(least[-1])}
 
 
 def turn_unknown(tracking: Tracking, values: np.ndarray | None, label: int) -> Bool[np.ndarray, "updates"]:
@@ -188,8 +202,8 @@ def turn_unknown_from(tracking: Tracking, values: np.ndarray | None, label: int)
 
 
 def _of_object(
-    tracking: Tracking, flags: list[np.ndarray], values: np.ndarray | None, label: int
-) -> Bool[np.ndarray, "updates parts"]:
-    """The flags of one object's groups."""
+    tracking: Tracking, rows: list[np.ndarray], values: np.ndarray | None, label: int, kind: type = bool
+) -> Shaped[np.ndarray, "updates parts"]:
+    """What each update says of one object's groups."""
     ids = labels_of_groups(tracking, values)
-    return np.asarray(flags, bool).reshape(len(flags), len(ids) - 1)[:, ids[1:] == label]
+    return np.asarray(rows, kind).reshape(len(rows), len(ids) - 1)[:, ids[1:] == label]

@@ -61,7 +61,9 @@ def track(
     Yields:
         ticks. `result` is the `Tracked` scene: `.scene`, `.pose`, `.labels` and `.gaussians()`. `info` is
         that of `track_step`; `run.plans["track"]` is the plan, and `run.kept.chosen` the settings chosen for
-        a budget. `seconds` go from images in memory to the new state, re-planning included.
+        a budget. `seconds` go from images in memory to the new state, re-planning included. Before the first
+        tick the update is planned and compiled and the first frame looked at, which takes a minute or two
+        unless `gsjax.keep_programs` has kept the programs; `compile_seconds` of that tick has the compiling.
 
     Raises:
         ValueError: a frame has other shapes than the first one, the budget is not above 0, or there are extra
@@ -75,12 +77,13 @@ def track(
             "extra_losses: expected none under budget_ms, whose settings have no refinement to add them to; "
             "leave one of the two out"
         )
-    frames = iter(frames)
+    frames, clock = iter(frames), Clock()
     if after is not None:
         warn_of_lost(after, extra_losses)
     if budget_ms is None:
         method = Track(config, extra_losses)
-        yield from _ticks(method, *_begun(method, scene, first, after, like()), first, frames, None)
+        begun = _begun(method, scene, first, after, like())
+        yield from _ticks(method, *begun, first, frames, None, clock.read()[1])
         return
     if unused := not_used(config):
         named = ", ".join(unused)
@@ -99,7 +102,8 @@ def track(
     method = Track(chosen.config)
     shape, run = start(method)
     run = run.having(kept=run.kept._replace(chosen=chosen))
-    yield from _ticks(method, shape, run, first, frames, Governor(budget_ms / 1e3, chosen.costs, count))
+    governor = Governor(budget_ms / 1e3, chosen.costs, count)
+    yield from _ticks(method, shape, run, first, frames, governor, clock.read()[1])
 
 
 def _ticks(
@@ -109,8 +113,10 @@ def _ticks(
     first: Frame,
     frames: Iterable[Frame],
     governor: Governor | None,
+    compiled: float,
 ) -> Iterator[Tick]:
-    """An update per frame; the governor limits how many groups are searched for, or the config."""
+    """An update per frame; the governor limits how many groups are searched for, or the config. `compiled`
+    are seconds of compiling before the first one, which count as the first's."""
     advance, count = _Updates(method, shape, run), run.params.scene.num_objects
     most = method.config.align.everywhere
     usually = count if most is None else min(most, count)
@@ -122,7 +128,8 @@ def _ticks(
         run, info, seconds, compile_seconds = shielded(advance, run, frame, everywhere)
         if governor is not None:
             governor.spent(seconds, int(info["looked_for"].sum()))
-        yield announced(Tick(method, shape, run, info, seconds, compile_seconds))
+        yield announced(Tick(method, shape, run, info, seconds, compiled + compile_seconds))
+        compiled = 0.0
 
 
 def first_update(scene: TrackedScene, first: Frame, config: TrackConfig) -> Tick:

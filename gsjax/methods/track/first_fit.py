@@ -86,7 +86,7 @@ def _warn_of_few(scene: TrackedScene) -> None:
         warnings.warn(
             "too few Gaussians in the first frame to tell whether an object, or part of one, is lost: "
             f"{', '.join(few)}, expected {_FEW} or more; lower start.object_pixels "
-            "(--track.start.object-pixels)",
+            "(--track.start.object-pixels), or take the mask of a camera that sees more of it",
             stacklevel=3,
         )
 

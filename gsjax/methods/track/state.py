@@ -40,8 +40,14 @@ class Tracked(NamedTuple):
 
     @property
     def labels(self) -> Int[Array, "n"]:
-        """Group of each Gaussian: 0 the background, 1..K the objects; K+1 for an empty slot."""
+        """Group of each Gaussian: 0 the background, 1..K the rigid groups, of which an object may have
+        several, K+1 an empty slot."""
         return self.scene.labels
+
+    @property
+    def mask_values(self) -> Int[Array, "n"]:
+        """Mask value of the object that each Gaussian belongs to: 0 the background, -1 an empty slot."""
+        return jnp.asarray((*self.scene.label_ids, -1))[self.labels]
 
 
 class TrackState(NamedTuple):

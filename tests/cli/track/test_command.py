@@ -222,7 +222,9 @@ def test_a_run_says_what_was_lost_and_whose_turn_is_not_known(
             known[ids.index(CAN)] = t < 2
             known[ids.index(BALL)] = t == 2
             known[ids.index(CARTON)] = t < 2
-            yield replace(now, info=now.info | {"lost": lost, "turn_known": known})
+            agrees = np.full(len(ids), 0.9)
+            agrees[ids.index(BALL)] = 0.5 if t == 3 else 0.4
+            yield replace(now, info=now.info | {"lost": lost, "turn_known": known, "agrees": agrees})
 
     monkeypatch.setattr(gsjax.engine.track.loop, "track", flagged)
     assert gsjax_track(pristine, "--cameras", "1")[0] == 0
@@ -234,14 +236,19 @@ def test_a_run_says_what_was_lost_and_whose_turn_is_not_known(
         "can: its rotation is unknown from frame 2 on: other rotations agree as well.",
         "ball: lost in 1 frame, number 1.",
         "ball: its rotation is unknown from frame 3 on: other rotations agree as well.",
+        "ball: in the end only 50% of what is seen of it, or of a part of it, agree with the pictures; "
+        "it may not be where it is drawn.",
     ]
     objects = found["objects"]
     lost = {name: o["frames_lost"] for name, o in objects.items() if o["frames_lost"]}
     assert lost == {"carton": 1, "can": 2, "ball": 1}
     unknown = {name: o["turn_unknown_from"] for name, o in objects.items() if o["turn_unknown_from"]}
     assert unknown == {"carton": 2, "can": 2, "ball": 3}
+    assert found["objects"]["ball"]["agrees_least"] == pytest.approx(0.4)
+    assert found["objects"]["can"]["agrees_last"] == pytest.approx(0.9)
     with np.load(tmp_path / "run" / "trajectory.npz") as stored:
         objects = stored["label_ids"][1:].tolist()
+        np.testing.assert_allclose(stored["agrees"][:, objects.index(BALL)], [1, 0.4, 0.4, 0.5])
         frames, of = np.nonzero(stored["lost"])
         assert {(t, objects[k]) for t, k in zip(frames, of, strict=True)} == {
             (1, CAN),

@@ -90,7 +90,10 @@ def test_parts_whose_state_did_not_follow_are_written_again(tmp_path, monkeypatc
     def tracked_up_to(frames: int):
         rows = [Pose(jnp.full((3, 3), float(t)), jnp.full((3, 4), float(t))) for t in range(frames)]
         tick = SimpleNamespace(run=None)
-        lists = {name: [] for name in ("joined", "update_s", "visible", "lost", "turn_known", "everywhere")}
+        lists = {
+            name: []
+            for name in ("joined", "update_s", "visible", "lost", "turn_known", "agrees", "everywhere")
+        }
         return Mock(spec=Tracking, poses=rows, num_frames=frames, scene=None, tick=tick, skipped=0, **lists)
 
     def full(path, *_):

@@ -20,6 +20,7 @@ from gsjax.methods.track import (
     Track,
     TrackBatch,
     TrackConfig,
+    Tracked,
     TrackedScene,
     first_pose,
     method,
@@ -140,6 +141,22 @@ def test_labels_keep_the_masks_values(table, started):
     labels = np.asarray(started.labels)
     assert (labels[: started.num_moving] > 0).all()
     assert (labels[started.num_moving :] == 0).all()
+
+
+@pytest.mark.thorough
+def test_each_gaussian_knows_its_objects_mask_value(started):
+    scene = with_slots(started, 5)
+    found = np.asarray(Tracked(scene, first_pose(scene)).mask_values)
+    empty = np.asarray(scene.labels) == scene.num_objects + 1
+    assert empty.sum() == 5
+    assert (found[empty] == -1).all()
+    labels = np.asarray(scene.labels)[~empty]
+    np.testing.assert_array_equal(found[~empty], np.asarray(scene.label_ids)[labels])
+
+
+@pytest.mark.thorough
+def test_the_first_tick_has_the_time_of_compiling(tracked):
+    assert tracked[0].compile_seconds > tracked[1].compile_seconds
 
 
 @pytest.mark.thorough
