@@ -19,7 +19,7 @@ def describe_run(path: Path) -> dict[str, str]:
         ValueError, OSError: its settings or scores cannot be read.
     """
     if kind_of(path) is None:
-        facts = {"run": f"of a command whose scores are not listed here; they are in {path / 'metrics.json'}"}
+        facts = _facts_of_stream(path)
     else:
         record = read_record(path)
         facts = {"run": f"gsjax {record.kind}, {_ending(record)}"} | _scores(record)
@@ -37,6 +37,30 @@ def describe_run(path: Path) -> dict[str, str]:
     if (report := path / "report.html").is_file():
         facts["report"] = str(report)
     return facts
+
+
+def _facts_of_stream(path: Path) -> dict[str, str]:
+    """How a run of `gsjax live` kept up."""
+    metrics = path / "metrics.json"
+    found = read_values(metrics, parse_json) if metrics.is_file() else {}
+    if found.get("kind") != "live":
+        return {"run": f"of a command whose scores are not listed here; they are in {metrics}"}
+    try:
+        frames, latency = found["frames"], found["latency_ms"] or {"median": 0.0, "p95": 0.0}
+        lost = ", ".join(f"{name} in {counted(n, 'frame')}" for name, n in found["frames_lost"].items() if n)
+        return {
+            "run": "gsjax live, " + (f"stopped by {found['stopped']}" if found["stopped"] else "finished"),
+            "source": str(found["source"]),
+            "frames": f"{frames['used']:,} of {frames['offered']:,}, {found['hz'] or 0:.2f} Hz",
+            "latency": f"{latency['median']:.0f} ms, 95 in 100 below {latency['p95']:.0f}",
+            "lost": lost or "nothing",
+            "trajectory": str(path / "trajectory.npz"),
+        }
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise ValueError(
+            f"{metrics}: expected the scores of gsjax live, found others ({describe(error)}); run it again "
+            "with this version of gsjax"
+        ) from error
 
 
 def describe_film(path: Path) -> dict[str, str]:

@@ -94,8 +94,8 @@ def open_viewable(
         return _of_deformation(path, notes, now.weights, photographs), path
     if not (path / "scene.ply").is_file():
         raise FileNotFoundError(
-            f"{path}: expected a run with scene.ply, found none; finish the run with --resume, unless its "
-            "command keeps no scene"
+            f"{path}: expected a run with scene.ply, found none; finish the run with --resume, or track the "
+            "recording with gsjax track, as gsjax live keeps no Gaussians"
         )
     if (path / "parts.npz").is_file():
         _expect_only((), now, f"{path} is a run of `gsjax parts`")

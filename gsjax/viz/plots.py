@@ -18,6 +18,7 @@ from gsjax.viz.colors import label_color
 INK, FAINT, GRID = "#22262b", "#6b7280", "#e4e7eb"
 """Colours of text, of secondary text, and of grids and frames."""
 _BLUE, _ORANGE = "#0072b2", "#d55e00"
+_SIZE = 6.4, 3.4  # of a plot, inches
 _DASHED, _TARGET_HZ = (0, (5, 3)), 30
 
 
@@ -147,26 +148,29 @@ def trajectories(
     labels: Mapping[str, int] | None = None,
     truth: Mapping[str, Float[np.ndarray, "frames 3"]] | None = None,
 ) -> Figure:
-    """Paths of the centroids from above, in metres: a ring at the start, a dot at the end, the true path thin
-    below.
+    """Paths of the centroids along x and y, and along x and z, in metres: a ring at the start, a dot at the
+    end, the true path thin below.
 
     Args:
         centroids: name to position in each frame; NaN where there is none.
         labels: name to label, which gives the line its colour (default: counted from 1).
         truth: name to true position in each frame.
     """
-    figure, axes = _new("Paths of the objects", "x (m)", "y (m)")
-    for i, (name, path) in enumerate(centroids.items()):
-        color = _rgb(labels[name] if labels else i + 1)
-        if truth and name in truth:
-            axes.plot(*np.asarray(truth[name])[:, :2].T, color=INK, lw=0.9, alpha=0.55)
-        axes.plot(*np.asarray(path)[:, :2].T, color=color, lw=2.0, label=name)
-        finite = np.asarray(path)[np.isfinite(path).all(axis=1), :2]
-        if len(finite):
-            axes.plot(*finite[:1].T, color=color, marker="o", ms=7, mfc="white", mew=1.6)
-            axes.plot(*finite[-1:].T, color=color, marker="o", ms=6, mew=0)
-    axes.set_aspect("equal", adjustable="datalim")
-    _legend(figure, axes)
+    figure = Figure(figsize=_SIZE, facecolor="white", layout="constrained")
+    panels = figure.subplots(1, 2)
+    for panel, title, plane in zip(panels, ("Paths of the objects", ""), ([0, 1], [0, 2]), strict=True):
+        _style(panel, title, *(f"{'xyz'[axis]} (m)" for axis in plane))
+        for i, (name, path) in enumerate(centroids.items()):
+            color = _rgb(labels[name] if labels else i + 1)
+            if truth and name in truth:
+                panel.plot(*np.asarray(truth[name])[:, plane].T, color=INK, lw=0.9, alpha=0.55)
+            panel.plot(*np.asarray(path)[:, plane].T, color=color, lw=2.0, label=name)
+            finite = np.asarray(path)[np.isfinite(path).all(axis=1)][:, plane]
+            if len(finite):
+                panel.plot(*finite[:1].T, color=color, marker="o", ms=7, mfc="white", mew=1.6)
+                panel.plot(*finite[-1:].T, color=color, marker="o", ms=6, mew=0)
+        panel.set_aspect("equal", adjustable="datalim")
+    _legend(figure, panels[0])
     return figure
 
 
@@ -185,14 +189,18 @@ def save(figure: Figure, path: str | Path) -> Path:
 
 
 def _new(title: str, xlabel: str, ylabel: str) -> tuple[Figure, Axes]:
-    figure = Figure(figsize=(6.4, 3.4), facecolor="white", layout="constrained")
+    figure = Figure(figsize=_SIZE, facecolor="white", layout="constrained")
     axes = figure.add_subplot()
+    _style(axes, title, xlabel, ylabel)
+    return figure, axes
+
+
+def _style(axes: Axes, title: str, xlabel: str, ylabel: str) -> None:
     axes.set_title(title, loc="left", fontsize=12, fontweight="bold", color=INK, pad=10)
     style_axes(axes, xlabel, ylabel)
     if xlabel == "frame":
         axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     axes.spines[["top", "right", "left"]].set_visible(False)
-    return figure, axes
 
 
 def style_axes(axes: Axes, xlabel: str, ylabel: str) -> None:

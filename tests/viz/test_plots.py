@@ -57,6 +57,7 @@ def test_trajectories_survive_gaps_and_absent_objects(tmp_path):
     path[3] = np.nan
     paths = {"cup": path, "never seen": np.full((10, 3), np.nan)}
     figure = plots.trajectories(paths, truth={"cup": path})
+    assert [one.get_ylabel() for one in figure.axes] == ["y (m)", "z (m)"]
     assert plots.save(figure, tmp_path / "plots" / "paths.png").stat().st_size > 5000
 
 

@@ -134,7 +134,7 @@ def write_plots(
     if moved:
         paths = _centroids(tracking, names, group_labels)
         figure = plots.trajectories(paths, labels, _true_paths(recording, tracking, paths, names))
-        keep("paths", figure, "Centroids from above; ring: start, dot: end; thin lines: the truth")
+        keep("paths", figure, "Centroids along x, y and z; ring: start, dot: end; thin lines: the truth")
     return written
 
 

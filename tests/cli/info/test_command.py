@@ -133,6 +133,20 @@ def test_points_of_a_fisheye_lie_at_their_distances():
     np.testing.assert_allclose(np.linalg.norm(points, axis=1), 2.0, rtol=1e-5)
 
 
+def test_a_run_of_live_is_told_by_how_it_kept_up(capfd, tmp_path):
+    found = {"kind": "live", "source": "table", "stopped": None, "frames": {"used": 179, "offered": 180}}
+    found |= {"hz": 14.94, "latency_ms": {"median": 55.1, "p95": 73.0}, "frames_lost": {"can": 3, "ball": 0}}
+    (tmp_path / "config.yml").write_text("# gsjax run\nsource: table\n")
+    (tmp_path / "metrics.json").write_text(json.dumps(found))
+    said, _ = told(tmp_path, capfd)
+    assert "run gsjax live, finished source table frames 179 of 180, 14.94 Hz latency 55 ms" in said
+    assert "lost can in 3 frames" in said
+    (tmp_path / "metrics.json").write_text(json.dumps({"kind": "live"}))
+    assert main(["info", str(tmp_path)]) == 2
+    said = " ".join(capfd.readouterr().err.split())
+    assert "metrics.json: expected the scores of gsjax live, found others" in said
+
+
 @pytest.mark.parametrize("kind", ["parts", "distill", "deform"])
 def test_a_run_is_told_by_its_end_its_data_its_scores_and_its_scene(kind, capfd, tmp_path):
     data = {"scene" if kind == "distill" else "dataset": "data/room"}
