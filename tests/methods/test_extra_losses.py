@@ -168,7 +168,8 @@ def config(quick):
 @pytest.mark.slow
 def test_the_tracker_is_pulled_and_compiles_once(table, started, config):
     _, frames, _ = table()
-    *_, plain = track(started, frames[0], frames[1:], config)
+    # Beside custom losses a refinement is always kept: without any, other groups would differ by that.
+    *_, plain = track(started, frames[0], frames[1:], config, extra_losses=(nothing,))
     calls, heights = [], []
     CALLS.clear()
     for now in track(started, frames[0], frames[1:], config, extra_losses=(upwards,)):
@@ -184,7 +185,8 @@ def test_the_tracker_is_pulled_and_compiles_once(table, started, config):
 
     assert plain.info["visible"][0]
     assert lift(now, 1) > lift(plain, 1) + 2e-3
-    assert abs(lift(now, 2) - lift(plain, 2)) < 1e-3
+    for group in range(2, started.num_objects + 1):
+        assert abs(lift(now, group) - lift(plain, group)) < 3e-4
     assert heights[-1] < heights[0]
 
 
