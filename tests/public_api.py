@@ -60,26 +60,45 @@ def page() -> str:
 
 
 def unmentioned() -> list[str]:
-    """Public names that differ from those of the last release and that the changelog's newest section does
-    not have in backticks."""
-    before, now = json.loads(RELEASED.read_text()), digests()
-    changed = sorted(name for name in before | now if before.get(name) != now.get(name))
+    """Public names that came or went since the last release, and members of others that differ from it, which
+    the changelog's newest section does not have in backticks."""
     newest = re.split(r"^## ", (ROOT / "CHANGELOG.md").read_text(), flags=re.MULTILINE)[1]
     quoted = set(re.findall(r"\w+", " ".join(re.findall(r"`([^`]*)`", newest))))
-    return [name for name in changed if name.split(".")[-1] not in quoted]
+    return [name for name in changed() if name.split(".")[-1] not in quoted]
+
+
+def changed() -> list[str]:
+    """What differs from the last release: names, or members of a class that it has too, as `Name.member`."""
+    before, now, found = json.loads(RELEASED.read_text()), digests(), []
+    for name in sorted(before.keys() | now.keys()):
+        old, new = before.get(name, {}), now.get(name, {})
+        members = [member for member in old | new if old.get(member) != new.get(member)]
+        whole = not old or not new or "" in members
+        found += [name] if whole else [f"{name}.{member}" for member in members]
+    return found
 
 
 def broken() -> list[str]:
-    """Public names of the last release that a patch version has changed or lacks."""
+    """Public names of the last release, or their members, that a patch version has changed or lacks."""
     if gsjax.__version__.split(".")[2] == "0":
         return []
-    before, now = json.loads(RELEASED.read_text()), digests()
-    return sorted(name for name in before if before[name] != now.get(name))
+    before = json.loads(RELEASED.read_text())
+    return [name for name in changed() if name in before or name.rpartition(".")[0] in before]
 
 
-def digests() -> dict[str, str]:
-    """A short digest of each signature."""
-    return {name: hashlib.sha256(text.encode()).hexdigest()[:16] for name, text in signatures().items()}
+def digests() -> dict[str, dict[str, str]]:
+    """A short digest of each line of each signature, by the member that it declares; "" for the first."""
+    return {name: _digests(text.splitlines()) for name, text in signatures().items()}
+
+
+def _digests(lines: list[str]) -> dict[str, str]:
+    found, kinds = {"": lines[0]}, ""
+    for line in map(str.strip, lines[1:]):
+        if line.startswith("@"):
+            kinds += line
+        else:
+            found[re.match(r"(?:def )?(\w+)", line)[1]], kinds = kinds + line, ""
+    return {member: hashlib.sha256(text.encode()).hexdigest()[:16] for member, text in found.items()}
 
 
 def _signature(thing: type | FunctionType) -> str:

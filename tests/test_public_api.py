@@ -1,5 +1,9 @@
 """What is promised is written down, and what changes in it is in the changelog."""
 
+import json
+
+import pytest
+
 from tests import public_api
 
 
@@ -16,25 +20,58 @@ def test_a_patch_version_keeps_its_promise():
     assert public_api.broken() == []
 
 
-def test_a_promise_that_a_patch_version_breaks_is_found(tmp_path, monkeypatch):
+BEFORE = {
+    "kept": {"": "same"},
+    "changed": {"": "old"},
+    "gone": {"": "old"},
+    "Config": {"": "same", "kept": "same", "changed": "old", "gone": "old"},
+}
+NOW = {
+    "kept": {"": "same"},
+    "changed": {"": "new"},
+    "added": {"": "new"},
+    "Config": {"": "same", "kept": "same", "changed": "new", "added": "new"},
+}
+
+
+@pytest.fixture
+def released(tmp_path, monkeypatch):
     monkeypatch.setattr(public_api, "RELEASED", tmp_path / "released.json")
-    (tmp_path / "released.json").write_text('{"kept": "same", "changed": "old", "gone": "old"}')
-    monkeypatch.setattr(public_api, "digests", lambda: {"kept": "same", "changed": "new", "added": "new"})
-    for version, names in (("0.2.1", ["changed", "gone"]), ("0.2.0", [])):
-        monkeypatch.setattr("gsjax.__version__", version)
-        assert public_api.broken() == names
+    (tmp_path / "released.json").write_text(json.dumps(BEFORE))
+    monkeypatch.setattr(public_api, "digests", lambda: NOW)
 
 
+@pytest.mark.usefixtures("released")
+def test_a_promise_that_a_patch_version_breaks_is_found(monkeypatch):
+    monkeypatch.setattr("gsjax.__version__", "0.2.1")
+    broken = ["Config.changed", "Config.gone", "Config.added", "changed", "gone"]
+    assert public_api.broken() == broken
+    monkeypatch.setattr("gsjax.__version__", "0.2.0")
+    assert public_api.broken() == []
+
+
+@pytest.mark.usefixtures("released")
 def test_a_change_that_is_not_in_the_changelog_is_found(tmp_path, monkeypatch):
     monkeypatch.setattr(public_api, "ROOT", tmp_path)
-    monkeypatch.setattr(public_api, "RELEASED", tmp_path / "released.json")
-    (tmp_path / "released.json").write_text('{"kept": "same", "changed": "old", "gone": "old"}')
-    now = {"kept": "same", "changed": "new", "added": "new"}
-    monkeypatch.setattr(public_api, "digests", lambda: now)
     changelog = tmp_path / "CHANGELOG.md"
     changelog.write_text(
         "# Changelog\n\n## [Unreleased]\n\nMuch.\n\n## 0.1.0\n\n`changed`, `gone` and `added`\n"
     )
-    assert public_api.unmentioned() == ["added", "changed", "gone"]
+    assert public_api.unmentioned() == [
+        "Config.changed",
+        "Config.gone",
+        "Config.added",
+        "added",
+        "changed",
+        "gone",
+    ]
     changelog.write_text("# Changelog\n\n## [Unreleased]\n\n`gsjax.changed(x)` for `gone`; `added`\n")
     assert public_api.unmentioned() == []
+
+
+def test_a_member_is_known_with_what_decorates_it():
+    lines = ["class A:", "    size: int = 3", "    @property", "    def first(self) -> int: ..."]
+    before = public_api._digests(lines)
+    assert set(before) == {"", "size", "first"}
+    after = public_api._digests([*lines[:2], lines[3]])
+    assert [member for member in before if before[member] != after[member]] == ["first"]
