@@ -61,10 +61,12 @@ def page() -> str:
 
 def unmentioned() -> list[str]:
     """Public names that came or went since the last release, and members of others that differ from it, which
-    the changelog's newest section does not have in backticks."""
+    the changelog's newest section does not have in backticks; a member's class has to stand in the same
+    paragraph."""
     newest = re.split(r"^## ", (ROOT / "CHANGELOG.md").read_text(), flags=re.MULTILINE)[1]
-    quoted = set(re.findall(r"\w+", " ".join(re.findall(r"`([^`]*)`", newest))))
-    return [name for name in changed() if name.split(".")[-1] not in quoted]
+    code = (" ".join(re.findall(r"`([^`]*)`", paragraph)) for paragraph in newest.split("\n\n"))
+    quoted = [set(re.findall(r"\w+", text)) for text in code]
+    return [name for name in changed() if not any({*name.split(".")} <= words for words in quoted)]
 
 
 def changed() -> list[str]:

@@ -66,6 +66,8 @@ def test_a_change_that_is_not_in_the_changelog_is_found(tmp_path, monkeypatch):
         "gone",
     ]
     changelog.write_text("# Changelog\n\n## [Unreleased]\n\n`gsjax.changed(x)` for `gone`; `added`\n")
+    assert public_api.unmentioned() == ["Config.changed", "Config.gone", "Config.added"]
+    changelog.write_text(changelog.read_text() + "\nA `Config` has `added` for `gone`; `changed`, too.\n")
     assert public_api.unmentioned() == []
 
 

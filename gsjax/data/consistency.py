@@ -28,7 +28,7 @@ _FACTORS = np.geomspace(1e-3, 1e3, 271)  # 5 % apart
 _AGREES = 0.05  # relative difference of two depths of one surface
 _RIGHT = 1.25  # a smaller factor may be noise, or a calibration that is slightly off
 _LEAST_SHARE = 0.2  # of the points must agree with some factor, for a verdict
-_TIMES_AS_MANY = 2.0  # as without it
+_TIMES_AS_MANY = 2.0  # as without a factor, or as poses are
 _ANGLE = np.deg2rad(40)  # between views that may see the same surface
 _FLIP = np.diag([1.0, -1.0, -1.0, 1.0])  # between the axes of OpenCV's and of OpenGL's cameras
 _MISREAD = {
@@ -36,8 +36,8 @@ _MISREAD = {
     "in OpenGL's axes": lambda viewmats: _FLIP @ viewmats,
     "from the camera to the world, in OpenGL's axes": lambda viewmats: _FLIP @ np.linalg.inv(viewmats),
 }
-"""What poses may be that are read as from the world to the camera in OpenCV's axes, and how to mend them."""
-_MEANT = 0.2, 3.0  # share of the points that must agree with mended poses, and times as many as without
+"""How poses may have been misread, which should be from the world to the camera in OpenCV's axes, and how to
+mend each."""
 _JUMP, _FEW = 20.0, 0.1  # in median steps; of all steps
 _SAME_PLACE = 1e-6  # of their distance from the origin
 _LEAST_LEFT = 0.02  # of what masks are asked about: the points in view or, without points, the pixels
@@ -72,10 +72,8 @@ def check_recording(sequence: Sequence) -> None:
         else _simultaneous_pairs(Ks[0], viewmats[0], partial(load, 0))
     )
     pairs = list(pairs)
-    factor = _factor_of_pairs(pairs)
-    _warn_of_factor(name, factor, "that of other views")
-    if factor is None and pairs and cameras > 1:
-        _check_conventions(name, pairs)
+    if cameras == 1 or not _are_misread(name, pairs):
+        _warn_of_factor(name, _factor_of_pairs(pairs), "that of other views")
 
 
 def check_photographs(photographs: Photographs) -> None:
@@ -170,20 +168,22 @@ def _factor_of_pairs(pairs: list[tuple[_View, _View]]) -> float | None:
     return _verdict(best, shares.mean(0))
 
 
-def _check_conventions(name: str, pairs: list[tuple[_View, _View]]) -> None:
-    """Warns if depth of the cameras agrees only with poses that mean something else."""
+def _are_misread(name: str, pairs: list[tuple[_View, _View]]) -> bool:
+    """Whether depth of the cameras agrees much better with poses that mean something else; warns if so."""
 
     def agree(mended: Callable[[np.ndarray], np.ndarray]) -> float:
         views = [[view._replace(viewmat=mended(view.viewmat)) for view in pair] for pair in pairs]
         both = [(a, b) for pair in views for a, b in (pair, pair[::-1])]
-        return float(np.mean([_shares(a, b, np.ones(1)) for a, b in both]))
+        return float(np.mean([_shares(a, b, np.ones(1)) for a, b in both])) if both else 0.0
 
     as_they_are, shares = agree(np.asarray), {what: agree(mended) for what, mended in _MISREAD.items()}
     what = max(shares, key=lambda what: shares[what])
-    if shares[what] > max(_MEANT[0], _MEANT[1] * as_they_are):
-        found = f"depth of the cameras agrees in {as_they_are:.0%} of the pixels, and in {shares[what]:.0%}"
-        advice = "give poses from the world to the camera, in OpenCV's axes (x right, y down, z forward)"
-        warnings.warn(f"{name}: {found} if their poses are {what}; {advice}", DataWarning, stacklevel=3)
+    if shares[what] < max(_LEAST_SHARE, _TIMES_AS_MANY * as_they_are):
+        return False
+    found = f"depth of the cameras agrees in {as_they_are:.0%} of the pixels, and in {shares[what]:.0%}"
+    advice = "give poses from the world to the camera, in OpenCV's axes (x right, y down, z forward)"
+    warnings.warn(f"{name}: {found} if their poses are {what}; {advice}", DataWarning, stacklevel=3)
+    return True
 
 
 def _verdict(best: float, shares: Float[np.ndarray, "factors"]) -> float | None:

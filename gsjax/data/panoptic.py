@@ -150,8 +150,8 @@ def write_panoptic(sequence: Sequence, path: str | Path, depth_unit_m: float = 0
         "time": sequence.times.tolist(),
         "depth_unit_m": depth_unit_m,
     }
-    if sequence.label_names:
-        meta["label_names"] = {str(label): name for label, name in sequence.label_names.items()}
+    if sequence.names_of_labels:
+        meta["label_names"] = {str(label): name for label, name in sequence.names_of_labels.items()}
     if truth is not None:
         write_npz(root / "truth.npz", {"T_wo": truth.poses})
         write_json(root / "meta.json", {"objects": truth.names, "seg": "0 scene, 1 robot, 2+i objects[i]"})

@@ -43,7 +43,8 @@ def check_loaded(where: str, array: np.ndarray | None, shape: tuple[int, ...], k
         type_name = {np.floating: "floats", np.integer: "integers"}.get(kind) or np.dtype(kind).name
         found = "nothing" if array is None else f"shape {array.shape} of {array.dtype}"
         advice = "Correct the file or its loader."
-        if kind is np.floating and array is not None and np.issubdtype(array.dtype, np.integer):
+        is_depth = kind is np.floating and len(shape) == 2
+        if is_depth and array is not None and array.dtype.kind in "iu":
             advice = "Give metres as floats: divide millimetres by 1000."
         raise DataError(where, f"shape {shape} of {type_name}", found, advice)
 

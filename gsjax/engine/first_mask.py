@@ -95,7 +95,8 @@ def placed(masks: str | Path) -> str | Path:
 def without_truth(recording: Recording) -> Recording:
     """A recording whose objects are those of a picture: what it knows of its own is left out."""
     tracked, judged = (
-        replace(sequence, load_mask=None, truth=None) for sequence in (recording.tracked, recording.judged)
+        replace(sequence, load_mask=None, truth=None, label_names={})
+        for sequence in (recording.tracked, recording.judged)
     )
     return replace(recording, tracked=tracked, judged=judged)
 
@@ -149,15 +150,13 @@ def _check_not_empty(labels: np.ndarray, tracked: Sequence, c: int) -> None:
 
 def label_names(recording: Recording, source: str) -> dict[int, str]:
     """The name of each mask value that has one; only the recording's own do."""
-    names = {0: "background"}
-    if source not in OWN_MASKS:
-        return names
-    names |= {model.label: model.name for model in recording.tracked.models if model.label}
-    truth = recording.tracked.truth
-    if truth is not None:
-        names |= {int(label): name for label, name in zip(truth.label_ids, truth.names, strict=True)}
-        names |= {} if truth.robot is None else {truth.robot: "robot"}
-    return names
+    return {0: "background"} | (recording.tracked.names_of_labels if source in OWN_MASKS else {})
+
+
+def known_objects(recording: Recording) -> set[int]:
+    """The mask values of objects that the recording has a shape or true poses of: they should be seen."""
+    tracked = recording.tracked
+    return set(replace(tracked, label_names={}).names_of_labels) - {0}
 
 
 def warn_of_missing(recording: Recording, mask: FirstMask, scene_ids: tuple[int, ...], notes: Notes) -> None:
@@ -174,7 +173,7 @@ def warn_of_missing(recording: Recording, mask: FirstMask, scene_ids: tuple[int,
         return
     names, there = label_names(recording, mask.source), set(np.unique(mask.labels).tolist())
     if mask.source == "files":
-        for value in sorted(set(names) - there - {0}):
+        for value in sorted(known_objects(recording) - there):
             notes.warn(
                 f"{names[value]} (label {value}) has no pixel in the first mask of camera {mask.camera}: "
                 "it is not tracked; another --mask-camera may see it"

@@ -80,9 +80,9 @@ def scene_points(
         if depth is None or not (depth > 0).any():
             continue
         fisheye = None if photographs.fisheye is None else photographs.fisheye[i]
-        seen = points_from_rgbd(
-            photographs.image(i), depth, photographs.viewmats[i], photographs.Ks[i], fisheye=fisheye
-        )
+        stride = max(1, int(np.sqrt((depth > 0).sum() / (4 * _PIXELS))))
+        pose = photographs.viewmats[i], photographs.Ks[i]
+        seen = points_from_rgbd(photographs.image(i), depth, *pose, fisheye=fisheye, stride=stride)
         some = random.choice(len(seen[0]), min(_PIXELS, len(seen[0])), replace=False)
         points.append(seen[0][some])
         colors.append(seen[1][some])

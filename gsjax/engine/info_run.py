@@ -7,7 +7,7 @@ from gsjax.engine.compare.data import SCORES, data_in_words, data_of
 from gsjax.engine.folder import is_finished, is_resumable, read_values
 from gsjax.engine.info_scene import describe_scene
 from gsjax.engine.messages import counted, describe
-from gsjax.engine.records import EVALUATION, Record, kind_of, read_record
+from gsjax.engine.records import EVALUATION, Record, is_of_live, kind_of, read_record
 from gsjax.engine.summary import cards_of
 from gsjax.io.parsed import parse_json
 
@@ -42,25 +42,30 @@ def describe_run(path: Path) -> dict[str, str]:
 def _facts_of_stream(path: Path) -> dict[str, str]:
     """How a run of `gsjax live` kept up."""
     metrics = path / "metrics.json"
-    found = read_values(metrics, parse_json) if metrics.is_file() else {}
-    if found.get("kind") != "live":
+    if not is_of_live(path):
         return {"run": f"of a command whose scores are not listed here; they are in {metrics}"}
+    found = read_values(metrics, parse_json)
     try:
-        frames, latency = found["frames"], found["latency_ms"] or {"median": 0.0, "p95": 0.0}
+        frames, latency = found["frames"], found["latency_ms"]
         lost = ", ".join(f"{name} in {counted(n, 'frame')}" for name, n in found["frames_lost"].items() if n)
-        return {
+        facts = {
             "run": "gsjax live, " + (f"stopped by {found['stopped']}" if found["stopped"] else "finished"),
             "source": str(found["source"]),
             "frames": f"{frames['used']:,} of {frames['offered']:,}, {found['hz'] or 0:.2f} Hz",
-            "latency": f"{latency['median']:.0f} ms, 95 in 100 below {latency['p95']:.0f}",
-            "lost": lost or "nothing",
-            "trajectory": str(path / "trajectory.npz"),
         }
+        if latency is not None:
+            facts["latency"] = f"median {latency['median']:.0f} ms, 95 % below {latency['p95']:.0f} ms"
+        facts["lost"] = lost or "nothing"
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise ValueError(
             f"{metrics}: expected the scores of gsjax live, found others ({describe(error)}); run it again "
             "with this version of gsjax"
         ) from error
+    if notes := found.get("notes"):
+        facts["notes"] = "\n".join(map(str, notes))
+    if (trajectory := path / "trajectory.npz").is_file():
+        facts["trajectory"] = str(trajectory)
+    return facts
 
 
 def describe_film(path: Path) -> dict[str, str]:

@@ -273,6 +273,11 @@ def load_run(folder: Path, run: Run, progress: Progress) -> tuple[Run, Progress]
         ValueError: the checkpoint has other inputs.
     """
     wrong, damaged = None, []
+    if not _saved(folder) and (other := sorted(folder.glob("*.npz"))):
+        raise CheckpointError(
+            f"{other[0]}: expected a checkpoint step-*.npz, found one of another version of gsjax; start "
+            "again without --resume"
+        )
     for path in reversed(_saved(folder)):
         try:
             found, stored = load_checkpoint(path)

@@ -85,6 +85,12 @@ def kind_of(path: Path) -> Kind | None:
         return None
 
 
+def is_of_live(path: Path) -> bool:
+    """Whether a run is one of `gsjax live`."""
+    metrics = path / "metrics.json"
+    return metrics.is_file() and read_values(metrics, parse_json).get("kind") == "live"
+
+
 def digest(file: Path) -> str | None:
     """SHA-256 of a file, to identify a scene; None if there is no file."""
     if not file.is_file():

@@ -71,7 +71,8 @@ class Scores:
         self._values, self._robot = values, robot
         self.cameras: dict[int, CameraScores] = {}
         self.overlaps = {False: LabelOverlap(), True: LabelOverlap()}
-        self.num_frames = self.later_masks = 0  # masks of frames after the first one, which may be the input
+        self.num_frames = 0
+        self.later_masks = {False: 0, True: 0}  # those of frames after the first, which may be the input
 
     def add(self, view: View) -> None:
         """Score one view."""
@@ -96,7 +97,7 @@ class Scores:
             camera.values[name].append(value)
         if view.mask is not None and self._values is not None:
             self.overlaps[view.held_out].add(self._values[view.groups], view.mask)
-            self.later_masks += view.t > 0
+            self.later_masks[view.held_out] += view.t > 0
 
 
 def camera_metrics(scores: Scores) -> dict[str, Any]:

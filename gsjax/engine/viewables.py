@@ -26,6 +26,7 @@ from gsjax.engine.parts.saved import PartsRun, blend_of, open_parts_run, read_pa
 from gsjax.engine.parts.viewer import Filmed, camera_names, editing_of
 from gsjax.engine.photographs import photographs_of_run
 from gsjax.engine.recording import Recording
+from gsjax.engine.records import is_of_live
 from gsjax.engine.track.saved import open_run, read_tracking
 from gsjax.io.parsed import parse_yaml
 from gsjax.io.scenes import is_scene
@@ -93,10 +94,10 @@ def open_viewable(
         _expect_only(("weights",), now, f"{path} is a run that deforms")
         return _of_deformation(path, notes, now.weights, photographs), path
     if not (path / "scene.ply").is_file():
-        raise FileNotFoundError(
-            f"{path}: expected a run with scene.ply, found none; finish the run with --resume, or track the "
-            "recording with gsjax track, as gsjax live keeps no Gaussians"
-        )
+        advice = "finish the run with --resume"
+        if is_of_live(path):
+            advice = "gsjax live keeps no Gaussians, so track the recording with gsjax track"
+        raise FileNotFoundError(f"{path}: expected a run with scene.ply, found none; {advice}")
     if (path / "parts.npz").is_file():
         _expect_only((), now, f"{path} is a run of `gsjax parts`")
         if (field := field_of(path)) is not None:

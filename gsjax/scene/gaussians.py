@@ -199,7 +199,7 @@ def _joined(parts: list[Gaussians]) -> Gaussians:
 
 
 def with_sh_degree(gaussians: Gaussians, degree: int) -> Gaussians:
-    """The same Gaussians with missing coefficients up to `degree`, not below their own, set to zero."""
+    """The same Gaussians at a higher degree, with new coefficients of 0; `degree` is at least their own."""
     missing = num_sh_bases(degree) - num_sh_bases(gaussians.sh_degree)
     if missing == 0:
         return gaussians

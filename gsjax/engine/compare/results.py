@@ -8,6 +8,7 @@ from typing import Any
 
 from gsjax.engine.compare.comparison import Comparison, Group
 from gsjax.engine.compare.pictures import write_strip
+from gsjax.engine.folder import expect_ours
 from gsjax.engine.messages import counted
 from gsjax.engine.summary import Card, Column, Media, Summary, Table
 from gsjax.viz.plots import fit_curves, save
@@ -58,9 +59,10 @@ def _draw(found: Comparison, out: Path) -> tuple[list[Media], list[Media]]:
     """Write the curves and the pictures of held-out views that the runs of a group have in common."""
     plots, strips = [], []
     out.mkdir(parents=True, exist_ok=True)
-    for name in FOLDERS:
-        folder = (out / name).resolve()
-        shutil.rmtree(folder, ignore_errors=True)
+    for name, written in FOLDERS.items():
+        folder = expect_ours(out / name, (written,))
+        if folder.exists():
+            shutil.rmtree(folder)
         folder.mkdir()
     for i, group in enumerate(found.groups):
         prefix = f"{group.dataset}: " if len(found.groups) > 1 else ""

@@ -40,7 +40,8 @@ class Tracking:
         joined: number of Gaussians that had joined by each frame.
         update_s: seconds of each update; 0 for the first frame, which is initialisation.
         compile_s: seconds spent compiling, since the run began or was resumed.
-        planning_s: seconds spent on the plan and the first look before the first update, without compiling.
+        planning_s: seconds before the first update, without compiling: for the plan, the first look and,
+            under a budget, trials of settings.
         loading_s: seconds that the loop waited for images.
         loop_s: seconds of the whole loop.
         plans: number of plans; more than one means that a plan had become too small.

@@ -94,7 +94,8 @@ _OBJECT_NOTE = (
     "the true motion would have carried each. IoU "
     "pools pixels over frames and cameras. 'Moved' is the truth's, 'travelled' the tracker's. "
     "'Agrees' is the share of what cameras see of the object, or of the worst part of it, that shows its "
-    "colours and depth, in the worst frame: below 60 % look at the videos, below 35 % it counts as lost. "
+    "colours and depth, in the worst frame: below 60 % look at the videos; below 25 to 35 % it counts as "
+    "lost. "
     "Pixels are those of the first mask. 'ADD-S AUC' (up to 10 cm) and 'within 5 cm 5°' (of frames) are "
     "scores of pose benchmarks, from the true pose of the first frame on."
 )
@@ -106,7 +107,7 @@ _HOLES = (
 _TIMES = {
     "preparing": "opening the recording, the first mask; drawing it if simulated",
     "start": "from the first frame to a fitted scene, compiling included",
-    "planning": "loop: planning, and looking at the first frame",
+    "planning": "loop: planning, looking at the first frame, trying settings for a budget",
     "compile": "loop: compiling, nearly all of it before the first update",
     "updates": "loop: updates, from images in memory to the new state",
     "loading": "loop: waiting for images",

@@ -67,6 +67,11 @@ def load(folder: Path, config: TrackConfig) -> Tracking:
             "again with --overwrite in place of it"
         )
     tree, found = load_checkpoint(path)
+    if missing := [name for name in _PER_UPDATE if name not in found]:
+        raise CheckpointError(
+            f"{path}: expected {missing[0]} of each update, found a run of another version of gsjax; start "
+            "again without --resume"
+        )
     scene, run = tree["scene"], tree["run"]
     chosen = run.kept.chosen
     start = jax.device_get(first_pose(scene))

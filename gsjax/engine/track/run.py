@@ -270,6 +270,7 @@ def _note_what_is_missing(
 ) -> None:
     """Note what was not scored, and why."""
     sequence = recording.judged
+    overlaps = found["iou"] | found["iou_held_out"]
     if mask.source == "segment":
         notes.add("Objects were found by the weight-free segmenter; they are named by size.")
     if mask.source == PICTURE:
@@ -282,7 +283,7 @@ def _note_what_is_missing(
         notes.add("Labels were not scored: the recording has no masks.")
     elif mask.source != PICTURE and values is None:
         notes.add(f"Labels were not scored: the recording has no first mask of camera {mask.camera}.")
-    elif tracking.num_frames > 1 and mask.source != PICTURE and not found["iou"]:
+    elif mask.source != PICTURE and found["frames"]["scored"] > 1 and not overlaps:
         notes.add("Labels were not scored: the recording has masks of the first frame alone.")
     if not sequence.has_depth:
         notes.add("Depth was not scored: the recording has none.")
@@ -329,7 +330,7 @@ def _note_what_was_lost(
         if agrees is not None and agrees < DOUBTFUL and not to_the_end:
             notes.say(
                 f"{names[label]}: in the end only {agrees:.0%} of what is seen of it, or of a part of it, "
-                "agree with the pictures; it may not be where it is drawn."
+                "agrees with the pictures; it may not be where it is drawn."
             )
     for label in sorted({*groups.tolist()}):
         frames = unseen[groups == label].max()

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Int, Shaped
 
-from gsjax.engine.first_mask import FirstMask, label_names
+from gsjax.engine.first_mask import FirstMask, known_objects, label_names
 from gsjax.engine.recording import Recording
 from gsjax.engine.scores import Scores, camera_metrics, motion_metrics, true_labels_at
 from gsjax.engine.track.loop import Tracking
@@ -144,14 +144,16 @@ def object_names(tracking: Tracking, recording: Recording, values: np.ndarray | 
         recording: the recording, with the names of its mask values.
         values: the mask value of each group, [K+1], or None.
     """
-    known = {} if values is None else label_names(recording, "files")
+    names = {} if values is None else label_names(recording, "files")
+    known = set() if values is None else known_objects(recording)
     labels = sorted({*labels_of_groups(tracking, values).tolist(), *known} - {0})
-    return {label: known.get(label, f"object {label}") for label in labels}
+    return {label: names.get(label, f"object {label}") for label in labels}
 
 
 def _iou(scores: Scores, names: dict[int, str], held_out: bool) -> dict[str, float]:
-    """IoU of each object; none where only the first of several frames has masks, which is no test."""
-    if scores.num_frames > 1 and not scores.later_masks:
+    """IoU of each object; none in the tracked cameras where only the first of several frames has masks, from
+    which objects were started."""
+    if not held_out and scores.num_frames > 1 and not scores.later_masks[False]:
         return {}
     overlap = scores.overlaps[held_out]
     return {name: overlap.iou(label) for label, name in names.items() if label in overlap.labels}
@@ -172,12 +174,12 @@ def lost_over_frames(
 
 def _agreement(tracking: Tracking, values: np.ndarray | None, label: int) -> dict[str, float | None]:
     """The share of what is seen of an object, or of the part of it where that is least, that agrees with the
-    pictures: the least of all updates, and that of the last one; None if it is not tracked."""
+    pictures: the least of all updates, and that of the last one; None where nothing of it was seen."""
     shares = _of_object(tracking, tracking.agrees, values, label, float)
-    if not shares.size:
-        return {"agrees_least": None, "agrees_last": None}
-    least = shares.min(axis=1)
-    return {"agrees_least": float(least.min()), "agrees_last": float(least[-1])}
+    shares = np.where(_of_object(tracking, tracking.visible, values, label), shares, np.inf)
+    least = shares.min(axis=1, initial=np.inf)
+    known = {"agrees_least": least.min(initial=np.inf), "agrees_last": least[-1] if len(least) else np.inf}
+    return {name: float(share) if np.isfinite(share) else None for name, share in known.items()}
 
 
 def turn_unknown(tracking: Tracking, values: np.ndarray | None, label: int) -> Bool[np.ndarray, "updates"]:

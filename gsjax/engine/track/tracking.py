@@ -5,6 +5,7 @@ import itertools
 import warnings
 from collections.abc import Callable, Iterable, Iterator
 from functools import lru_cache, partial
+from time import perf_counter
 from typing import Any
 
 import jax
@@ -63,7 +64,8 @@ def track(
         that of `track_step`; `run.plans["track"]` is the plan, and `run.kept.chosen` the settings chosen for
         a budget. `seconds` go from images in memory to the new state, re-planning included. Before the first
         tick the update is planned and compiled and the first frame looked at, which takes a minute or two
-        unless `gsjax.keep_programs` has kept the programs; `compile_seconds` of that tick has the compiling.
+        unless `gsjax.keep_programs` has kept the programs; `compile_seconds` of that tick has the compiling,
+        and the time that `like` took.
 
     Raises:
         ValueError: a frame has other shapes than the first one, the budget is not above 0, or there are extra
@@ -77,13 +79,16 @@ def track(
             "extra_losses: expected none under budget_ms, whose settings have no refinement to add them to; "
             "leave one of the two out"
         )
-    frames, clock = iter(frames), Clock()
+    frames = iter(frames)
     if after is not None:
         warn_of_lost(after, extra_losses)
+    at = perf_counter()
+    known, clock = like(), Clock()
+    waited = perf_counter() - at  # for another thread that compiles
     if budget_ms is None:
         method = Track(config, extra_losses)
-        begun = _begun(method, scene, first, after, like())
-        yield from _ticks(method, *begun, first, frames, None, clock.read()[1])
+        begun = _begun(method, scene, first, after, known)
+        yield from _ticks(method, *begun, first, frames, None, waited + clock.read()[1])
         return
     if unused := not_used(config):
         named = ", ".join(unused)
@@ -91,7 +96,7 @@ def track(
         warnings.warn(message, UserWarning, stacklevel=2)
     count = (scene if after is None else after.run.params.scene).num_objects
     chosen = None if after is None else after.run.kept.chosen
-    start = partial(_begun, scene=scene, first=first, after=after, like=like(), anew=chosen is None)
+    start = partial(_begun, scene=scene, first=first, after=after, like=known, anew=chosen is None)
     if chosen is None:
         ahead = list(itertools.islice(frames, 1))
         frames = itertools.chain(ahead, frames)
@@ -103,7 +108,7 @@ def track(
     shape, run = start(method)
     run = run.having(kept=run.kept._replace(chosen=chosen))
     governor = Governor(budget_ms / 1e3, chosen.costs, count)
-    yield from _ticks(method, shape, run, first, frames, governor, clock.read()[1])
+    yield from _ticks(method, shape, run, first, frames, governor, waited + clock.read()[1])
 
 
 def _ticks(

@@ -183,7 +183,7 @@ class Fit:
         when = config.growth if config.strategy == "relocate" else config.split
         if step < when.begin or step % when.every or progress >= when.end:
             return run
-        room = config.cap  # a run that goes on with a larger one has fewer slots until here
+        room = config.cap  # a run resumed with a larger cap has fewer slots until now
         if config.strategy == "split":
             room = min(room, rung(int(slots_wanted(run.params, run.state, config))))
         run = self._enlarged(run, slots=room)

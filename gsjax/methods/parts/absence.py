@@ -129,10 +129,12 @@ class _Explained:
         return losses[0.0] < losses[1.0]
 
     def _of(self, frame: Frame, pose, shown: Float[Array, "P"]) -> float:
-        scene = self._discovery.canonical, self._weights, pose
-        loss, self._plan = with_room(
-            lambda plan: loss_of_picture(*scene, frame, plan, self._config, shown), self._plan, self._headroom
-        )
+        canonical, weights, config = self._discovery.canonical, self._weights, self._config
+
+        def draw(plan: Plan):
+            return loss_of_picture(canonical, weights, pose, frame, plan, config, shown)
+
+        loss, self._plan = with_room(draw, self._plan, self._headroom)
         return float(loss)
 
     def _chosen(self, t: int) -> list[int]:

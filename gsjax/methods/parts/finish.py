@@ -111,7 +111,7 @@ class _MeanLoss:
         weights: Float[np.ndarray, "M P"],
         config: PartsConfig,
     ):
-        self._loss = partial(loss_of_picture, config=config.stream)
+        self._config = config.stream
         self._canonical, self._headroom = discovery.canonical, 2 * config.headroom
         done, count = np.flatnonzero(discovery.done), problem.sequence.num_cameras
         most = min(_PICTURES // _CAMERAS, len(done))
@@ -132,7 +132,8 @@ class _MeanLoss:
     def __call__(self, weights: Float[np.ndarray, "M P"]) -> float:
         losses = []
         for pose, frame in self._pictures:
-            draw = partial(self._loss, self._canonical, jnp.asarray(weights), pose, frame)
+            scene = self._canonical, jnp.asarray(weights), pose
+            draw = partial(loss_of_picture, *scene, frame, config=self._config)
             loss, self._plan = with_room(draw, self._plan, self._headroom)
             losses.append(float(loss))
         return float(np.mean(losses))

@@ -24,7 +24,7 @@ POINTS = 64
 """Gaussians by which a part, or a group of them, is recognised."""
 _MOST = 0.3  # difference of colours, 0 to 1, that counts as entirely wrong
 _ASTRAY = 1.25, 0.02  # a group is looked for if its difference is so much larger than at the anchor
-_LEFT = 0.3  # of the difference in excess of the anchor's: what a better place may leave of it
+_LEFT = 0.3  # share of the excess over the anchor's difference that a better place may leave
 _GRIDS = (6.0, 1.0), (1.0, 0.5), (0.5, 0.25)  # reach and spacing of the places, in radii of the group
 _NOWHERE = np.zeros((1, 3), np.float32)
 _INSIDE = 0.5  # share of the points that a place must keep in the pictures

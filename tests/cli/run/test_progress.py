@@ -54,6 +54,13 @@ def test_what_a_version_before_saved_is_refused(tmp_path):
     assert load_run(tmp_path, run, progress)[0].step == 3
 
 
+@pytest.mark.parametrize("name", ["state.npz", "parts.npz"])
+def test_what_was_saved_under_another_name_is_refused(name, tmp_path):
+    (tmp_path / name).write_bytes(b"of another version")
+    with pytest.raises(CheckpointError, match=rf"{name}: expected a checkpoint step-\*.npz"):
+        load_run(tmp_path, Run(jnp.zeros(2), None), Progress({}))
+
+
 def test_a_log_says_when_a_later_step_compiles(tmp_path):
     said, schedule = StringIO(), Schedule("walking", 11, means_of(), lambda row: f"loss {row['loss']:.1f}")
     ticks = walked(WalkConfig(steps=11, sick=2))  # it grows after 4 and 8 steps

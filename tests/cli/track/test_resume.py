@@ -15,7 +15,8 @@ import gsjax.engine.track.loop
 import gsjax.engine.track.resume
 from gsjax.engine.track.loop import Tracking
 from gsjax.engine.track.tracking import track
-from gsjax.methods.track import Pose
+from gsjax.io.checkpoints import CheckpointError
+from gsjax.methods.track import Pose, TrackConfig
 
 OPTIONS = ("--cameras", "0", "1", "--preset", "fast", "--track.start.iterations", "5")
 
@@ -110,3 +111,13 @@ def test_parts_whose_state_did_not_follow_are_written_again(tmp_path, monkeypatc
     assert len(written) == 2
     saved = gsjax.engine.track.resume._saved_poses(tmp_path, 30, tracked_up_to(1).poses[0])
     assert [float(pose.means[0, 0]) for pose in saved] == list(range(1, 30))
+
+
+def test_a_run_of_another_version_is_refused(monkeypatch, tmp_path):
+    """Which has not saved all that this one has of each update."""
+    tree = {"scene": None, "run": SimpleNamespace(kept=SimpleNamespace(chosen=None))}
+    saved = {"frames": 1, "visible": [], "lost": [], "turn_known": []}
+    monkeypatch.setattr(gsjax.engine.track.resume, "load_checkpoint", lambda path: (tree, saved))
+    (tmp_path / "state.npz").touch()
+    with pytest.raises(CheckpointError, match=r"state\.npz: expected agrees of each update, found a run of"):
+        gsjax.engine.track.resume.load(tmp_path, TrackConfig())

