@@ -29,7 +29,7 @@ test-thorough: $(VENV)/installed-test ## what takes seconds a test; with the qui
 	$(PYTEST) -m "thorough and not slow"
 
 test-all: $(VENV)/installed-test ## every test, those of minutes too, on programs that XLA optimises
-	XLA_FLAGS= $(PYTEST) -m "slow or not slow" --cov=gsjax --cov-report=term
+	XLA_FLAGS= $(PYTEST) --timeout=2700 -m "slow or not slow" --cov=gsjax --cov-report=term
 
 # Of the tests those that touch every dependency and are quick. Some floors have no wheel for a newer Python.
 FLOORS := build/floors
