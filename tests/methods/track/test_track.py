@@ -155,6 +155,17 @@ def test_each_gaussian_knows_its_objects_mask_value(started):
 
 
 @pytest.mark.thorough
+def test_what_joins_an_object_comes_after_its_first_gaussians(started, tracked):
+    """As docs/track.md takes the path of an object."""
+    groups = np.asarray(started.labels)[: started.num_moving]
+    mine = np.asarray(started.label_ids)[groups] == 3
+    assert 0 < mine.sum() < len(mine)
+    for now in tracked:
+        np.testing.assert_array_equal(np.asarray(now.result.mask_values)[: len(mine)] == 3, mine)
+        assert np.isfinite(now.result.pose.means[: len(mine)][mine].mean(0)).all()
+
+
+@pytest.mark.thorough
 def test_the_first_tick_has_the_time_of_compiling(tracked):
     assert tracked[0].compile_seconds > tracked[1].compile_seconds
 
