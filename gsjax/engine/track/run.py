@@ -330,7 +330,7 @@ def _note_what_was_lost(
         if agrees is not None and agrees < DOUBTFUL and not to_the_end:
             notes.say(
                 f"{names[label]}: in the end only {agrees:.0%} of what is seen of it, or of a part of it, "
-                "agrees with the pictures; it may not be where it is drawn."
+                "agrees with the pictures; it shows other sides, or is not where it is drawn."
             )
     for label in sorted({*groups.tolist()}):
         frames = unseen[groups == label].max()

@@ -237,7 +237,7 @@ def test_a_run_says_what_was_lost_and_whose_turn_is_not_known(
         "ball: lost in 1 frame, number 1.",
         "ball: its rotation is unknown from frame 3 on: other rotations agree as well.",
         "ball: in the end only 50% of what is seen of it, or of a part of it, agrees with the pictures; "
-        "it may not be where it is drawn.",
+        "it shows other sides, or is not where it is drawn.",
     ]
     objects = found["objects"]
     lost = {name: o["frames_lost"] for name, o in objects.items() if o["frames_lost"]}
