@@ -66,12 +66,11 @@ def check_recording(sequence: Sequence) -> None:
     if sequence.load_depth is None:
         return
     Ks, viewmats, load = sequence.Ks, sequence.viewmats, sequence.load_depth
-    pairs = (
+    pairs = list(
         _moved_pairs(Ks[:, 0], viewmats[:, 0], partial(_at, load))
         if cameras == 1
         else _simultaneous_pairs(Ks[0], viewmats[0], partial(load, 0))
     )
-    pairs = list(pairs)
     if cameras == 1 or not _are_misread(name, pairs):
         _warn_of_factor(name, _factor_of_pairs(pairs), "that of other views")
 

@@ -159,7 +159,12 @@ class Sequence:
     @property
     def names_of_labels(self) -> dict[int, str]:
         """Names of mask values: from the data, the models and the truth."""
-        names = dict(self.label_names) | {m.label: m.name for m in self.models if m.label}
+        return dict(self.label_names) | self.known_objects
+
+    @property
+    def known_objects(self) -> dict[int, str]:
+        """Names of the mask values of objects whose shape or true poses are known."""
+        names = {m.label: m.name for m in self.models if m.label}
         if self.truth is not None:
             labels = (int(label) for label in self.truth.label_ids)
             names |= dict(zip(labels, self.truth.names, strict=True))

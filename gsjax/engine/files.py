@@ -44,21 +44,11 @@ def read_arrays(file: Path, wanted: Sequence[str], again: str) -> dict[str, np.n
         raise ValueError(
             f"{file}: expected plain arrays, found a file that cannot be read; {again}"
         ) from error
-    expect_arrays(file, arrays, wanted, again)
+    _expect_arrays(file, arrays, wanted, again)
     return arrays
 
 
-def expect_arrays(file: Path, arrays: Mapping[str, np.ndarray], wanted: Iterable[str], again: str) -> None:
-    """Check that a file has arrays of these names.
-
-    Args:
-        file: their file, for the error.
-        arrays: those that it has, by name.
-        wanted, again: as for `read_arrays`.
-
-    Raises:
-        ValueError: one is missing.
-    """
+def _expect_arrays(file: Path, arrays: Mapping[str, np.ndarray], wanted: Iterable[str], again: str) -> None:
     missing = [name for name in wanted if name not in arrays]
     if missing:
         found = brief(", ".join(arrays)) or "an array without a name"  # which is what an .npy file holds
@@ -82,7 +72,7 @@ def check_arrays(
     Raises:
         ValueError: an array is missing, has another shape, holds no numbers, or is not finite everywhere.
     """
-    expect_arrays(file, arrays, shapes, again)
+    _expect_arrays(file, arrays, shapes, again)
     sizes: dict[str, int] = {}
     for name, shape in shapes.items():
         array = arrays[name]

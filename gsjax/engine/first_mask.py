@@ -153,12 +153,6 @@ def label_names(recording: Recording, source: str) -> dict[int, str]:
     return {0: "background"} | (recording.tracked.names_of_labels if source in OWN_MASKS else {})
 
 
-def known_objects(recording: Recording) -> set[int]:
-    """The mask values of objects that the recording has a shape or true poses of: they should be seen."""
-    tracked = recording.tracked
-    return set(replace(tracked, label_names={}).names_of_labels) - {0}
-
-
 def warn_of_missing(recording: Recording, mask: FirstMask, scene_ids: tuple[int, ...], notes: Notes) -> None:
     """Warn of objects that will not be tracked: true objects without a label in the mask, and labels without
     Gaussians.
@@ -173,7 +167,7 @@ def warn_of_missing(recording: Recording, mask: FirstMask, scene_ids: tuple[int,
         return
     names, there = label_names(recording, mask.source), set(np.unique(mask.labels).tolist())
     if mask.source == "files":
-        for value in sorted(known_objects(recording) - there):
+        for value in sorted(recording.tracked.known_objects.keys() - there - {0}):
             notes.warn(
                 f"{names[value]} (label {value}) has no pixel in the first mask of camera {mask.camera}: "
                 "it is not tracked; another --mask-camera may see it"

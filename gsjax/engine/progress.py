@@ -272,13 +272,13 @@ def load_run(folder: Path, run: Run, progress: Progress) -> tuple[Run, Progress]
         CheckpointError: all checkpoints are damaged, or of another version.
         ValueError: the checkpoint has other inputs.
     """
-    wrong, damaged = None, []
-    if not _saved(folder) and (other := sorted(folder.glob("*.npz"))):
+    wrong, damaged, saved = None, [], _saved(folder)
+    if not saved and (other := sorted(folder.glob("*.npz"))):
         raise CheckpointError(
             f"{other[0]}: expected a checkpoint step-*.npz, found one of another version of gsjax; start "
             "again without --resume"
         )
-    for path in reversed(_saved(folder)):
+    for path in reversed(saved):
         try:
             found, stored = load_checkpoint(path)
         except CheckpointError as error:

@@ -1,7 +1,7 @@
 """Files of a tracked recording: trajectory, scene and plots."""
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int, Shaped
 
 from gsjax.engine.files import write_scene
 from gsjax.engine.first_mask import FirstMask
@@ -39,9 +39,9 @@ def write_tracking(
         labels=labels,
         label_ids=label_ids.astype(np.int32),
         poses=_poses_of(tracking, labels, origin),
-        lost=_of_objects(tracking.lost, label_of),
-        turn_known=~_of_objects([~known for known in tracking.turn_known], label_of),
-        agrees=_least_of_objects(tracking.agrees, label_of),
+        lost=_of_objects(tracking.lost, label_of, np.logical_or, False),
+        turn_known=_of_objects(tracking.turn_known, label_of, np.logical_and, True),
+        agrees=_of_objects(tracking.agrees, label_of, np.minimum, np.float32(1)),
         times=times[: tracking.num_frames],
         update_s=np.asarray(tracking.update_s),
     )
@@ -63,19 +63,13 @@ def _poses_of(
     return poses
 
 
-def _of_objects(flags: list[np.ndarray], label_of: np.ndarray) -> Bool[np.ndarray, "T K"]:
-    """Whether an update set the flag of any part of each object; never in the first frame."""
-    rows = np.zeros((1 + len(flags), label_of.max()), bool)
-    for t, row in enumerate(flags, 1):
-        np.logical_or.at(rows[t], label_of[1:] - 1, row)
-    return rows
-
-
-def _least_of_objects(values: list[np.ndarray], label_of: np.ndarray) -> Float[np.ndarray, "T K"]:
-    """The least value of an update for any part of each object; 1 in the first frame."""
-    rows = np.ones((1 + len(values), label_of.max()), np.float32)
+def _of_objects(
+    values: list[np.ndarray], label_of: np.ndarray, joined: np.ufunc, first: bool | np.float32
+) -> Shaped[np.ndarray, "T K"]:
+    """What each update says of an object, joined from what it says of its parts; `first` in frame 0."""
+    rows = np.full((1 + len(values), label_of.max()), first)
     for t, row in enumerate(values, 1):
-        np.minimum.at(rows[t], label_of[1:] - 1, row)
+        joined.at(rows[t], label_of[1:] - 1, row)
     return rows
 
 

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Int, Shaped
 
-from gsjax.engine.first_mask import FirstMask, known_objects, label_names
+from gsjax.engine.first_mask import FirstMask, label_names
 from gsjax.engine.recording import Recording
 from gsjax.engine.scores import Scores, camera_metrics, motion_metrics, true_labels_at
 from gsjax.engine.track.loop import Tracking
@@ -145,7 +145,7 @@ def object_names(tracking: Tracking, recording: Recording, values: np.ndarray | 
         values: the mask value of each group, [K+1], or None.
     """
     names = {} if values is None else label_names(recording, "files")
-    known = set() if values is None else known_objects(recording)
+    known = {} if values is None else recording.tracked.known_objects
     labels = sorted({*labels_of_groups(tracking, values).tolist(), *known} - {0})
     return {label: names.get(label, f"object {label}") for label in labels}
 
