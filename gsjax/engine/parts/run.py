@@ -170,7 +170,7 @@ def _masks(
     masks = masks_from_labels(np.stack(known), moved.any(1), options.parts.discover.most_parts)
     if not masks.any():
         raise ValueError(
-            "--masks files: expected a label with at least a third of its pixels changed in other frames, "
+            "--masks files: expected a label with at least 30 % of its pixels changed in other frames, "
             "found none; use --masks segment"
         )
     return masks

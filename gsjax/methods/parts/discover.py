@@ -104,7 +104,7 @@ def begin(
         masks = _find_masks(sequence, gaussians, frame, drawn, plan, anchor, shown, config, segmenter)
     if not (masks > 0).any():
         raise ValueError(
-            "masks: expected a segment with at least a third of its pixels changed in other frames, found "
+            "masks: expected a segment with at least 30 % of its pixels changed in other frames, found "
             "none; choose another anchor, lower discover.threshold, or turn discover.difference off"
         )
     slots = config.discover.most_parts + 1
