@@ -1,4 +1,4 @@
-"""One optimization step of a distillation: render the features of a view and compare them with its teacher
+"""One optimisation step of a distillation: render the features of a view and compare them with its teacher
 (FD-3DGS, section 3.4).
 """
 
