@@ -15,8 +15,8 @@ object faces one of the fingers, that contact is unobserved: the object is assum
 contact gets the cosine of the other one, and the score is multiplied by `unseen`, less than 1, so that a
 grasp with two observed contacts is preferred. The width is then that of the observed part, a lower bound.
 
-The fingers close on everything of the object that lies between them, so no part is grasped through another: a
-mug's handle only from where the body is not in the way.
+The fingers close on all parts of the object between them, so no part is grasped through another: a mug's
+handle can be grasped only where the body is not in the way.
 """
 
 from dataclasses import dataclass

@@ -34,7 +34,7 @@ class Prompt(NamedTuple):
         name: its own or its nearest name; None for a text that an encoder reads.
         min_score: the encoder's own threshold of a cosine; None if it has none.
         rule: name of the rule by which the threshold is 1/2.
-        level: level of the features that they are compared with; None where there are none.
+        level: level of the features that they are compared with; None without levels.
     """
 
     vectors: Float[np.ndarray, "q c"]
@@ -54,8 +54,8 @@ class Prompt(NamedTuple):
 
     def threshold(self, scores: Float[np.ndarray, "n"], given: float | None = None) -> Threshold:
         """The score above which Gaussians are selected, and the rule that it comes from: the given one; 1/2
-        with negatives; without, the encoder's own or, where it has none, Otsu's, which splits the scores into
-        two classes of the least variance within each. On the host.
+        with negatives; without negatives, the encoder's own or, if it has none, Otsu's, which splits the
+        scores into the two classes with the least variance within each. On the host.
 
         Args:
             scores: scores of all Gaussians.

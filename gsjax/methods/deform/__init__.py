@@ -12,7 +12,7 @@ hull.py       initial Gaussians within the visual hull of a scene that the camer
 poses.py      refined camera poses
 nodes.py      the nodes at which the field is evaluated
 graph.py      the teacher's features at nodes, and the losses on their edges
-update.py     the losses, and one optimization step
+update.py     the losses, and one optimisation step
 result.py     the scene at any time, its cameras, and queries
 meaning.py    the vocabulary of the features, and prompts
 query.py      probabilities of prompts

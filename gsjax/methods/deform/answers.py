@@ -166,7 +166,7 @@ def _when(asked: Question, facts: SceneFacts, rows: list[int]) -> Answer:
 
 
 def _speeds(facts: SceneFacts, thing: int) -> Float[np.ndarray, "T"]:
-    """Speed of the visible points of a class from each frame to the next, per unit of time; NaN at last."""
+    """Speed of a class's visible points from each frame to the next, per unit of time; NaN for the last."""
     steps = np.diagonal(facts.moved[:, :, thing], offset=1)
     return np.append(steps / np.maximum(np.diff(facts.times), 1e-9), np.nan)
 
@@ -195,7 +195,7 @@ _ANSWERS: dict[str, Callable[[Question, SceneFacts, list[int]], Answer]] = {
 
 @dataclass(frozen=True)
 class PromptedAnswerer:
-    """Answers from the same facts by a language model: a sentence without a value.
+    """Answers by a language model from the same facts: a sentence without a value.
 
     Attributes:
         complete: the model, a function from a prompt to a text.

@@ -32,7 +32,7 @@ class DeformRatesConfig:
     layers: float = 1e-3
     """Learning rate of the field's network."""
     twists: float = 1e-3
-    """Learning rate of the poses, where they are refined: rotations in radians, translations in radii of the
+    """Learning rate of the poses, if they are refined: rotations in radians, translations in radii of the
     scene."""
 
     def __post_init__(self):
@@ -46,7 +46,7 @@ class DeformWeightsConfig:
     dssim: float = 0.2
     """lambda of (1 - lambda) L1 + lambda D-SSIM (SurstSplat, eq. 13)."""
     depth: float = 1.0
-    """Weight of the depth error, in radii of the scene; 0: depth is used for initialization only."""
+    """Weight of the depth error, in radii of the scene; 0: depth is used for initialisation only."""
     feature: float = 1.0
     """Weight of the feature error, where there is a teacher (GaussianClin, eq. 10)."""
     plane_tv: float = 2e-4
@@ -56,8 +56,8 @@ class DeformWeightsConfig:
     time_sparsity: float = 1e-4
     """Weight of the distance of the space-time planes from 1, at which nothing moves (4DGS)."""
     rigidity: float = 1e-2
-    """Weight of strains between neighbouring nodes, in excess of a rigid motion, so that what no camera sees
-    moves with what is around it (ARAP, as in SC-GS). Without nodes there is none."""
+    """Weight of the deviation of neighbouring nodes from a rigid motion, so that what no camera sees moves
+    with its surroundings (ARAP, as in SC-GS). Unused without nodes."""
 
     def __post_init__(self):
         expect(self, "weights.", **dict.fromkeys(vars(self), (0, np.inf)))
@@ -68,19 +68,19 @@ class DeformConfig:
     """Configuration of the reconstruction of a deforming scene."""
 
     warmup: int = 1000
-    """Steps in which only the canonical scene is optimized (GaussianClin, section A)."""
+    """Steps in which only the canonical scene is optimised (GaussianClin, section A)."""
     iterations: int = 3000
-    """Steps after the warm-up, in which scene and deformation are optimized jointly."""
+    """Steps after the warm-up, in which scene and deformation are optimised jointly."""
     start_pixels: float = 1.3
     """Edge of the cubes in which the initial points are thinned to one Gaussian each, in pixels."""
     plane_depth: float = 1.0
-    """Distance from the first camera to the plane on which a scene without depth is initialized, in the unit
+    """Distance from the first camera to the plane on which a scene without depth is initialised, in the unit
     of the poses; it makes no difference if the camera is static."""
     hull_points: int = 20_000
-    """Number of Gaussians of a scene that is initialized within its visual hull."""
+    """Number of Gaussians of a scene that is initialised within its visual hull."""
     warmup_frames: Literal["first", "all"] = "first"
-    """Frames of the warm-up: the one that the canonical scene is initialized from, or all; all too where it
-    is initialized within its visual hull, from all."""
+    """Frames of the warm-up: the one that the canonical scene is initialised from, or all. A scene that is
+    initialised within its visual hull uses all."""
     refine_poses: bool = False
     """Optimize the poses of the cameras of all frames but the first."""
     nodes: int = 2048
@@ -141,5 +141,5 @@ PRESETS = MappingProxyType(
 )
 """The two papers' recipes: GaussianClin (section A: Adam, 1k canonical and 3k joint iterations), and
 SurstSplat (section 3: AdamW, cosine, weight decay 1e-5). And this project's for a camera that goes around a
-moving object: random points in its hull have far to go, a warm-up would only blur what moves, and a field
-with few vertices fits no view alone where each time has one."""
+moving object: high learning rates, as random points in its hull have far to go; a short warm-up, as a long
+one would blur what moves; and a field with few vertices, which cannot overfit the one view of each time."""

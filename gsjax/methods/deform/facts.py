@@ -29,7 +29,7 @@ _LEAST_OPACITY = 0.3  # below which a Gaussian belongs to no surface
 _SURFACE = 0.03  # relative difference in depth between a Gaussian and its pixel, for it to be visible there
 _SMOOTH = 0.03  # relative difference in depth between a pixel and its neighbours, on one surface
 _STRAY = 3  # the n-th nearest point measures a gap, as one or two may belong to another surface
-_MOST_POINTS = 4000  # of a class
+_MOST_POINTS = 4000  # largest number of points of a class
 
 
 class LabelledView(NamedTuple):
@@ -67,7 +67,7 @@ class SceneFacts:
         centers: mean of its visible points, in the camera's axes: right, down, forward.
         extents: distance from their 5th to their 95th percentile, along the same axes.
         gaps: smallest distance between the visible surfaces of two classes: between their pixels, or between
-            their points at edges of depth, where a pixel is a mean of foreground and background.
+            their points at depth discontinuities, where pixels blend foreground and background.
         moved: [i, j]: median distance that the points visible in frame i are displaced in frame j.
         shifts: [i, j]: their mean displacement, in the axes of the camera of frame i.
     """
@@ -130,9 +130,9 @@ def _plain(value: Any) -> Any:
 def scene_facts(result: DeformResult, rows: Sequence[int]) -> SceneFacts:
     """Facts of a deforming scene at some of its frames.
 
-    A pixel belongs to the class that is the most similar to its rendered features, a Gaussian to that of its
+    A pixel belongs to the class most similar to its rendered features, a Gaussian to that most similar to its
     own features in the first of these frames; to none where all are equally likely. In a scene of unknown
-    scale lengths are in per cent of the median depth of the first frame.
+    scale, lengths are in per cent of the median depth of the first frame.
 
     Args:
         result: a scene with a meaning.
@@ -203,10 +203,10 @@ def facts_of_views(
     Args:
         views: one for each frame, all with the same number of points of each class.
         names: names of the classes.
-        frames: the recording's numbers of the frames.
+        frames: frame numbers in the recording.
         times: their times, 0 to 1.
-        metric: whether the unit of depths and points is the metre, and lengths are given in mm; else they are
-            given in per cent of the median depth of the first view.
+        metric: whether the unit of depths and points is the metre; lengths are then given in mm, else in per
+            cent of the median depth of the first view.
     """
     views = list(views)
     scale = 1e3 if metric else 100 / _median_depth(views[0])
@@ -306,7 +306,7 @@ def _smooth(depths: Float[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
 
 
 def _unprojected(mask: Bool[np.ndarray, "h w"], view: LabelledView) -> Float[np.ndarray, "n 3"]:
-    """The points behind the pixels of a mask, in the camera's axes."""
+    """The points that the pixels of a mask show, in the camera's axes."""
     rows, columns = np.nonzero(mask)
     rays = np.stack([columns + 0.5, rows + 0.5, np.ones(len(rows))], axis=1) @ np.linalg.inv(view.K).T
     return rays * view.depths[rows, columns, None]

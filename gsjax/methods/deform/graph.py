@@ -87,7 +87,7 @@ class FrameGraph(NamedTuple):
         nodes: rows of the Gaussians that are nodes.
         times: times of the frames, 0 to 1.
         teacher: the teacher's features at nodes, in the scene's channels.
-        valid: where it has one.
+        valid: whether there is one, for a node that is visible in the frame.
         edges: spatial and temporal edges; for a matching, the union of both.
         affinities: the teacher's affinities of edges; None without a matching.
         weights: weights of edges; None without a matching.
@@ -181,7 +181,7 @@ def seen_ids(
         cameras: viewmat [C,4,4] and K [C,3,3].
         ids: row of the codebook of each of the teacher's pixels, a grid of any size over each image; -1 for
             none.
-        depths: depths of the images, metres; 0 where unknown, where nothing occludes a place.
+        depths: depths of the images, metres; 0 where unknown; there, no place counts as occluded.
     """
     (high, wide), (height, width) = ids.shape[1:], depths.shape[1:]
 
@@ -236,7 +236,7 @@ def _labelled(
     ids: Int[np.ndarray, "h w"],
     codebook: Float[np.ndarray, "k c"],
 ) -> tuple[Float[np.ndarray, "n c"], Bool[np.ndarray, "n"]]:
-    """The teacher's features at places in a frame, and where it has one and the place is visible."""
+    """The teacher's features at places in a frame, and whether there is one and the place is visible."""
     camera = frame.cameras
     column, row, z, inside = pixels_of(places, camera.viewmat[0], camera.K[0], camera.width, camera.height)
     depth = known_depth(frame)[row, column]

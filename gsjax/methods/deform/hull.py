@@ -13,17 +13,17 @@ from gsjax.scene.gaussians import Gaussians
 from gsjax.scene.initialize import gaussians_from_points
 
 _TURNED = 0.1  # mean squared sine of the angles between optical axes and their mean
-_MISSED = 0.25  # of the distance to the focus, by which an optical axis may miss it
-_VIEWS = 48  # that carve, evenly spread over time
+_MISSED = 0.25  # share of the distance to the focus by which an optical axis may miss it
+_VIEWS = 48  # views that carve the hull, evenly spread over time
 _CELLS = 64  # along each edge of the box that is carved
-_LEAST_SHARE = 0.6  # of the views that show the best cell: what moves is not always where it was
-_DIFFERS = 0.02  # of a colour from the background
-_OPACITY = 0.1  # as in 3DGS: what is inside can be seen, and so learned
+_LEAST_SHARE = 0.6  # of the best cell's number of views; below 1, as what moves does not stay in one place
+_DIFFERS = 0.02  # difference of a colour from the background above which it is another
+_OPACITY = 0.1  # as in 3DGS; low, so that the interior is visible and can be learned
 
 
 def goes_around(viewmats: Float[np.ndarray, "n 4 4"]) -> bool:
-    """Whether a camera goes around what it looks at: its optical axes meet before it, and turn by tens of
-    degrees.
+    """Whether a camera goes around what it looks at: its optical axes meet in front of it, and their
+    directions differ by tens of degrees.
 
     Args:
         viewmats: world to camera, OpenCV axes.
@@ -41,14 +41,14 @@ def goes_around(viewmats: Float[np.ndarray, "n 4 4"]) -> bool:
 def hull_gaussians(
     frames: Sequence[Frame], background: tuple[float, float, float] | None, count: int, seed: int
 ) -> Gaussians:
-    """Gaussians at random within the visual hull, coloured by the mean of the pixels that show them.
+    """Gaussians at random positions in the visual hull, coloured by the mean of the pixels that show them.
 
     A cell of a cube around the focus, as wide as the view there, is in the hull if it projects to something
-    other than the background in most of the views. In a picture without one, every pixel shows something.
+    other than the background in most of the views. Without a background, every pixel shows something.
 
     Args:
         frames: frames of one camera over time; pixels outside their masks may show anything.
-        background: RGB, 0 to 1; None if pictures are full.
+        background: RGB, 0 to 1; None if the images have none.
         count: number of Gaussians.
         seed: random seed.
 

@@ -15,7 +15,7 @@ from gsjax.methods.deform.questions import plain_words
 from gsjax.methods.protocols import LanguageEncoder
 from gsjax.methods.query import Prompt, encoded_prompt
 
-_LEAST_SHARE = 0.95  # of the pixels of a teacher's cell that count, for the cell to count
+_LEAST_SHARE = 0.95  # of the pixels of a teacher's cell that must count for the cell to count
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,7 +40,7 @@ class Meaning:
         """A sentence on the texts that can be queried; see `Source.hint`.
 
         Args:
-            weights: present folder of CLIP's weights.
+            weights: current folder of CLIP's weights.
         """
         known = self.source.hint(weights)
         return known if self.source.kind == "classes" else f"{known}; or one of: {', '.join(self.names)}"
@@ -64,8 +64,8 @@ class Lesson(NamedTuple):
 def counted_ids(
     ids: Int[np.ndarray, "h w"], mask: Bool[np.ndarray, "height width"] | None
 ) -> Int[np.ndarray, "h w"]:
-    """The teacher's ids where (nearly) all pixels of a cell of its grid count, else -1: tissue behind a tool
-    is not to be labelled as tool.
+    """The teacher's ids where (nearly) all pixels of a cell of its grid count, else -1, so that tissue behind
+    a tool is not labelled as tool.
 
     Args:
         ids: ids of the teacher's cells, a grid of any size.
@@ -84,7 +84,8 @@ def text_prompt(
     negatives: tuple[str, ...] | None = None,
     encoder: Callable[[], LanguageEncoder] | None = None,
 ) -> Prompt:
-    """The prompt of a text: one of the scene's names, or the embedding by the encoder of its features.
+    """The prompt of a text: the code of one of the scene's names, or the text's embedding by the encoder of
+    the scene's features.
 
     Args:
         meaning: meaning of the scene's features.

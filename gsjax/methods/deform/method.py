@@ -47,7 +47,7 @@ class Problem(NamedTuple):
         seen: the same frames on the device.
         ids: the teacher's ids where pixels count, on the device; None without a teacher.
         codebook: codebook of the teacher, on the device; None without.
-        first: index of the frame that the canonical scene is initialized from; None if from all of them.
+        first: index of the frame that the canonical scene is initialised from; None if from all of them.
         radius: radius of the scene, metres; the unit of learning rates.
         bounds: box of the deformation field, around the initial Gaussians, metres.
         timeline: the frames of the whole recording, for the result.
@@ -67,7 +67,7 @@ class Problem(NamedTuple):
 
 
 class Kept(NamedTuple):
-    """Inputs of the steps that `Deform.between` replaces now and then.
+    """Inputs of the steps that `Deform.between` updates from time to time.
 
     Attributes:
         moving: where the field is evaluated.
@@ -110,20 +110,20 @@ class Deform:
 
         Args:
             frames: frames of one camera over time, all of one size, on the host. If none has depth, the scene
-                is initialized on a plane.
+                is initialised on a plane.
             lesson: a teacher's labels of these frames, with codes of `config.channels` numbers.
-            first: index of the frame from which the canonical scene is initialized (default: the first for
+            first: index of the frame from which the canonical scene is initialised (default: the first for
                 which `can_start_from` holds).
             gaussians: initial canonical Gaussians; invalid ones are removed (default: from depth, or on the
                 plane).
             timeline: frames of the whole recording, for the result (default: `frames`).
             background: RGB behind the scene, 0 to 1 (default: black).
-            hull: whether the camera goes around the scene, which is then initialized within its visual hull,
+            hull: whether the camera goes around the scene, which is then initialised within its visual hull,
                 from all frames alike.
 
         Raises:
             ValueError: frames differ in size, no pixel counts, no depth is known, the teacher's labels do not
-                fit, poses are to be refined of frames that share a time, or there is a first frame of a hull.
+                fit, poses are to be refined but frames share a time, or `first` is given for a hull.
         """
         config = self.config
         _check(frames, config, lesson)
@@ -270,7 +270,7 @@ def _on_device(frame: Frame) -> Frame:
 def _graphs(
     config: DeformConfig, problem: Problem, scene: DeformingScene, moving: Moving
 ) -> list[FrameGraph] | None:
-    """The graph of each frame, from the present positions of the nodes and the present poses."""
+    """The graph of each frame, from the current positions of the nodes and the current poses."""
     if config.graph.kind == "none" or problem.lesson is None:
         return None
     nodes = far_apart(scene.gaussians.means, config.graph.nodes)

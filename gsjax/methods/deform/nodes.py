@@ -20,10 +20,10 @@ def far_apart(means: Float[Array | np.ndarray, "n 3"], count: int) -> Int[np.nda
 
 
 def nodes_of(gaussians: Gaussians, count: int, groups: Int[np.ndarray, "n"] | None = None) -> Nodes:
-    """Nodes on Gaussians that lie far from each other, of which each Gaussian blends the four nearest.
+    """Nodes on Gaussians that lie far from each other; each Gaussian blends the four nearest.
 
     The weights are a Gaussian of the distance, whose width is the distance to the second nearest node, minus
-    the weight of the fourth: so a node's weight is 0 where it ceases to be among the four.
+    the weight of the fourth, so that a node's weight vanishes where it ceases to be among the four.
 
     Args:
         gaussians: canonical Gaussians.

@@ -38,7 +38,7 @@ def region_feature(
     alphas: Float[np.ndarray, "height width"],
     box: tuple[float, float, float, float],
 ) -> Float[np.ndarray, "c"]:
-    """The mean of the features rendered in a box; of one pixel, where both corners lie in it.
+    """The mean of the features rendered in a box; the feature of a single pixel if both corners lie in it.
 
     Args:
         drawn: features, composited like colours.

@@ -148,7 +148,7 @@ class Question:
     Attributes:
         kind: name of its type.
         things: rows of the classes in question.
-        frames: the recording's numbers of the frames in question.
+        frames: numbers, in the recording, of the frames in question.
         event: the event of a `when` question.
     """
 

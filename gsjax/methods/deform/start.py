@@ -13,7 +13,7 @@ from gsjax.scene.frame import Frame
 from gsjax.scene.gaussians import Gaussians
 from gsjax.scene.initialize import gaussians_from_points, points_from_rgbd
 
-_BEHIND = 0.06  # relative depth behind a surface beyond which a point was occluded, and has not just moved
+_BEHIND = 0.06  # relative depth behind a surface beyond which a point was occluded rather than moved there
 _NEAR_PX = 2.0  # a point of another frame nearer than this to the points so far adds nothing
 
 
@@ -27,7 +27,7 @@ def start_gaussians(frames: Sequence[Frame], first: int, pixels: float) -> Gauss
 
     Args:
         frames: frames of one camera over time; pixels outside their masks do not count.
-        first: index of the frame that the canonical scene is initialized from.
+        first: index of the frame that the canonical scene is initialised from.
         pixels: edge of the cubes in which points are thinned to one Gaussian, in pixels.
 
     Raises:
@@ -60,7 +60,7 @@ def start_gaussians(frames: Sequence[Frame], first: int, pixels: float) -> Gauss
 
 
 def can_start_from(frame: Frame, frames: Sequence[Frame]) -> bool:
-    """Whether a scene can be initialized from a frame: a pixel counts, and has depth if any frame does."""
+    """Whether a scene can be initialised from a frame: a pixel counts, and has depth if any frame does."""
     if all(one.depths is None for one in frames):
         return frame.masks is None or bool(frame.masks.any())
     return bool(known_depth(frame).any())

@@ -1,4 +1,4 @@
-"""One optimization step of a deforming scene: deform, render colours and features in one pass, compare."""
+"""One optimisation step of a deforming scene: deform, render colours and features in one pass, compare."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -35,9 +35,9 @@ from gsjax.scene.render import render
 from gsjax.scene.time_encodings import HexPlane
 
 LOSSES = ("rgb", "depth", "feature", "node", "structure", "spatial", "temporal", "planes", "rigid")
-"""Names in `info` of the losses, which are recorded during a run."""
+"""Names of the losses in `info`, which are recorded during a run."""
 _FINAL_RATE = 0.1
-_TOLERANCE = 0.1  # strain above which it is no longer punished by its square
+_TOLERANCE = 0.1  # strain above which the penalty is no longer quadratic
 _WEIGHT_DECAY = 1e-5  # of AdamW (SurstSplat, section 3)
 
 
@@ -71,7 +71,7 @@ class DeformingScene(eqx.Module):
     def features_at(
         self, times: Float[Array, "T"], rows: Int[Array, "n"], moving: "Moving" = None
     ) -> Float[Array, "T n c"]:
-        """Features of some Gaussians at some times, as those of `at`.
+        """Features of some Gaussians at some times, equal to those of `at`.
 
         Args:
             times: 0 to 1.
@@ -89,7 +89,7 @@ class SceneAtTime(NamedTuple):
     """The scene at one moment, as passed to extra losses.
 
     Attributes:
-        gaussians: the Gaussians as they were drawn, deformed to this time.
+        gaussians: the Gaussians as they were rendered, deformed to this time.
         canonical: what is trained: `canonical.gaussians` before they were deformed, and `canonical.field`,
             which is None in the warm-up.
         moving: where the field is evaluated.
@@ -100,7 +100,7 @@ class SceneAtTime(NamedTuple):
     moving: "Moving" = None
 
     def at(self, time: Float[Array, ""]) -> Gaussians:
-        """The Gaussians as they are drawn at a time, 0 to 1."""
+        """The Gaussians as they are rendered at a time, 0 to 1."""
         return self.canonical.at(time, self.moving)
 
 
@@ -201,7 +201,7 @@ def deform_loss(config: DeformConfig, extra_losses: ExtraLosses = ()) -> Callabl
 
 
 def _strain(gaussians: Gaussians, offsets: Offsets, nodes: Nodes) -> Float[Array, ""]:
-    """How much nodes move or grow otherwise than those around them."""
+    """How far nodes and their neighbours are from moving rigidly and growing alike."""
     rest = jax.tree.map(lambda leaf: leaf[nodes.rows], gaussians)
     moved, neighbors = deform(rest, offsets), nodes.indices[nodes.rows]
     back = normalize_quats(rest.quats) * jnp.array([1.0, -1.0, -1.0, -1.0])
@@ -243,14 +243,14 @@ def on_grid(drawn: Float[Array, "height width c"], shape: tuple[int, int]) -> Fl
 
 
 def deform_step(config: DeformConfig, extra_losses: ExtraLosses = ()) -> Step:
-    """Adam or AdamW on a `DeformingScene`.
+    """A step of Adam or AdamW on a `DeformingScene`.
 
     `batch` is a `Batch`; `key` and `step` are unused, as the rates decay with the optimizer's own count of
-    steps. `info` has `psnr` and each loss by name beside what every step reports.
+    steps. `info` has `psnr` and each loss by name in addition to what every step reports.
 
     Args:
         config: configuration of the reconstruction.
-        extra_losses: custom losses (`gsjax.losses.extra`) beside those of the method.
+        extra_losses: custom losses (`gsjax.losses.extra`), added to those of the method.
     """
     named_losses(extra_losses)
     total = max(1, config.warmup + config.iterations)

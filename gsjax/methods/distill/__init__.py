@@ -10,9 +10,9 @@ config.py   configuration
 teacher.py  target features of pixels
 views.py    the scene and the teacher in each view
 field.py    hash grid and convolution
-levels.py   what a view's masks lack on a level, told by the other views
+levels.py   masks that a view lacks on a level, from the votes of other views
 solve.py    a vector for each Gaussian, by least squares
-update.py   the loss, and one optimization step
+update.py   the loss, and one optimisation step
 method.py   the method of the drive loop
 result.py   the field with its queries
 query.py    scores of Gaussians and pixels

@@ -48,18 +48,18 @@ class DistillWeightsConfig:
 
 @dataclass(frozen=True)
 class SolveConfig:
-    """Configuration of a solution: a vector for each Gaussian by linear least squares."""
+    """Configuration of the solution for a vector per Gaussian by linear least squares."""
 
     iterations: int = 4
     """Iterations of conjugate gradients, each a pass over all views, after the vote."""
     smoothness: float = 0.1
-    """Weight of the squared difference of neighbours in space, relative to the pixels that show a Gaussian in
-    the mean."""
+    """Weight of the squared difference of neighbours in space, relative to the mean number of pixels that
+    show a Gaussian."""
     neighbors: int = 8
     """Number of neighbours of each Gaussian."""
     energy: float = 0.9999
-    """Share of the squared length of the teacher's features that its channels keep. There are at most
-    `channels`."""
+    """Share of the squared length of the teacher's features that the solution's channels retain. There are at
+    most `channels`."""
 
     def __post_init__(self):
         expect(self, "solve.", iterations=(1, np.inf), smoothness=(0, np.inf), neighbors=(1, 64))
@@ -72,10 +72,10 @@ class DistillConfig:
 
     start: Literal["random", "vote", "solve"] = "random"
     """What training begins with: random values; a vote, in which each Gaussian has the mean feature of the
-    pixels that show it; or the least-squares solution, the vectors with which views show the teacher's
+    pixels that show it; or the least-squares solution, the vectors whose renderings fit the teacher's
     features best."""
     solve: SolveConfig = field(default_factory=SolveConfig)
-    """Settings of that start, unless it is random."""
+    """Settings of the vote or the solution."""
     iterations: int = 1500
     """Number of training steps, of one view each; 0: the vectors of the start are the field."""
     channels: int = 256
@@ -95,7 +95,7 @@ class DistillConfig:
     contrast_pool: int = 4
     """Edge of the max-pooling windows of the contrastive loss, pixels: 1, 2, 4 or 8."""
     contrast_patch: int = 32
-    """Edge of the patch of windows in a step, 64 at most: all pairs of windows are compared."""
+    """Edge of the patch of a step, in windows, at most 64: all pairs of windows are compared."""
     strip_megabytes: float = 256.0
     """Memory of a strip of features. Larger images are rendered strip by strip, with the same result, and
     again in the backward pass."""
@@ -128,4 +128,4 @@ PRESETS = {
     "paper": DistillConfig(),
 }
 """Settings by name, the fastest first: the mean of the pixels that show each Gaussian; the least-squares
-solution; a hash grid that begins as that solution; and the training of FD-3DGS."""
+solution; a hash grid that is trained from that solution; and the training of FD-3DGS."""

@@ -24,11 +24,11 @@ from gsjax.methods.distill.config import DistillConfig
 from gsjax.optim.step import per_field_adam
 from gsjax.scene.feature_grid import FeatureGrid, Located, init_feature_grid, locate
 
-_MARGIN = 0.02  # of the box beyond the outermost Gaussians, as a share of its size
+_MARGIN = 0.02  # by which the box extends beyond the outermost Gaussians, as a share of its size
 _OUTLIERS = 0.01  # share of the Gaussians that may lie far out on either side of an axis
-_RATES = {"table": 2.5e-2, "layers": 5e-3}  # of the fit to vectors, as of the descent
+_RATES = {"table": 2.5e-2, "layers": 5e-3}  # learning rates of the fit to vectors
 _FINAL_RATE, _SOME = 0.1, 4096
-_FAR_OUT = 0.5  # how far the box extends beyond the others, as a share of their extent
+_FAR_OUT = 0.5  # how far the box extends at most beyond the inliers, as a share of their extent
 
 
 class FeatureField(eqx.Module):
@@ -106,13 +106,13 @@ def init_field(
 
 
 def expect_finite(means: Float[Array, "n 3"]) -> Float[np.ndarray, "some 3"]:
-    """The centres of Gaussians that are finite. On the host.
+    """The finite ones among the centres of Gaussians. On the host.
 
     Args:
         means: centres, metres.
 
     Raises:
-        ValueError: none is.
+        ValueError: none is finite.
     """
     points = np.asarray(means)
     points = points[np.isfinite(points).all(axis=1)]
@@ -124,7 +124,7 @@ def expect_finite(means: Float[Array, "n 3"]) -> Float[np.ndarray, "some 3"]:
 
 
 def _box(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "2 3"]:
-    """The bounding box without a few outliers, which would make the cells much larger for all others."""
+    """The bounding box without a few outliers, which would make all cells much larger."""
     low, high = np.quantile(points, [_OUTLIERS, 1 - _OUTLIERS], axis=0).astype(np.float32)
     room = _FAR_OUT * max((high - low).max(), 1e-3)
     return np.stack([np.maximum(points.min(0), low - room), np.minimum(points.max(0), high + room)])
@@ -165,7 +165,7 @@ def fitted_to_vectors(
     key: PRNGKeyArray,
     steps: int = 400,
 ) -> FeatureField:
-    """A field whose encoding has the given vectors at the Gaussians, as far as it can.
+    """The field with its encoding fitted to given vectors at the Gaussians.
 
     Args:
         field: the field before.

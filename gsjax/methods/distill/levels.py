@@ -1,9 +1,10 @@
-"""A teacher on several levels, completed: where a view lacks the mask of a level, others may have it.
+"""Completion of a teacher on several levels: where a view lacks a mask on a level, other views may have one.
 
-A segmenter misses masks, so that in each view some pixels have none on a level, and were given that of
-another level (`Teacher.filled`). Taken at its word, such a view teaches that a drawer is a cabinet. So views
-vote first: on each level a Gaussian is what most of its pixels are that have a mask there and, only where
-hardly any has one, what it is on the next larger level. Drawn, the Gaussians tell what each filled pixel is.
+A segmenter misses masks, so in each view some pixels have none on a level and were given that of another
+level (`Teacher.filled`). Taken at face value, such a view teaches that a drawer is a cabinet. So the views
+vote first: on each level, a Gaussian takes the majority kind of those of its pixels that have a mask there
+or, if hardly any has one, its kind on the next larger level. Rendering these Gaussians then gives the kind of
+each filled pixel.
 """
 
 from collections.abc import Sequence
@@ -19,14 +20,14 @@ from gsjax.methods.distill.votes import voted_labels
 from gsjax.rasterize.frozen import FrozenView, paint
 from gsjax.rasterize.plan import Plan
 
-_KINDS = 256  # of embeddings that are told apart, on all levels together
-_LEAST = 0.1  # share of a Gaussian's pixels that must have a mask of a level, for it to have one
+_KINDS = 256  # largest number of kinds of embeddings, on all levels together
+_LEAST = 0.1  # share of a Gaussian's pixels that must have a mask of a level for it to have a kind there
 _SEED, _ITERATIONS = 0, 10  # of clustering
-_AT_ONCE = 32  # kinds that are drawn at once
+_AT_ONCE = 32  # kinds that are rendered at once
 
 
 def completed(teacher: Teacher, views: Sequence[tuple[FrozenView, Plan]], num: int) -> Teacher:
-    """The teacher with what other views say in place of what was filled in from other levels.
+    """The teacher with the votes of all views in place of what was filled in from other levels.
 
     Args:
         teacher: a teacher of masks on levels, with `filled`.
@@ -41,7 +42,7 @@ def completed(teacher: Teacher, views: Sequence[tuple[FrozenView, Plan]], num: i
     )
     place, (kinds, centers) = place.reshape(-1, levels), _kinds(embeddings)
     of_gaussians = _kinds_of_gaussians(teacher, views, kinds[place], len(centers), num)
-    rows = []  # of the embeddings, and of the centres after them, of each pixel on each level
+    rows = []  # of each pixel on each level, into the embeddings followed by the centres
     for (view, plan), ids, filled in zip(views, teacher.ids, teacher.filled, strict=True):
         voted = np.stack([_drawn(view, plan, each, len(centers)) for each in of_gaussians], axis=-1)
         row = np.where(filled & (voted >= 0), len(embeddings) + voted, place[np.maximum(ids, 0)])
@@ -50,8 +51,8 @@ def completed(teacher: Teacher, views: Sequence[tuple[FrozenView, Plan]], num: i
 
 
 def _kinds(embeddings: Float[np.ndarray, "u d"]) -> tuple[Int[np.ndarray, "u"], Float[np.ndarray, "k d"]]:
-    """The kind of each embedding, and the mean embedding of each kind: itself where they are few, else of a
-    cluster."""
+    """The kind of each embedding, and the mean embedding of each kind. A kind is a single embedding if they
+    are few, else a cluster."""
     if len(embeddings) <= _KINDS:
         return np.arange(len(embeddings)), embeddings
     from scipy.cluster.vq import kmeans2  # slow to import
@@ -70,7 +71,7 @@ def _kinds_of_gaussians(
     num: int,
 ) -> Int[np.ndarray, "levels n"]:
     """The kind with the most votes for each Gaussian on each level; where too few pixels have a mask of a
-    level, that on the next larger level or, without one, the next smaller. -1 where there is none at all."""
+    level, the kind on the next larger level or, failing that, the next smaller; -1 where there is none."""
     levels, filled_of = kinds.shape[1], teacher.filled or []
     _, every = voted_labels(views, [np.where(ids >= 0, 0, -1) for ids in teacher.ids], 1, num)
     best = np.full((levels, num), -1)
@@ -89,7 +90,7 @@ def _kinds_of_gaussians(
 
 
 def _drawn(view: FrozenView, plan: Plan, kinds: Int[np.ndarray, "n"], count: int) -> Int[np.ndarray, "h w"]:
-    """The kind of Gaussians that a pixel shows most of; -1 where it shows none."""
+    """The kind of Gaussians that contributes most to each pixel; -1 where none does."""
     best, most = np.full((plan.height, plan.width), -1), np.zeros((plan.height, plan.width))
     some = min(_AT_ONCE, count)
     for first in range(0, count, _AT_ONCE):

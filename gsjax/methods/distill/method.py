@@ -1,4 +1,4 @@
-"""The method of the drive loop: a vote or a least-squares solution, then the descent of the losses."""
+"""The method of the drive loop: a vote or a least-squares solution, then gradient descent on the losses."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -45,8 +45,8 @@ class Problem(NamedTuple):
         means: centres of the scene's Gaussians, metres.
         source, scene: as in `DistillResult`.
         solving: the views with their teacher in the channels of a solution; empty without one.
-        neighbors: of each Gaussian, in a solution; None without one.
-        untrained: the field of the descent, before it is fitted to the solution; None without either.
+        neighbors: the nearest neighbours of each Gaussian, for a solution; None without one.
+        untrained: the field to train, before it is fitted to the solution; None unless there are both.
         located: the locations of the Gaussians in its grid; None without one.
     """
 
@@ -82,8 +82,8 @@ def field_step(config: DistillConfig) -> Step:
 
 @dataclass(frozen=True)
 class Distill:
-    """Distillation of a semantic field of a static scene (`gsjax.optim.method.Method`): first the passes of a
-    vote or a solution, if it does not start at random, then the steps of a descent.
+    """Distillation of a semantic field of a static scene (`gsjax.optim.method.Method`): first, unless it
+    starts at random, the passes of a vote or a solution; then steps of gradient descent.
 
     Attributes:
         config: configuration of the field and its training.
@@ -149,7 +149,7 @@ class Distill:
         return field_step(self.config)
 
     def steps_of_solution(self, problem: Problem) -> int:
-        """Number of steps before the descent: one for each view in each pass."""
+        """Number of steps before gradient descent: one for each view in each pass."""
         return passes(self.config) * len(problem.views)
 
     def total(self, problem: Problem) -> int:
@@ -161,8 +161,8 @@ class Distill:
         return len(problem.views)
 
     def between(self, problem: Problem, run: Run, progress: float) -> Run:
-        """The run, with the field of the descent after the last step of the solution; without its guard as
-        losses become others. Arguments as for `Method.between`."""
+        """The run; after the last step of the solution, with the field to train. The guard is dropped where
+        the loss is redefined. Arguments as for `Method.between`."""
         step = run.step - self.steps_of_solution(problem)
         if step < 0:
             return run.having(guard=resting(run.guard))
@@ -179,7 +179,7 @@ class Distill:
     def batch(
         self, problem: Problem, run: Run, progress: float
     ) -> tuple[SolveBatch | Batch, tuple[str, ...]]:
-        """The next view: in order in a solution, shuffled in the descent.
+        """The next view: in order during a solution, shuffled during gradient descent.
         Arguments as for `Method.batch`."""
         begun, count = self.steps_of_solution(problem), len(problem.views)
         if run.step < begun:

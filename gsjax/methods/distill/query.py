@@ -39,8 +39,8 @@ def gaussian_cosines(
 def directions_of(
     field: FeatureField, located: Located | None
 ) -> tuple[Float[Array, "n r"], Float[Array, "d r"]]:
-    """The rendered features of Gaussians, scaled so that W f_i has length 1, 0 where it has length 0; and the
-    map from them to the teacher's channels: all that queries need, made once for many of them.
+    """The rendered features of Gaussians, scaled so that W f_i has length 1, or 0 where it has length 0; and
+    the map from them to the teacher's channels. Many queries can share them.
 
     Args:
         field: the field of all Gaussians.
@@ -120,12 +120,12 @@ def back_projected_cosines(
 
 
 def _of_gaussians(parts: RenderedFeatures) -> Float[Array, "n r"]:
-    """The rendered features of pixels that would show one Gaussian each."""
+    """The rendered features of pixels that each show a single opaque Gaussian."""
     return parts.joined(parts.values, jnp.ones(len(parts.values), parts.values.dtype))
 
 
 def _unit(rendered: Float[Array, "n r"], lifted: Float[Array, "d r"]) -> Float[Array, "n r"]:
-    """Rendered features, scaled so that what they are in the teacher's channels has length 1."""
+    """Rendered features, scaled to length 1 in the teacher's channels."""
     gram = jnp.matmul(lifted.T, lifted, precision="highest")
     squared = jnp.sum(jnp.matmul(rendered, gram, precision="highest") * rendered, axis=-1, keepdims=True)
     return jnp.where(squared > _LEAST_NORM, rendered / jnp.sqrt(jnp.maximum(squared, _LEAST_NORM)), 0.0)

@@ -22,7 +22,7 @@ from gsjax.scene.feature_grid import FeatureGrid, Located, locate
 
 FORMAT = 1
 """Format of field.npz."""
-_BEST, _ALIKE = 32, 0.02  # Gaussians by which the level of a query is told; cosines that are alike
+_BEST, _ALIKE = 32, 0.02  # best Gaussians that decide the level of a query; difference of equal cosines
 _UNKNOWN = {"kind": "files", "names": {}, "weights": None}  # an unknown source
 
 
@@ -40,8 +40,8 @@ class DistillResult:
         means: centres of the Gaussians to score, metres; None before the scene is loaded.
 
     A teacher may have features on several levels (`source.levels`: things, their parts, the parts of these),
-    whose channels follow one another. A query is then of one level, `level`; by default, of the one that it
-    fits best.
+    whose channels are concatenated. A query is then made on one level, `level`; by default, on the one that
+    it fits best.
     """
 
     field: FeatureField
@@ -98,7 +98,7 @@ class DistillResult:
 
     @property
     def levels(self) -> tuple[str, ...]:
-        """The levels of the features; none where there is one alone."""
+        """The levels of the features; none if there is only one."""
         return () if self.source is None else tuple(self.source.levels)
 
     @property
@@ -107,7 +107,7 @@ class DistillResult:
         return next(iter(self.levels), None)
 
     def channels(self, level: str | None) -> slice:
-        """The teacher's channels that are of a level; all of them where there are no levels.
+        """The teacher's channels of a level; all of them if there are no levels.
 
         Args:
             level: name of the level; None where there are none.
@@ -125,7 +125,7 @@ class DistillResult:
         """The feature of a Gaussian in the teacher's channels, of length 1, or 0 where it has none.
 
         Args:
-            row: of the Gaussian.
+            row: index of the Gaussian.
             level: of the feature (default: the smallest).
         """
         directions, lifted = self._directions(level or self.smallest)
@@ -159,7 +159,7 @@ class DistillResult:
 
     def best_level(self, vectors: Float[ArrayLike, "..."]) -> str | None:
         """The level whose best Gaussians score highest for a query, as in LangSplat (Qin et al. 2024,
-        section 3.4), and the largest of those that score as high; None where there are no levels.
+        section 3.4); of several that score about as high, the largest. None if there are no levels.
 
         Args:
             vectors: the query, then negatives, in the teacher's channels, [q, d].
@@ -231,7 +231,7 @@ class DistillResult:
         return {}
 
     def _directions(self, level: str | None) -> tuple[Float[Array, "n r"], Float[Array, "d r"]]:
-        """All that scores on a level need, made by the first query."""
+        """All that scores on a level need, computed by the first query."""
         if level not in self._known:
             field, located = self.placed
             of_level = eqx.tree_at(lambda f: f.lift, field, field.lift[self.channels(level)])
@@ -255,8 +255,8 @@ def _scores(directions, lifted, queries):
 
 @jax.jit
 def _best_ahead(directions, lifted, queries):
-    """By how much the query's cosine is ahead of those of its negatives, if any: the mean of the best
-    Gaussians, as one alone may be by chance."""
+    """By how much the query's cosine exceeds those of its negatives, if any: the mean over the best
+    Gaussians, as a single one may score high by chance."""
     cosines = cosines_of(directions, lifted, queries)
     ahead = cosines[:, 0] - (cosines[:, 1:].max(axis=1) if len(queries) > 1 else 0.0)
     return jax.lax.top_k(jnp.nan_to_num(ahead, nan=-2.0), min(_BEST, len(ahead)))[0].mean()

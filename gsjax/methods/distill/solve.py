@@ -1,20 +1,21 @@
-"""Vectors of Gaussians that are solved for, not descended to.
+"""Solution for the vectors of Gaussians by linear least squares, in place of gradient descent.
 
-Rendering is linear in the vectors x_i of Gaussians. So what L_rec (FD-3DGS, eq. 4) asks of them is a linear
-least-squares problem. With the weight w_pi of Gaussian i in pixel p, the pixel's alpha, its teacher's feature
-e_p, and m_p = 1 where there is one,
+Rendering is linear in the vectors x_i of Gaussians, so minimising L_rec (FD-3DGS, eq. 4) over them is a
+linear least-squares problem. With the weight w_pi of Gaussian i in pixel p, the pixel's alpha, its teacher's
+feature e_p, and m_p = 1 where there is one,
 
     min_x  sum_p m_p |sum_i w_pi x_i - alpha_p e_p|^2  +  lambda sum_(i,j) |x_i - x_j|^2
 
-over pairs (i, j) of neighbours in space, which give what few pixels show the vectors around it. The normal
-equations (W^T M W + lambda L) x = W^T M alpha e are the same for each channel, and W is only ever applied:
-a product is a view drawn and drawn back. Rows of W^T M W sum to D = W^T M alpha, so that D^-1 (W^T M W)
-has no eigenvalue above 1, and conjugate gradients with D as the preconditioner converge in a few passes.
+over pairs (i, j) of neighbours in space; the second term gives Gaussians that few pixels show the vectors
+around them. The matrix of the normal equations (W^T M W + lambda L) x = W^T M alpha e is the same for each
+channel, and W is never formed: W x renders a view, and W^T is the backward pass of that rendering. Rows of
+W^T M W sum to D = W^T M alpha, so that D^-1 (W^T M W) has no eigenvalue above 1, and conjugate gradients with
+D as the preconditioner converge in a few passes.
 
-Each step sees one view, and the sums of a pass over all views make an iteration: the first pass gives the
-right-hand side and D, and their quotient is where the iterations begin. That is a vote: each Gaussian has the
-mean of the features of the pixels that show it, as in Occam's LGS (Cheng et al. 2024) and LUDVIG (Marrie et
-al. 2024). The second pass gives the residual, and each further one an iteration.
+Each step processes one view, and the sums of a pass over all views make an iteration. The first pass gives
+the right-hand side and D, whose quotient is the initial guess. That is a vote: each Gaussian has the mean of
+the features of the pixels that show it, as in Occam's LGS (Cheng et al. 2024) and LUDVIG (Marrie et al.
+2024). The second pass gives the residual, and each further one an iteration.
 """
 
 from functools import partial
@@ -35,8 +36,8 @@ from gsjax.optim.step import Step, all_finite
 from gsjax.rasterize.frozen import paint_shown, rows_within, strip_of
 
 _LEAST = 1e-12
-_TAUGHT = 0.05  # share of the pixels that show a Gaussian that must have a teacher
-_SPREAD = 64  # most neighbours over which a vector spreads to Gaussians that no pixel shows
+_TAUGHT = 0.05  # share of a Gaussian's pixels that must have a teacher
+_SPREAD = 64  # most rings of neighbours over which vectors spread to Gaussians that no pixel shows
 
 
 class SolveBatch(NamedTuple):
@@ -44,7 +45,7 @@ class SolveBatch(NamedTuple):
 
     Attributes:
         view: a view and its teacher, in the channels of the field (`gsjax.methods.distill.views.in_basis`).
-        neighbors: the nearest others of each Gaussian.
+        neighbors: the nearest neighbours of each Gaussian.
         turn: index of the pass over the views; the first is the vote.
         is_last: whether the view is the last of its pass.
     """
@@ -56,13 +57,13 @@ class SolveBatch(NamedTuple):
 
 
 class SolveState(NamedTuple):
-    """The sums of the present pass, and of those before what the iterations need, for r channels.
+    """The sums of the current pass, and what the iterations need of earlier ones, for r channels.
 
     Attributes:
-        total: the sums of the present pass over the views.
+        total: the sums of the current pass over the views.
         wanted: the right-hand side.
-        mass: D, how much pixels that have a teacher show of each Gaussian.
-        shown: how much all pixels show of it.
+        mass: D, how much of each Gaussian is shown by pixels that have a teacher.
+        shown: how much of it is shown by all pixels.
         tie: lambda.
         conjugate: the state of the iterations; None for a vote.
         target: sum of the squared targets, sum_p m_p |alpha_p e_p|^2.
@@ -82,7 +83,8 @@ class SolveState(NamedTuple):
 
 
 class _Sums(NamedTuple):
-    """What a view adds to a pass: to its Gaussians' rows, to `mass`, `shown`, `target` and `pixels`."""
+    """What a view adds to the sums of a pass: to its Gaussians' rows of `total`, `mass` and `shown`, and to
+    `target` and `pixels`."""
 
     rows: Float[Array, "seen r"]
     mass: Float[Array, "seen"]
@@ -92,12 +94,12 @@ class _Sums(NamedTuple):
 
 
 def solve_step(config: DistillConfig) -> Step:
-    """One view of a pass of the solution of a `FeatureField` with a vector for each Gaussian, whose `lift`
-    has orthonormal columns and does not change; given a `SolveBatch`. Neither `step` nor `key` is used.
+    """Processes one view of a pass, a `SolveBatch`, for a `FeatureField` with a vector for each Gaussian,
+    whose `lift` has orthonormal columns and stays fixed. Neither `step` nor `key` is used.
 
-    The loss is the objective after the latest whole pass, a mean over pixels; until the second pass knows
-    that of the vote, it is that of vectors of zeros. `info` also has `rec`, the loss as a mean over the
-    teacher's channels like L_rec, NaN as long as it is that of zeros. A view whose sums are not finite adds
+    The loss is the objective after the latest complete pass, a mean over pixels; until the second pass has
+    evaluated the vote, it is that of vectors of zeros. `info` also has `rec`, the loss as a mean over the
+    teacher's channels like L_rec, NaN while the loss is that of zeros. A view whose sums are not finite adds
     nothing, but the pass goes on.
 
     Args:
@@ -156,13 +158,13 @@ def passes(config: DistillConfig) -> int:
 
 
 def unsolved(teacher: Teacher, means: Float[Array, "n 3"], config: DistillConfig) -> FeatureField:
-    """The field before its first step: vectors of zeros, in the channels of a basis in which the teacher's
-    features have `solve.energy` of their squared length.
+    """The field before its first step: vectors of zeros, in a basis that retains `solve.energy` of the
+    squared length of the teacher's features.
 
     Args:
         teacher: the teacher's features.
-        means: centres of the Gaussians, whose precision the field has.
-        config: the energy, and the most channels.
+        means: centres of the Gaussians, which also set the field's precision.
+        config: the energy, and the largest number of channels.
     """
     basis = jnp.asarray(basis_of(teacher, config), means.dtype)
     return FeatureField(jnp.zeros((len(means), basis.shape[1]), basis.dtype), basis)
@@ -172,8 +174,8 @@ def basis_of(teacher: Teacher, config: DistillConfig) -> Float[np.ndarray, "d r"
     """Orthonormal columns that span the teacher's features, the most important first. On the host.
 
     Args:
-        teacher: the teacher's features; each row of its codebook counts as much as the others, and as a map.
-        config: the energy that is kept, and the most channels.
+        teacher: the teacher's features; each row of its codebook counts as much as a whole map.
+        config: the energy that is kept, and the largest number of channels.
     """
     gram = np.zeros((teacher.dimension, teacher.dimension))
     if teacher.codebook is not None:
@@ -220,8 +222,8 @@ def _product(values: Float[Array, "n r"], batch: Batch, config: DistillConfig) -
 
 
 def _drawn_back(values: Float[Array, "seen c"], batch: Batch, config: DistillConfig, cotangent):
-    """The values drawn, and what `cotangent(first_row, inside, image, alphas)` makes of each strip of the
-    image drawn back to the Gaussians; and the sums of the two numbers that it returns beside that."""
+    """Renders the values strip by strip and pulls the first output of `cotangent(first_row, inside, image,
+    alphas)` back to the Gaussians, summed over strips; its other two outputs, numbers, are summed as well."""
     plan = batch.plan
     rows = rows_within(config.strip_megabytes, 3 * values.shape[1], plan)
     high = rows * plan.tile_size
@@ -280,8 +282,9 @@ def _after_pass(field: FeatureField, state: SolveState, batch: SolveBatch, confi
 
 
 def _voted(field: FeatureField, state: SolveState, neighbors, smoothness: float):
-    """After the vote: it is the first guess, and what no pixel shows has the mean of its neighbours. What
-    pixels show that have no teacher has nothing: it lies beside things, but is none of them."""
+    """After the vote, which is the initial guess. Gaussians that no pixel shows get the mean of their
+    neighbours; those shown by pixels without a teacher get zeros, as they lie beside objects but belong to
+    none."""
     seen = state.mass > _LEAST
     votes = jnp.where(seen[:, None], state.total / jnp.maximum(state.mass, _LEAST)[:, None], 0.0)
     tie = smoothness * state.mass.sum() / jnp.maximum(seen.sum(), 1)
@@ -291,7 +294,7 @@ def _voted(field: FeatureField, state: SolveState, neighbors, smoothness: float)
 
 
 def _begun(field: FeatureField, state: SolveState, neighbors):
-    """After the product with the first guess: the residual, along which the first iteration goes."""
+    """After the product with the initial guess: the residual, which gives the first search direction."""
     x = field.encoding
     residual = state.wanted - state.total - state.tie * _laplacian(x, neighbors)
     assert state.conjugate is not None
@@ -300,7 +303,7 @@ def _begun(field: FeatureField, state: SolveState, neighbors):
 
 
 def _advanced(field: FeatureField, state: SolveState, neighbors):
-    """After the product with a direction: an iteration of conjugate gradients."""
+    """After the product with a search direction: an iteration of conjugate gradients."""
     assert state.conjugate is not None
     product = state.total + state.tie * _laplacian(state.conjugate.direction, neighbors)
     scale = _preconditioner(state, neighbors)
@@ -310,12 +313,12 @@ def _advanced(field: FeatureField, state: SolveState, neighbors):
 
 
 def _untaught(state: SolveState) -> Bool[Array, "n"]:
-    """The Gaussians that pixels show, but hardly any that has a teacher."""
+    """The Gaussians that pixels show, of which hardly any has a teacher."""
     return (state.shown > _LEAST) & (state.mass <= _TAUGHT * state.shown)
 
 
 def _without_untaught(x: Float[Array, "n r"], state: SolveState) -> Float[Array, "n r"]:
-    """The vectors, zeros for those that no pixel has taught."""
+    """The vectors, zero for untaught Gaussians."""
     return jnp.where(_untaught(state)[:, None], 0.0, x)
 
 
@@ -333,7 +336,7 @@ def _objective(x: Float[Array, "n r"], residual: Float[Array, "n r"], state: Sol
 def _laplacian(x: Float[Array, "n r"], neighbors: Int[Array, "n k"]) -> Float[Array, "n r"]:
     """L x: the gradient of half of sum_(i,j) |x_i - x_j|^2 over the pairs of neighbours."""
 
-    def one(total, others):  # at a time, as there may be hundreds of channels
+    def one(total, others):  # one neighbour at a time, as there may be hundreds of channels
         apart = x - x[others]
         return (total + apart).at[others].add(-apart), None
 

@@ -19,11 +19,11 @@ class Teacher(NamedTuple):
 
     Attributes:
         ids: row of the codebook of each pixel, [H,W] per view; -1 where unknown. Pixels with the same id show
-            the same object, for the contrastive loss; without a codebook, ids serve for that alone.
+            the same object; without a codebook, ids serve the contrastive loss alone.
         codebook: the distinct embeddings, [K, D]; None for a teacher of maps only.
         maps: feature maps of any resolution, [h,w,D] per view, stretched over the view; None without.
-        filled: for a codebook of L levels, whose channels follow one another: the levels on which a pixel has
-            no mask of its own but that of another level, [H,W,L] per view. None without levels.
+        filled: for a codebook of L levels, whose channels are concatenated: the levels on which a pixel has
+            no mask and was given that of another level, [H,W,L] per view. None without levels.
 
     Embeddings and maps are scaled to a mean length of 1: cosines do not depend on their length, but the speed
     of training would.

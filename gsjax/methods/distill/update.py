@@ -1,4 +1,4 @@
-"""One optimization step of a distillation: render the features of a view and compare them with its teacher
+"""One optimisation step of a distillation: render the features of a view and compare them with its teacher
 (FD-3DGS, section 3.4).
 """
 
@@ -40,10 +40,10 @@ class _Sums(NamedTuple):
 
 
 def distill_step(config: DistillConfig) -> Step:
-    """Adam on a `FeatureField`.
+    """A step of Adam on a `FeatureField`.
 
     `batch` is a `Batch`; `step` determines when the contrastive loss begins, and `key` selects its patch.
-    `info` has each loss by name, unweighted, beside what every step reports.
+    `info` has each loss by name, unweighted, in addition to what every step reports.
 
     Args:
         config: configuration of the distillation.
@@ -57,7 +57,7 @@ def distill_step(config: DistillConfig) -> Step:
 
 
 def contrast_begins(config: DistillConfig) -> int:
-    """The step of the descent from which on the contrastive loss counts."""
+    """The training step from which the contrastive loss counts."""
     return math.ceil(config.contrast_after * config.iterations)
 
 
@@ -182,7 +182,7 @@ def _teacher_sums(
     inside,
     map_weight: float,
 ) -> _Sums:
-    """Errors of a strip's pixels, on one axis, to the teacher's features. A pixel of a map has the weight
+    """Errors of a strip's flattened pixels against the teacher's features. A pixel of a map has the weight
     `map_weight` if there are masks too."""
     lifted = parts.lifted(field.lift)
     zero = jnp.zeros((), rendered.dtype)

@@ -1,4 +1,4 @@
-"""The views of a distillation: the frozen scene in each camera, with its teacher."""
+"""The views of a distillation: the frozen scene as each camera sees it, with its teacher."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -26,7 +26,7 @@ class Batch(NamedTuple):
         codebook: the teacher's features in this view; None for a teacher of maps only.
         map: the teacher's feature map, of any resolution; None without. It stays on the host until its step.
         plan: plan of the view, which never grows, as the view is frozen.
-        begun: the step at which the descent began.
+        begun: the step at which gradient descent began.
     """
 
     view: FrozenView

@@ -1,8 +1,8 @@
-"""Labels of pixels lifted to Gaussians by majority vote: the baseline of a field.
+"""Labels of pixels lifted to Gaussians by majority vote: the baseline for a field.
 
-A pixel votes for a Gaussian with the weight of the Gaussian in the pixel. So the votes of a view are the
-gradient of the sum over pixels p of F(p)[label of p] with respect to the Gaussians' values, in which F is
-linear.
+A pixel's vote for a Gaussian has the Gaussian's compositing weight in that pixel. The rendered image F is
+linear in the Gaussians' values, so the votes of a view are the gradient, with respect to these values, of the
+sum over pixels p of F(p)[label of p].
 """
 
 from collections.abc import Sequence

@@ -1,5 +1,5 @@
-"""A static scene from posed photographs: 3D Gaussian splatting (Kerbl et al. 2023) with a fixed number of
-slots (3DGS-MCMC, Kheradmand et al. 2024).
+"""Reconstruction of a static scene from posed photographs: 3D Gaussian splatting (Kerbl et al. 2023) with a
+fixed number of slots (3DGS-MCMC, Kheradmand et al. 2024).
 
     method = Fit(config)
     problem, run = method.start(frames, cloud)
@@ -8,7 +8,7 @@ slots (3DGS-MCMC, Kheradmand et al. 2024).
     config.py  settings                  start.py    the initial Gaussians
     model.py   the parameters of a fit   update.py   the loss, one step, and densification
     method.py  the method, for the loop  pruning.py  removal of unneeded Gaussians
-    padding.py  photographs of many sizes, padded to a few
+    padding.py  padding of photographs of many sizes to a few
 """
 
 from gsjax.geometry.extent import Extent, extent_of

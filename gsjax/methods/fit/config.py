@@ -164,5 +164,5 @@ PRESETS = {
         growth=GrowthConfig(begin=500, end=25 / 30),
     ),
 }
-"""Settings by name: for a first look, with the cloning and splitting of 3DGS, for RGB-D, and close to those
-of 3DGS-MCMC, which need a GPU or a night."""
+"""Settings by name: a first look; the cloning and splitting of 3DGS; RGB-D; and settings close to those of
+3DGS-MCMC, which need a GPU or a night."""

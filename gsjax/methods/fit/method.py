@@ -1,4 +1,5 @@
-"""The method of a fit: the order and the size of photographs, plans, and the schedule of densification."""
+"""The method that fits a scene: the order and size of photographs, render plans, and the schedule of
+densification."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -38,7 +39,7 @@ class Problem(NamedTuple):
 
     Attributes:
         frames: the photographs to fit, with one camera each, on the host, padded to common sizes.
-        shares: the share of each that is not padding; None if none is padded.
+        shares: the share of each one's width and height that is not padding; None if none is padded.
         extent: the extent of the scene.
         background: RGB behind the scene; None: random in each step.
         start: source of the initial Gaussians: cloud, depth, matches or random.
@@ -125,8 +126,8 @@ class Fit:
         return len(problem.frames)
 
     def between(self, problem: Problem, run: Run, progress: float) -> Run:
-        """Relocates or splits Gaussians, unlocks the next degree of the spherical harmonics, and plans new
-        sizes, whose losses are others. Arguments as for `Method.between`."""
+        """Relocates or splits Gaussians, unlocks the next degree of the spherical harmonics, and plans the
+        rendering of new sizes, whose losses are not comparable. Arguments as for `Method.between`."""
         run = self._densified(problem, run, run.step - 1, progress)
         run = self._enlarged(run, degree=min(self.config.sh_degree, run.step // self.config.sh_every))
         name, frame = self._turn(problem, run.step, progress)
@@ -211,8 +212,8 @@ def shrink_at(config: FitConfig, progress: float) -> int:
 
 
 def _all_seen_since(config: FitConfig, step: int, views: int) -> bool:
-    """Whether each photograph was used since this was last true, after `step`; any two rounds contain a whole
-    shuffled one. Arguments: the config, and the number of views.
+    """Whether, after `step`, every photograph was used since this was last true: any 2 n consecutive steps
+    contain a whole epoch over n views. Arguments: the config, and the number of views.
     """
     if config.strategy == "split":  # which resets visibility each time
         return config.split.every >= 2 * views

@@ -49,8 +49,8 @@ def model_of(gaussians: Gaussians, config: FitConfig, views: int) -> Model:
 def exposed(
     colors: Float[Array, "c h w 3"], exposures: Float[Array, "views 3 4"], view: Int[Array, ""]
 ) -> Float[Array, "c h w 3"]:
-    """Colours with the exposure of a photograph: E [c; 1]. The mean of E over photographs is [I | 0], because
-    a shared exposure belongs to the scene.
+    """Colours at the exposure of a photograph: E [c; 1]. The mean of E over photographs is [I | 0], because
+    an exposure that all of them share belongs to the scene.
 
     Args:
         colors: colours of the scene.
@@ -96,8 +96,8 @@ def with_slots(model: Model, count: int) -> Model:
 
 
 def in_slots(gaussians: Gaussians, count: int) -> Gaussians:
-    """The Gaussians in the first of `count` slots, of which the others are empty; padded on the host, where
-    nothing is compiled for it."""
+    """The Gaussians, followed by empty slots up to `count`. Padded on the host, which needs no compiled
+    program."""
     rows = np.minimum(np.arange(count), gaussians.num) % gaussians.num  # empty slots hold copies of the first
     padded = jax.tree.map(lambda leaf: np.asarray(leaf)[rows], gaussians)
     logits = np.where(np.arange(count) < gaussians.num, padded.logit_opacities, EMPTY_LOGIT)

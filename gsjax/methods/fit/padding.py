@@ -1,4 +1,5 @@
-"""Common sizes for photographs of many sizes: each size costs three compiled programs. On the host."""
+"""Padding of photographs of many sizes to a few, because each size costs three compiled programs. On the
+host."""
 
 from dataclasses import replace
 
@@ -7,16 +8,16 @@ from jaxtyping import Float, Int
 
 from gsjax.scene.frame import Frame
 
-_MOST = 2  # sizes; upright and lying photographs stay apart
-_WASTE = 0.25  # of all pixels, that a second size must save
-_CELLS = 8  # along each axis of the grid on which near sizes are joined first, if there are more than cells
+_MOST = 2  # sizes: one for portrait and one for landscape photographs
+_WASTE = 0.25  # share of all pixels that a second size must save
+_CELLS = 8  # per axis of the grid on which similar sizes are merged first, if there are more sizes than cells
 
 
 def common_sizes(sizes: Int[np.ndarray, "n 2"]) -> Int[np.ndarray, "n 2"]:
     """The size to which each photograph is padded.
 
-    Sizes are joined, those first that add the fewest pixels, until there are two at most, and joining any
-    would add more than a quarter of all pixels.
+    Pairs of sizes are merged, those that add the fewest pixels first, until at most two sizes are left and
+    merging them would add more than a quarter of all pixels.
 
     Args:
         sizes: width and height of each photograph, pixels.
@@ -41,8 +42,8 @@ def common_sizes(sizes: Int[np.ndarray, "n 2"]) -> Int[np.ndarray, "n 2"]:
 
 
 def with_common_sizes(frames: list[Frame]) -> tuple[list[Frame], Float[np.ndarray, "n 2"] | None]:
-    """Photographs padded to common sizes, and the shares of each one's width and height that are not padding;
-    None if none is padded. If one is padded, all have masks, so that one program serves them all.
+    """Photographs padded to common sizes, and the share of each one's width and height that is not padding,
+    or None if none is padded. If one is padded, all have masks, so that one program serves them all.
 
     Args:
         frames: of one camera each, on the host.
@@ -56,7 +57,7 @@ def with_common_sizes(frames: list[Frame]) -> tuple[list[Frame], Float[np.ndarra
 
 
 def sizes_of(frames: list[Frame]) -> list[tuple[int, int]]:
-    """The common sizes, width and height, of photographs."""
+    """The common sizes (width, height) of photographs."""
     common = np.unique(common_sizes(_own_sizes(frames)), axis=0)
     return [(int(width), int(height)) for width, height in common]
 
@@ -66,11 +67,11 @@ def _own_sizes(frames: list[Frame]) -> Int[np.ndarray, "n 2"]:
 
 
 def padded(frame: Frame, size: Int[np.ndarray, "2"]) -> Frame:
-    """A photograph padded on the right and below, with a mask of what counts.
+    """A photograph padded on the right and at the bottom, with the padding masked out.
 
     Args:
         frame: of one camera, on the host.
-        size: width and height, pixels, no less than its own.
+        size: width and height, pixels, at least its own.
     """
     width, height = (int(side) for side in size)
     camera = frame.cameras

@@ -51,11 +51,11 @@ def prune(
 def light_of(
     gaussians: Gaussians, frames: Iterable[Frame], rasterize_mode: str = "classic"
 ) -> Float[np.ndarray, "n"]:
-    """The share of each Gaussian in the light of a view, in the view where it is largest: the sum, over
-    pixels that count, of its compositing weight, w_i = alpha_i T_i, divided by that of all Gaussians; the
-    maximum over views.
+    """Each Gaussian's share of the light of a view, in the view where that share is largest. The share is
+    the sum of its compositing weights, w_i = alpha_i T_i, over the pixels that count, divided by the same
+    sum for all Gaussians.
 
-    The sums are the gradient of the composited sum of a feature that is 1 everywhere.
+    The sums are computed as gradients of the sum of a rendered feature that is 1 for every Gaussian.
 
     Args:
         gaussians: the scene.

@@ -16,7 +16,7 @@ from gsjax.scene.gaussians import Gaussians
 from gsjax.scene.initialize import gaussians_from_points, points_from_rgbd
 
 _FEW = 0.1  # share of visible points below which something is wrong
-_FLAT_PX = 1.0  # disparity between cameras below which there is no depth
+_FLAT_PX = 1.0  # disparity between cameras below which the points show no depth
 
 
 def start_points(
@@ -81,7 +81,7 @@ def _is_seen(points: Float[np.ndarray, "m 3"], frames: list[Frame]) -> bool:
 
 
 def _from_depth(frames, count, random):
-    """Points of random pixels with depth, equally many from each frame."""
+    """Points at random pixels with depth, equally many from each frame where it has enough."""
     each = -(-count // len(frames))
     points, colors = [], []
     for frame in frames:
@@ -122,7 +122,7 @@ def _at_random(frames, count, random):
 def initial_gaussians(
     points: np.ndarray, colors: np.ndarray, slots: int, config: StartConfig, seed: int
 ) -> Gaussians:
-    """Spheres at the points, or at a random subset if these are more than slots, followed by empty slots.
+    """Spheres at the points, or at a random subset of them if they outnumber the slots; then empty slots.
 
     Args:
         points: [M, 3], metres.

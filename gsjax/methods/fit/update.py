@@ -55,15 +55,15 @@ def fit_loss(config: FitConfig, extra_losses: ExtraLosses = ()) -> Callable:
     Args:
         config: the weights.
         extra_losses: custom losses of the `Model`, its rendering, and the photograph; masked pixels are
-            rendered as photographed. Photographs of many sizes are padded, and padding is masked: a mean over
-            pixels belongs over `frame.masks`, if there are any.
+            rendered as photographed. Photographs of many sizes are padded, and the padding is masked: take
+            means over the pixels of `frame.masks`, unless it is None.
     """
 
     def loss(model: Model, batch: Batch, *, step: Any, key: Any):
         frame, gaussians = batch.frame, model.gaussians
         drawn, camera = _photographed(model, batch)
         image, target = drawn.colors, frame.colors
-        if frame.masks is not None:  # masked pixels are as photographed: no gradient, no edge
+        if frame.masks is not None:  # masked pixels equal the photograph's: no gradient, no edge
             image = jnp.where(frame.masks[..., None], image, target)
         value = photometric_loss(image, target, config.dssim_weight)
         if batch.share is not None:
@@ -109,7 +109,8 @@ def _photographed(model: Model, batch: Batch) -> tuple[Rendered, Camera]:
 
 
 def _depth_error(drawn: Rendered, depths: Any, masks: Any) -> Float[Array, ""]:
-    """The mean error of the rendered depth where there is depth, and a scene that is not transparent."""
+    """Mean absolute error of the rendered depth, where depth is known and the rendering more than half
+    opaque."""
     known = (depths > 0) & jax.lax.stop_gradient(drawn.alphas > 0.5)
     if masks is not None:
         known &= masks
@@ -117,9 +118,9 @@ def _depth_error(drawn: Rendered, depths: Any, masks: Any) -> Float[Array, ""]:
 
 
 def fit_step(config: FitConfig, extra_losses: ExtraLosses = ()) -> Step:
-    """Adam on a `Model`, and with relocation the noise of 3DGS-MCMC.
+    """A step of Adam on a `Model`, with the noise of 3DGS-MCMC if Gaussians are relocated.
 
-    `batch` is a `Batch`; `key` is used by the noise; `step` is not used, as rates depend on `batch.progress`.
+    `batch` is a `Batch`; `key` is for the noise; `step` is not used, as rates depend on `batch.progress`.
     `info` has `psnr` and `alive` in addition to what every step reports.
 
     Args:
@@ -133,7 +134,7 @@ def fit_step(config: FitConfig, extra_losses: ExtraLosses = ()) -> Step:
     def adam_step(model: Model) -> Step:
         present = [name for name in rates if getattr(model.gaussians, name, None) is not None]
         present += [name for name in ("exposures", "twists") if getattr(model, name) is not None]
-        # Means and twists move at a rate of 1 here, of which `update` takes a share that falls over the fit.
+        # Means and twists move at a rate of 1 here; `update` scales their steps by rates that decay.
         used = {name: 1.0 if name in ("means", "twists") else rates[name] for name in present}
         return gradient_step(loss, per_field_adam(used, others={"nudges": watch_pull()}))
 
@@ -182,7 +183,7 @@ def grow(
     slots = jnp.clip(jnp.ceil(used * factor).astype(jnp.int32), used, cap)
     moved, touched = relocate(gaussians, key, slots)
     state = _map_nodes(Gaussians, lambda known: reset_rows(known, touched), state)
-    seen = jnp.where(all_seen, 0.0, jnp.where(touched, 1.0, pull.seen))  # new ones cannot have been seen
+    seen = jnp.where(all_seen, 0.0, jnp.where(touched, 1.0, pull.seen))  # new ones had no chance to be seen
     state = _map_nodes(Pull, lambda pull: Pull(pull.total, seen), state)
     return eqx.tree_at(lambda m: m.gaussians, model, moved), state
 
