@@ -16,8 +16,8 @@ class StartConfig:
     """Source of the initial positions: the data's point cloud, its depth, points matched between photographs,
     or random points in front of the cameras. auto: the first of these that is available."""
     count: int = 20_000
-    """Number of Gaussians, unless they are the data's own points; from depth, up to one more per
-    photograph."""
+    """Number of Gaussians, unless they are points of the data or matched points; from depth, up to one more
+    per photograph."""
     opacity: float = 0.1
     """Initial opacity."""
     scale: float = 1.0

@@ -1,5 +1,5 @@
-"""The initial Gaussians: from a point cloud, from depth, or at random in front of the cameras. On the
-host."""
+"""The initial Gaussians: from a point cloud (the data's own, or points matched between photographs), from
+depth, or at random in front of the cameras. On the host."""
 
 import warnings
 
