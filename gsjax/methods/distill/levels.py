@@ -3,8 +3,8 @@
 A segmenter misses masks, so in each view some pixels have none on a level and were given that of another
 level (`Teacher.filled`). Taken at face value, such a view teaches that a drawer is a cabinet. So the views
 vote first: on each level, a Gaussian takes the majority kind of those of its pixels that have a mask there
-or, if hardly any has one, its kind on the next larger level or, without one, the next smaller. Rendering these
-Gaussians then gives the kind of each filled pixel.
+or, if hardly any has one, its kind on the next larger level or, without one, the next smaller. Rendering
+these Gaussians then gives the kind of each filled pixel.
 """
 
 from collections.abc import Sequence
