@@ -1,5 +1,5 @@
-"""The scene that a field is distilled for, and photographs of it: those of a run, or of a file of another
-program."""
+"""The scene that a field is distilled for, and its photographs: those of a run, or given along with a file of
+another program."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -75,7 +75,7 @@ def open_field_scene(options: SceneOptions, read_scene: Read | None = None) -> F
         read_scene: its Gaussians and the report about them, if they were read already.
 
     Raises:
-        ValueError, OSError: they do not exist, or options are given that the run has chosen itself.
+        ValueError, OSError: they do not exist, or options are given that the run has already settled.
     """
     path = options.scene
     if path.is_file():
@@ -181,7 +181,7 @@ def _read(file: Path) -> Read:
 
 
 def _as_learned(photographs: Photographs, file: Path) -> Photographs:
-    """The photographs with the poses that the fit refined, where it did."""
+    """The photographs with the poses that the fit refined, if it did."""
     if not file.is_file():
         return photographs
     arrays = read_arrays(file, ("names", "viewmats"), _AGAIN)
