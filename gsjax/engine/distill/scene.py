@@ -36,9 +36,9 @@ class SceneAndImages:
     """Folder of a run of `gsjax fit`, `gsjax track` (its first frame) or `gsjax parts` (its canonical frame);
     or a file of Gaussians from any program (.ply, .spz, .sog, .splat, .ksplat), with --images and --out."""
     images: str | None = None
-    """Photographs of a file's scene, with poses in its coordinates, among which --frames, --cameras,
-    --eval-cameras and --test-every select. For a run: the present folder of its photographs, if they
-    were moved."""
+    """Photographs of a file's scene, with poses in its coordinates; --frames, --cameras, --eval-cameras
+    and --test-every select among them. For a run: the current folder of its photographs, if they were
+    moved."""
 
 
 @dataclass(frozen=True)
