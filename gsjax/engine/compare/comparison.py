@@ -1,4 +1,4 @@
-"""What several runs have in common and where they differ: the numbers behind `gsjax compare`."""
+"""The comparison of several runs: the numbers behind `gsjax compare`."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -20,7 +20,7 @@ _NOT_COMPARED = (
     "overwrite",
     "debug",
     "tensorboard",
-)  # settings that say nothing of a result
+)  # settings that do not affect a result
 
 
 _OF_VIEWS = [score.key for score in SCORES["fit"] if score.of == "views"]
@@ -33,8 +33,8 @@ class Group:
     Attributes:
         dataset: its name.
         labels: of the runs.
-        views: held-out views that all of them were judged by; their scores are means over these.
-        best: the runs that are best by each score; one that cannot be compared is missing.
+        views: held-out views by which all of them were judged; scores are means over these.
+        best: the best runs by each score; a score that cannot be compared is missing.
     """
 
     dataset: str
@@ -48,9 +48,9 @@ class Comparison:
     """The result of a comparison.
 
     Attributes:
-        kind: the command whose runs these are.
+        kind: the command that made the runs.
         records: the runs, by their labels, group by group.
-        scores: of each run, by the keys of `SCORES`; None where it is not known.
+        scores: of each run, by the keys of `SCORES`; None if unknown.
         groups: runs that can be compared with each other.
         options: each run's values of the settings that all runs have but that differ between runs.
         notes: what was not compared, and why.
@@ -70,11 +70,11 @@ class Comparison:
 
 
 def compare(records: Sequence[Record], same_views: Callable[[list[Record], str], bool]) -> Comparison:
-    """Set runs side by side.
+    """Compare runs.
 
     Args:
-        records: two or more.
-        same_views: whether a held-out view of this name shows the same in all of these runs.
+        records: two or more runs.
+        same_views: (runs, name of a held-out view) -> whether the view shows the same in all of them.
 
     Raises:
         ValueError: they are runs of different commands.
@@ -120,11 +120,10 @@ def compare(records: Sequence[Record], same_views: Callable[[list[Record], str],
 
 
 def labels(paths: Sequence[Path]) -> list[str]:
-    """A short name for each folder: the last parts of its path, as many as it takes to tell it from the
-    others.
+    """A short label for each folder: as many of the last parts of its path as distinguish it from the others.
 
     Raises:
-        ValueError: a folder is named twice.
+        ValueError: a folder is given twice.
     """
     parts = [path.resolve().parts for path in paths]
     for i, part in enumerate(parts):
@@ -140,8 +139,8 @@ def labels(paths: Sequence[Path]) -> list[str]:
 
 
 def _data(record: Record, records: Sequence[Record]) -> tuple[str, Any]:
-    """What runs must share to be compared. One that is not finished is of the data of which another was that
-    was started with the same words."""
+    """What runs must share to be compared. An unfinished fit is taken to be of the same data as a finished
+    one with the same options for the data."""
     found = record.metrics
     if found is None and record.kind == "fit":
         named = _words(record)
@@ -157,7 +156,8 @@ def _words(record: Record) -> tuple[Any, ...]:
 
 
 def _held_out(record: Record) -> dict[str, dict[str, Any]]:
-    """What a fit and its evaluation found of each held-out view, by its name."""
+    """The scores of each held-out view of a fit, by the view's name, with those of `gsjax eval` if it was
+    evaluated."""
     found = record.metrics
     if found is None or not found["photographs"]["held_out"]:
         return {}
@@ -171,7 +171,7 @@ def _held_out(record: Record) -> dict[str, dict[str, Any]]:
 def _common_views(
     members: Mapping[str, Record], same: Callable[[list[Record], str], bool], notes: list[str]
 ) -> list[str]:
-    """Held-out views that all runs that were judged have; none where there is nothing to compare."""
+    """Held-out views that all runs with scores share; none if there is nothing to compare."""
     judged = {label: _held_out(record) for label, record in members.items()}
     judged = {label: rows for label, rows in judged.items() if rows}
     if len(judged) < 2:
@@ -196,12 +196,13 @@ def _common_views(
 
 
 def _fit_scores(members: Mapping[str, Record], views: list[str]) -> dict[str, dict[str, float | None]]:
-    """Of each run; scores of views are over those in common, where there are any, else over its own."""
+    """The scores of each fit; scores of views are means over the common views if there are any, else over its
+    own."""
     judged = {label: _held_out(record) for label, record in members.items()}
     scores: dict[str, dict[str, float | None]] = {}
     for label, record in members.items():
         scores[label] = _scores(record)
-        if record.metrics is None and record.curve:  # it has not come to its scores yet
+        if record.metrics is None and record.curve:  # not scored yet
             last = record.curve[-1]
             scores[label] |= {"num_gaussians": last["alive"], "steps": last["step"]}
             scores[label] |= {"minutes": last["seconds"] / 60}
@@ -223,7 +224,7 @@ def _is_known(value: Any) -> bool:
 
 
 def _comparable_fits(members: Mapping[str, Record], views: list[str], notes: list[str]) -> set[str]:
-    """Keys of the aspects in which these runs can be compared."""
+    """Keys of the scores by which these fits can be compared."""
     keys = {score.key for score in SCORES["fit"] if views or score.of != "views"}
     weights = {
         label: (record.evaluation or {}).get("lpips", {}).get("weights") for label, record in members.items()
@@ -235,7 +236,7 @@ def _comparable_fits(members: Mapping[str, Record], views: list[str], notes: lis
 
 
 def _what_eval_adds(records: Mapping[str, Record]) -> list[str]:
-    """Says for which fits there is no MS-SSIM or LPIPS, and how to have them."""
+    """Notes on the fits without MS-SSIM or LPIPS, and on how to get them."""
     judged = [label for label, record in records.items() if _held_out(record)]
     never = [label for label in judged if records[label].evaluation is None]
     blind = [label for label in judged if "absent" in (records[label].evaluation or {}).get("lpips", {})]
@@ -250,7 +251,7 @@ def _what_eval_adds(records: Mapping[str, Record]) -> list[str]:
 
 
 def _scores(record: Record) -> dict[str, float | None]:
-    """Of a run of any other kind."""
+    """The scores of a run, from its metrics."""
     found = record.metrics
     return {a.key: None if found is None else a.value(found) for a in SCORES[record.kind]}
 
@@ -262,7 +263,7 @@ def _machine(record: Record) -> str | None:
 def _best(
     kind: Kind, members: Mapping[str, Record], scores: Mapping[str, Mapping[str, Any]], comparable: set[str]
 ) -> dict[str, list[str]]:
-    """By each score, the finished runs that are best as far as the digits shown tell; none where all are."""
+    """The best finished runs by each score, compared at the digits shown; a score is left out if all tie."""
     best = {}
     for score in SCORES[kind]:
         if score.better is None or score.key not in comparable:
@@ -278,7 +279,7 @@ def _best(
 
 
 def _differing(records: Mapping[str, Record], notes: list[str]) -> dict[str, dict[str, Any]]:
-    """Settings that all runs have, and not the same."""
+    """Settings that all runs have but whose values differ. Notes settings that some runs lack."""
     flat = {label: flattened(record.config) for label, record in records.items()}
     names = [n for n in dict.fromkeys(n for s in flat.values() for n in s) if n not in _NOT_COMPARED]
     lacking: dict[tuple[str, ...], list[str]] = {}

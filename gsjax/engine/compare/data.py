@@ -1,4 +1,4 @@
-"""What two runs must share to be compared, and the scores that are compared for each command."""
+"""What runs must share to be compared, and the scores that are compared for each command."""
 
 from typing import Any
 
@@ -37,13 +37,13 @@ def data_of(kind: Kind, found: Metrics) -> tuple[Any, ...]:
 
 
 def data_in_words(dataset: str, data: tuple[Any, ...] | None) -> str:
-    """A dataset and its `data_of` in words, for a note; `data` is None for a run that has no metrics yet."""
+    """Describes a dataset and its `data_of`, for a note; `data` is None for a run without metrics yet."""
     if data is None:
         return dataset
     size = f"{dataset} at {data[0]}x{data[1]}"
     if len(data) == 2:
         return size
-    if isinstance(data[2], str):  # what it was judged by, and how many there were
+    if isinstance(data[2], str):  # the views or frames that it was judged by, and their numbers
         return f"{size}, " + ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in data[3])
     (first, last, count), (tracked, held_out) = data[2:]
     by = f", judged by {[*held_out]}" if held_out else ""

@@ -1,4 +1,4 @@
-"""The same held-out view in several runs side by side, from the pictures that the runs wrote."""
+"""Pictures of the same held-out view in several runs, side by side, from the pictures that the runs wrote."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -20,21 +20,21 @@ _CHIP = (22, 24, 28)
 
 
 class Panels(NamedTuple):
-    """What a run wrote of a view, [H,W,3] each."""
+    """The pictures that a run wrote of a view, [H,W,3] each."""
 
     photograph: UInt8[np.ndarray, "h w 3"]
     rendered: UInt8[np.ndarray, "h w 3"]
 
 
 def read_panels(record: Record, view: str) -> Panels | None:
-    """The pictures of a held-out view; None where the run wrote none or they are gone."""
+    """The pictures of a held-out view; None if the run wrote none or they are gone."""
     rows = [] if record.metrics is None else record.metrics["views"]
     names = [row.get("picture") for row in rows if row["view"] == view]
     file = record.path / names[0] if names and names[0] else None
     picture = None if file is None else cv2.imread(str(file))
     if picture is None:
         return None
-    width = picture.shape[1] // len(PANELS)  # there may be one column more, for an even number
+    width = picture.shape[1] // len(PANELS)  # one column may be left over: widths are even
     return Panels(*(picture[:, i * width : (i + 1) * width, ::-1] for i in range(2)))
 
 
@@ -59,7 +59,7 @@ def write_strip(path: Path, records: Mapping[str, Record], view: str) -> bool:
     known = {label: panels for label, panels in found.items() if panels is not None}
     if not known:
         return False
-    columns = -(-(1 + len(known)) // -(-(1 + len(known)) // _COLUMNS))  # rows as even as can be
+    columns = -(-(1 + len(known)) // -(-(1 + len(known)) // _COLUMNS))  # fill rows evenly
     room = _WIDTH // columns
     pictures = [_relabelled(next(iter(known.values())).photograph, PANELS[0], PANELS[0], room)]
     for label, panels in known.items():
@@ -79,7 +79,7 @@ def _psnr(record: Record, view: str) -> float | None:
 def _relabelled(
     picture: UInt8[np.ndarray, "h w 3"], old: str, new: str, room: int
 ) -> UInt8[np.ndarray, "height width 3"]:
-    """With another caption in place of the one that is painted there; as wide as `room` at most."""
+    """The picture with another caption in place of the one drawn on it, at most `room` pixels wide."""
     blank = np.full_like(picture, 255)
     painted = (captioned(blank, old) != blank).any(-1, keepdims=True)
     picture = np.where(painted, np.array(_CHIP, np.uint8), picture)

@@ -1,4 +1,4 @@
-"""The summary of a comparison: runs side by side, settings that differ, curves and pictures."""
+"""The summary of a comparison: runs side by side, the settings that differ, curves and pictures."""
 
 import shutil
 from collections.abc import Iterator
@@ -25,7 +25,7 @@ def summarize(found: Comparison, out: Path | None) -> Summary:
 
     Args:
         found: the comparison.
-        out: folder for its curves and pictures, whose earlier ones are replaced; None: none are drawn.
+        out: folder for its curves and pictures, which replace earlier ones; None: none are drawn.
     """
     plots, strips = ([], []) if out is None else _draw(found, out)
     return Summary(
@@ -82,13 +82,13 @@ def _draw(found: Comparison, out: Path) -> tuple[list[Media], list[Media]]:
 
 
 def _describe(group: Group) -> str:
-    """The group in words."""
+    """Describes a group."""
     views = f", {counted(len(group.views), 'held-out view')}" if group.views else ""
     return f"{group.dataset}: {', '.join(group.labels)}{views}"
 
 
 def _cards(found: Comparison) -> list[Card]:
-    """The best run by each score, where all runs can be compared."""
+    """The best runs by each score, if all runs can be compared."""
     if len(found.groups) > 1:
         return []
     best = found.groups[0].best
@@ -127,7 +127,7 @@ def _option_tables(found: Comparison) -> Iterator[Table]:
 
 
 def _setting(value: Any) -> str:
-    """A setting as config.yml has it."""
+    """A setting as it is written in config.yml."""
     if value is None or isinstance(value, bool):
         return {None: "–", True: "true", False: "false"}[value]
     return ", ".join(map(str, value)) if isinstance(value, list) else str(value)

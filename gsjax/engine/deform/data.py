@@ -1,4 +1,4 @@
-"""The data of `gsjax deform`: frames of one camera, the pixels that count, and names of mask values."""
+"""The data of `gsjax deform`: the frames of one camera, the pixels that count, and the teacher's labels."""
 
 import hashlib
 from collections.abc import Iterable
@@ -25,20 +25,20 @@ from gsjax.scene.frame import Frame
 
 Tools = Literal["leave-out", "draw"]
 _WITHOUT_ENCODER = ("auto", "classes", NO_TEACHER)
-_SHOWN = 0.005  # of a picture: a class that has less of it hardly shows
+_SHOWN = 0.005  # share of a picture below which a class hardly shows
 
 
 @dataclass(frozen=True, eq=False)
 class DeformData:
-    """A recording with its frames split.
+    """A recording whose frames are split into training and held-out frames.
 
     Attributes:
-        sequence: camera 0 is the one that is learned from; others are only judged.
+        sequence: the recording; camera 0 is the training camera, the others are only for evaluation.
         train: indices of training frames.
-        test: indices of frames that are held out.
+        test: indices of held-out frames.
         frames: the training frames, in memory.
         taught: the teacher's labels of the frames; None without a teacher.
-        tool_values: mask values that are tools; if empty, those that are named like tools.
+        tool_values: mask values that are tools; if empty, tools are recognised by name (`is_tool`).
     """
 
     sequence: Sequence
@@ -70,9 +70,9 @@ class DeformData:
 
     @property
     def first(self) -> int | None:
-        """Index in `frames` of the frame that the canonical scene starts from: the earliest that shows most
-        of the classes, because what it does not show has no Gaussians of its own. None without classes, or
-        where the scene can start from none of these frames."""
+        """Index in `frames` of the frame that the canonical scene starts from: the earliest of those that
+        show the most classes, because a class it does not show gets no Gaussians of its own. None without
+        classes, or if the scene cannot start from any of these frames."""
         if self.lesson is None or self.meaning is None or self.meaning.source.kind != "classes":
             return None
         shown = np.zeros(len(self.frames), int)
@@ -92,7 +92,7 @@ class DeformData:
         return found.hexdigest()
 
     def labels(self, t: int) -> Labels | None:
-        """The teacher's labels of a frame; None where it has none."""
+        """The teacher's labels of a frame; None if it has none."""
         if self.taught is None or self.lesson is None:
             return None
         if t not in self.train:
@@ -106,7 +106,7 @@ class DeformData:
             t: index of the frame.
             camera: index of the camera.
             tools: whether pixels of tools count.
-            mask: labels of the frame, if they were read before.
+            mask: labels of the frame, if they were already read.
         """
         seen, counts = self.sequence, None
         if tools == "leave-out" and seen.has_masks:
@@ -155,17 +155,17 @@ def deform_data(
     notes: Notes,
     console: Console,
 ) -> DeformData:
-    """Read the training frames.
+    """Read the training frames, and the teacher's labels of all frames.
 
     Args:
         sequence: the recording; camera 0 is the training camera.
-        every: without a split in the data, hold out frame i where (i - 1) mod `every` is 0, as is done with
+        every: if the data has no split, hold out frame i where (i - 1) mod `every` is 0, as is usual for
             EndoNeRF; 0: none.
         tools: whether tools, recognised by the names of mask values, are left out.
         choice: the teacher; checked. "auto": the masks' classes, if there are two or more among pixels that
             count. "none": no teacher.
         channels: of a Gaussian's feature.
-        tool_values: mask values that are tools; if empty, those that are named like tools.
+        tool_values: mask values that are tools; if empty, tools are recognised by name (`is_tool`).
         notes: receives oddities of the data.
         console: shows the progress.
 
@@ -209,8 +209,8 @@ def deform_data(
 
 
 def _split(sequence: Sequence, every: int, notes: Notes) -> tuple[list[int], list[int]]:
-    """Indices of training frames and of held-out ones: by the data's split, as `gsjax fit` has it, else every
-    n-th.
+    """Indices of training and of held-out frames: by the data's split, as in `gsjax fit`, else every n-th is
+    held out.
 
     Raises:
         ValueError: no frame is left to learn from.
@@ -240,7 +240,7 @@ def _counted_names(
     tool_values: tuple[int, ...],
     notes: Notes,
 ) -> dict[int, str]:
-    """Names of mask values that count; what is left out is noted."""
+    """The mask values that count, with their names; notes which are left out."""
     values = sorted({int(v) for mask in masks if mask is not None for v in np.unique(mask)})
     names = {TISSUE: "tissue"} | sequence.names_of_labels
     called = {value: names.get(value, f"object {value}") for value in values if value >= TISSUE}
@@ -252,11 +252,10 @@ def _counted_names(
 
 
 def _has_classes(sequence: Sequence, count: int, features: str) -> bool:
-    """Whether the classes of masks teach: where there are two or more among pixels that count, and always
-    where they are asked for.
+    """Whether the classes of masks are the teacher: if there are two or more among the pixels that count.
 
     Raises:
-        ValueError: they are asked for, and there is nothing to tell apart.
+        ValueError: they are asked for, but there are no masks or fewer than two classes.
     """
     if features == "classes" and not sequence.has_masks:
         raise ValueError(f"--features classes: {sequence.name} has no masks; leave it at auto, or give masks")

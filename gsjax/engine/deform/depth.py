@@ -1,4 +1,4 @@
-"""The depth that `gsjax deform` begins with: the data's, matched between two cameras, or none."""
+"""The depth that `gsjax deform` starts with: the data's own, from stereo matching of two cameras, or none."""
 
 from dataclasses import replace
 from typing import Literal
@@ -14,11 +14,11 @@ from gsjax.perception.stereo import stereo_depth
 Depth = Literal["auto", "data", "stereo", "hull", "plane"]
 DepthSource = Literal["data", "stereo", "hull", "plane"]
 METRIC: tuple[DepthSource, ...] = ("data", "stereo")
-"""Sources by which lengths are in the unit of the data, metres."""
+"""Sources with which lengths are in the unit of the data, metres."""
 
 
 def shows_one_object(sequence: Sequence, source: DepthSource) -> bool:
-    """Whether a camera goes around an object with nothing behind it, for which `PRESETS["around"]` is.
+    """Whether a camera goes around an object with nothing behind it, the case for `PRESETS["around"]`.
 
     Args:
         sequence, source: from `with_depth`.
@@ -27,12 +27,12 @@ def shows_one_object(sequence: Sequence, source: DepthSource) -> bool:
 
 
 def with_depth(sequence: Sequence, wanted: Depth, plane: float, notes: Notes) -> tuple[Sequence, DepthSource]:
-    """The recording with depth of camera 0, and its source: the recording's own, else matched with camera 1,
-    else none: the scene then begins within its visual hull if the camera goes around it, else on a plane.
-    Lengths are metres if the data's are, where there is depth.
+    """The recording with depth of camera 0, and the source of the depth: the recording's own, else stereo
+    matching with camera 1, else none; the scene then starts within its visual hull if the camera goes around
+    it, else on a plane. With depth, lengths are in metres if the data's are.
 
     Args:
-        sequence: camera 0 is learned from.
+        sequence: the recording; camera 0 is the training camera.
         wanted: the source; "auto" takes the first that exists.
         plane: distance of the plane from the first camera, in the unit of the poses.
         notes: receives the source.
@@ -99,7 +99,7 @@ def _of_two_eyes(sequence: Sequence, notes: Notes) -> tuple[Sequence, DepthSourc
 
 
 def _of_a_plane(sequence: Sequence, plane: float, notes: Notes) -> tuple[Sequence, DepthSource]:
-    """The first camera alone, and how far away the plane is."""
+    """The first camera alone, without depth; notes the distance of the plane."""
     notes.add(
         f"There is no depth: the scene starts on a plane {plane:g} in front of the first camera. Its depth "
         "has no metric unit, is learned from images alone, and is not scored."
@@ -121,7 +121,7 @@ def _of_a_plane(sequence: Sequence, plane: float, notes: Notes) -> tuple[Sequenc
 
 
 def _without_depth(sequence: Sequence) -> Sequence:
-    """The first camera alone, without what is known in metres, because the scene may have another unit."""
+    """The first camera alone, without depth and ground truth, as the scene may not be in metres."""
     alone = sequence.select(cameras=[sequence.camera_ids[0]])
-    names = alone.names_of_labels  # some of which may be truth's
+    names = alone.names_of_labels  # some may come from the ground truth
     return replace(alone, load_depth=None, truth=None, label_names=names)

@@ -1,4 +1,4 @@
-"""deformation.npz: a scene that deforms, apart from the recording that it was learned from."""
+"""deformation.npz: a deforming scene in a file that does not need the recording it was learned from."""
 
 import os
 from pathlib import Path
@@ -25,24 +25,24 @@ def write_deformation(
     origin: Float[np.ndarray, "3"] | None = None,
     background: tuple[float, float, float] | None = None,
 ) -> None:
-    """Write a deforming scene to `path`, a checkpoint (`gsjax.io.checkpoints`); atomic.
+    """Write a deforming scene to `path` atomically, as a checkpoint (`gsjax.io.checkpoints`).
 
     Args:
-        path: the file; its suffix is `.npz` by custom.
+        path: the file; its suffix is `.npz` by convention.
         result: the scene.
-        origin: what it is relative to, where the recording lies far from 0; kept beside it.
-        background: RGB, 0 to 1, behind the scene, if it was learned before one; kept beside it.
+        origin: what it is relative to, if the recording lies far from 0; stored as metadata.
+        background: RGB, 0 to 1, behind the scene, if it was learned with one; stored as metadata.
     """
     beside = {"origin": None if origin is None else origin.tolist(), "background": background}
     save_checkpoint(path, result, {name: value for name, value in beside.items() if value is not None})
 
 
 class Beside(NamedTuple):
-    """What `write_deformation` kept beside a scene.
+    """The metadata that `write_deformation` stores with a scene.
 
     Attributes:
-        origin: what it is relative to; None where that is 0.
-        background: RGB, 0 to 1, behind it; None where that is black.
+        origin: what the scene is relative to; None for 0.
+        background: RGB, 0 to 1, behind the scene; None for black.
     """
 
     origin: Float[np.ndarray, "3"] | None
@@ -50,7 +50,7 @@ class Beside(NamedTuple):
 
 
 def read_beside(path: str | os.PathLike) -> Beside:
-    """What is beside the scene that `write_deformation` wrote.
+    """The metadata of a scene that `write_deformation` wrote.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -70,7 +70,7 @@ def read_deformation(path: str | os.PathLike) -> DeformResult:
     Raises:
         FileNotFoundError: there is no such file.
         ValueError: it is damaged, of another version of gsjax, or holds something else; or numbers in it are
-            not finite or do not fit each other.
+            not finite or inconsistent.
     """
     path = Path(path)
     if not path.is_file():
@@ -85,7 +85,7 @@ def read_deformation(path: str | os.PathLike) -> DeformResult:
         )
     try:
         wrong = _misfit(result)
-    except (TypeError, ValueError, AttributeError, IndexError) as error:  # parts of other kinds
+    except (TypeError, ValueError, AttributeError, IndexError) as error:  # parts of other types
         wrong = f"expected the parts of a deforming scene, found others ({error})"
     if wrong is not None:
         raise ValueError(f"{path}: {wrong}; {_AGAIN}")
@@ -93,7 +93,7 @@ def read_deformation(path: str | os.PathLike) -> DeformResult:
 
 
 def warn_of_partial(path: Path, notes: Notes) -> None:
-    """Warns where the run in a folder was stopped before its end."""
+    """Warns if the run in a folder was stopped before its end."""
     try:
         found = parse_json((path / "metrics.json").read_text(encoding="utf-8"))
         steps = found["steps"] if not found["complete"] else None
@@ -125,7 +125,7 @@ def _misfit(result: DeformResult) -> str | None:
 
 
 def _misfit_of_moving(moving: Moving, count: int) -> str | None:
-    """The same of the places where the field is evaluated, for `count` Gaussians."""
+    """The first inconsistency of the rows or nodes where the field is evaluated, for `count` Gaussians."""
     if moving is None:
         return None
     bounded = {"rows": (moving.rows if isinstance(moving, Nodes) else moving, count)}

@@ -1,4 +1,4 @@
-"""Poses that `gsjax deform` refined: the recording with these, and how far they are from the given ones."""
+"""Camera poses refined by `gsjax deform`: the recording with them, and how far they are from those given."""
 
 from dataclasses import replace
 from typing import Any
@@ -19,15 +19,15 @@ NAME = "poses.npz"
 def as_refined(
     folder: RunFolder, problem: Problem, scene: DeformingScene, data: DeformData, notes: Notes
 ) -> tuple[DeformData, dict[str, Any] | None]:
-    """The data with refined poses, which are also written, and the entry of metrics.json about them; the data
-    as they are and None where poses were not refined.
+    """Returns the data with refined poses, which are also written, and the entry of metrics.json about them;
+    the unchanged data and None if poses were not refined.
 
     Args:
         folder: of the run.
-        problem: what was learned from.
+        problem: the problem that was solved.
         scene: the result.
         data: the recording, with the poses as given.
-        notes: receives how poses are judged.
+        notes: receives how frames are judged.
     """
     if scene.twists is None:
         return data, None

@@ -1,5 +1,5 @@
-"""Queries of a run of `gsjax deform`, at every time: the Gaussians that match a text, a point or a box, or
-the labels of all Gaussians."""
+"""Queries of a run of `gsjax deform` at any time: the Gaussians that match a text, a point or a box, or the
+labels of all Gaussians."""
 
 from collections.abc import Callable, Iterator, Sequence
 from functools import cached_property, partial
@@ -36,25 +36,25 @@ from gsjax.viz.colors import INVALID, in_rows, label_color, overlay_labels, to_u
 from gsjax.viz.viewer.drawing import recolored
 
 _PANEL_HEIGHT = 240  # pixels, at least
-_OPAQUE = 0.5  # a pixel in which less of the scene shows is of nothing
+_OPAQUE = 0.5  # alpha up to which a pixel counts as empty
 
 probabilities_of = jax.jit(prompt_probabilities)
 """`prompt_probabilities` of Gaussians or of a picture, compiled."""
 
 
 class _Seen(NamedTuple):
-    """A frame of the scene.
+    """A rendered frame of the scene.
 
     Attributes:
         t: its index.
-        number: the recording's own number of it.
-        gaussians: the scene in it.
+        number: its number in the recording.
+        gaussians: the scene in this frame.
         camera: its camera.
-        plan: that it was drawn with.
-        background: RGB behind it; None is black.
+        plan: the plan that it was rendered with.
+        background: RGB behind the scene; None is black.
         colors: rendered, 0 to 1.
         features: rendered, on the device.
-        there: where something of the scene is drawn.
+        there: the pixels that show the scene.
     """
 
     t: int
@@ -69,7 +69,7 @@ class _Seen(NamedTuple):
 
 
 class QueryableScene(Queryable):
-    """A scene that deforms."""
+    """A deforming scene."""
 
     def __init__(
         self,
@@ -161,8 +161,8 @@ class QueryableScene(Queryable):
 
     def draw(self, folder: Path, found: Selection, notes: Notes, console: Console) -> dict[str, int] | None:
         """Writes masks/FRAME.png (255 where a pixel's own features score above the threshold) and
-        frames/FRAME.png (the scene, it without what was found, that alone, recoloured, moved) of some frames,
-        and video.mp4 of all: the scene beside the scene without what was found."""
+        frames/FRAME.png (the scene; without what was found; what was found alone, recoloured, moved) of some
+        frames, and video.mp4 of all: the scene beside the scene without what was found."""
         if not found.question.pictures:
             return None
         result, pictured = self.result, self.pictured(found.question, found.frame)
@@ -187,7 +187,7 @@ class QueryableScene(Queryable):
         return pixels
 
     def _features(self, frame: int) -> Float[Array, "n c"]:
-        """Features of all Gaussians; those that do not change are the same in all frames."""
+        """Features of all Gaussians in a frame; if they do not change, always those of the first frame."""
         features = self.at(frame if self.result.meaning_changes else 0).features
         assert features is not None
         return features
@@ -206,18 +206,18 @@ def label_everything(
           query.json          the number of Gaussians of each name, and its share of each picture
           selection.npz       labels [N], 1 for the first of the names, 0 for none; probabilities [N,k]
           recolored.ply       the Gaussians in the colours of their labels
-          masks/FRAME.png     label maps; frames/FRAME.png and video.mp4 have them over the scene
+          masks/FRAME.png     label maps; frames/FRAME.png and video.mp4 overlay them on the scene
 
     Args:
         scene: the scene.
-        question: the frame of recolored.ply, and those to draw, if any.
+        question: names the frame of recolored.ply, and the frames to draw, if any.
         folder: for the result, which replaces an earlier one once it is complete.
         notes: for query.json.
         console: shows the progress.
 
     Raises:
         ValueError: a frame does not exist.
-        FileExistsError: the folder holds something else than a result of a query.
+        FileExistsError: the folder holds something other than the result of a query.
     """
     frame, result, shares = scene.frame_of(question), scene.result, None
     there, codebook = scene.at(frame), jnp.asarray(scene.meaning.codebook, jnp.float32)
@@ -254,7 +254,7 @@ def _draw_labels(
     folder: Path, scene: QueryableScene, pictured: Sequence[int], console: Console
 ) -> dict[str, dict[str, float]]:
     """Writes label maps masks/FRAME.png and frames/FRAME.png of some frames, and video.mp4 of all: the scene
-    beside what each pixel most likely is. Returns, by frame, the share of the picture that each name has."""
+    beside the most likely label of each pixel. Returns, by frame, the share of the picture of each name."""
     result, codebook = scene.result, jnp.asarray(scene.meaning.codebook, jnp.float32)
     shares: dict[str, dict[str, float]] = {}
     with VideoWriter(folder / "video.mp4", _frame_rate(result)) as video:
@@ -276,14 +276,14 @@ def _draw_labels(
 
 
 def _frame_rate(result: DeformResult) -> float:
-    """Pictures a second of a film of all frames."""
+    """Frames per second of a video of all frames."""
     return frame_rate(result.timeline.times * result.timeline.seconds)
 
 
 def _frames(
     result: DeformResult, background: Float[Array, "1 3"] | None, console: Console
 ) -> Iterator[_Seen]:
-    """All frames, one after the other."""
+    """Renders all frames, one after the other."""
     plan = None
     for t in track(range(len(result.timeline.times)), "drawing", console=console, transient=True):
         gaussians, camera = result.at(result.timeline.times[t]), result.camera(t)
@@ -295,7 +295,7 @@ def _frames(
 
 
 def _picture(gaussians: Gaussians, seen: _Seen) -> np.ndarray:
-    """Colours of a scene that stands as another does; drawn as that was, with features, for compiling takes
-    longer than drawing these."""
+    """Renders a scene with the camera and plan of `seen`. Features are rendered too, which reuses the
+    compiled program: compiling another takes longer."""
     drawn, _ = render_with_room(gaussians, seen.camera, seen.plan, backgrounds=seen.background)
     return to_uint8(np.asarray(drawn.colors[0]))

@@ -1,4 +1,4 @@
-"""The summary of a deforming scene: held-out frames, steadiness over time, classes, tracks."""
+"""The summary of a deforming scene: held-out frames, temporal consistency, classes, and tracks."""
 
 from typing import Any
 
@@ -58,7 +58,7 @@ _RECIPES = {
 
 
 def summarize(folder: RunFolder, found: Metrics) -> Summary:
-    """The summary of a deforming scene, whose losses are drawn into the folder."""
+    """The summary of a deforming scene; also draws its losses into the folder."""
     plots, test, tracks, judged = [], found["test"], found["tracks"], found["judged_by"]
     frames = found["frames"]
     if found["curve"]:
@@ -99,7 +99,7 @@ def summarize(folder: RunFolder, found: Metrics) -> Summary:
 
 
 def _over_time(test: Metrics) -> list[dict[str, Any]]:
-    """How steady neighbouring frames are, beside the recording."""
+    """The temporal consistency of neighbouring frames, compared with the recording."""
     if test["t_ssim"] is None:
         return []
     ends = {"the scene": "", "the recording": "_true", "difference": "_gap"}

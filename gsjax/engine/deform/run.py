@@ -1,5 +1,5 @@
-"""A run of `gsjax deform`: one camera's frames in, a folder with a scene over time, its scores and a report
-out."""
+"""A run of `gsjax deform`: the frames of one camera in, a folder with a deforming scene, its scores and a
+report out."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields, replace
@@ -46,8 +46,8 @@ from gsjax.methods.deform import PRESETS, Deform, DeformConfig
 from gsjax.methods.deform.method import PLAN
 from gsjax.methods.deform.update import LOSSES
 
-_HARDLY = 0.95  # of the error of a scene that stands still
-_UNLIKE = 0.6  # an IoU
+_HARDLY = 0.95  # of the error of a static scene: above it, motion was hardly learned
+_UNLIKE = 0.6  # IoU below which a warning is given
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -77,7 +77,7 @@ def run(options: Options, by_preset: Callable[[str], Options]) -> int:
 
     Args:
         options: those of the command.
-        by_preset: the same options with the defaults of a preset, for when none is named.
+        by_preset: returns the same options with the defaults of a given preset; used if none is named.
 
     Raises:
         ValueError, OSError: the options cannot be followed; everything learned before that is on disk.
@@ -93,7 +93,7 @@ def run(options: Options, by_preset: Callable[[str], Options]) -> int:
         if options.preset is None:
             stored = folder.setting("preset") if options.resume else None
             preset = stored or ("around" if shows_one_object(sequence, source) else "surst")
-            if preset != "surst":  # which the options have already
+            if preset != "surst":  # the options already have its settings
                 options = checked(by_preset(preset))
             options = replace(options, preset=preset)
             if preset == "around":
@@ -166,7 +166,7 @@ def run(options: Options, by_preset: Callable[[str], Options]) -> int:
 
 
 def _warn_of_oddities(progress: Progress, judged: Mapping[str, Any], notes: Notes) -> None:
-    """Warns of skipped steps, and of a scene that hardly learned motion or classes."""
+    """Warns of skipped steps, and if motion or classes were hardly learned."""
     warn_of_mishaps(progress, notes)
     if progress.stopped is not None:
         return
@@ -215,8 +215,8 @@ def _recording(options: Options, notes: Notes) -> tuple[Sequence, DepthSource]:
 
 
 def _of_photographs(photographs: Photographs, facing: Float[np.ndarray, "4 4"]) -> str:
-    """The note on their order, and on the unit of lengths by their points; `facing` is the first view
-    matrix."""
+    """A note on the order of the photographs and, from their points, on the unit of lengths; `facing` is the
+    first view matrix."""
     order = (
         "that of their files, as they have no times" if photographs.times is None else "that of their times"
     )
@@ -230,7 +230,7 @@ def _of_photographs(photographs: Photographs, facing: Float[np.ndarray, "4 4"]) 
 
 
 def _teacher(options: Options) -> TeacherChoice:
-    """The choice of a teacher, once all options fit."""
+    """The choice of a teacher, after checking the options."""
     if len(options.cameras) > 1:
         raise ValueError(f"--cameras: expected one training camera, found {list(options.cameras)}")
     if len(options.eval_cameras) > 1:
@@ -246,5 +246,5 @@ def _teacher(options: Options) -> TeacherChoice:
 
 
 def _in_words(row: Mapping[str, Any]) -> str:
-    """The means of a row in words."""
+    """The PSNR of a row in words."""
     return "–" if row["psnr"] is None else f"{row['psnr']:.1f} dB"

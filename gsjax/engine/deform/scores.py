@@ -1,5 +1,5 @@
-"""Scores of a deforming scene: held-out frames and their neighbours in time, the other eye, classes, and
-tracks if the ground truth has any."""
+"""Scores of a deforming scene: held-out frames and their neighbours in time, views of another camera,
+classes, and tracks if the ground truth has any."""
 
 from collections.abc import Callable, Iterable
 from dataclasses import replace
@@ -41,14 +41,14 @@ from gsjax.scene.render import render
 from gsjax.viz.colors import in_rows, overlay_labels, to_uint8
 
 OVER_TIME = ("t_ssim", "flow_warp_error", "warped_ssim")
-"""Scores of a frame and its neighbour, as `temporal_scores` names them; beside each stand NAME_true, that of
-the recording, and NAME_gap, how far apart the two are."""
+"""Scores of a frame and its neighbour, named as in `temporal_scores`. For each there are also NAME_true, the
+score of the recording, and NAME_gap, the absolute difference of the two."""
 _OF_FRAMES = ("psnr_masked", "ssim", "depth_mm", "psnr_other", "ms_ssim", "f_psnr", "flow_warp_share")
 _OF_FRAMES += tuple(f"{name}{end}" for name in OVER_TIME for end in ("", "_true", "_gap"))
 _SHOWN = 8  # frames in the report
 _PANEL_HEIGHT = 200  # pixels, at least
-_TIMED = 12  # frames drawn to measure how many a second
-_SEEN_WITHIN = 0.01  # of the depth: how far from what a pixel sees a tracked point may lie
+_TIMED = 12  # frames rendered to measure the frame rate
+_SEEN_WITHIN = 0.01  # of the depth: a tracked point this close to the depth map is visible
 _LEAST_SIDE = 11  # of SSIM's window
 _LEAST_LONGER_SIDE = 12  # of DIS's patches
 
@@ -61,17 +61,18 @@ def judge(
     tools: Tools,
     budget: Budget | None = None,
 ) -> dict[str, Any]:
-    """Scores of held-out frames, or of some that were learned from where none is, and pictures of them.
+    """Computes the scores of held-out frames, or of some training frames if none is held out, and writes
+    pictures of them.
 
     Args:
         folder: of the run.
         result: the scene.
-        plan: that frames were drawn with.
-        data: what it was learned from, with poses as they were refined.
+        plan: the plan that frames were rendered with.
+        data: the data that it was learned from, with refined poses.
         tools: whether tools count.
-        budget: the time that is left; of more frames than it allows, some are scored.
+        budget: the time that is left; if it does not allow all frames, some of them are scored.
     """
-    memory = peak_memory_mb()  # of learning, before anything is scored
+    memory = peak_memory_mb()  # of training, before anything is scored
     scene, moving, background = result.scene, result.moving, data.sequence.background
     drawn_at = partial(draw, scene, moving, plan=plan, background=background)
     which = data.test or data.train[:: max(1, len(data.train) // _SHOWN)][:_SHOWN]
@@ -86,7 +87,7 @@ def judge(
         write_png(path, to_uint8(drawn.colors))
         row = {"frame": number, **_of_frame(drawn, frame), **_of_classes(drawn, frame, data, t, overlap)}
         neighbor = t + 1 if t + 1 < data.sequence.num_frames else t - 1
-        if neighbor >= 0 and data.sequence.splits is None:  # frames of a split are seldom a film
+        if neighbor >= 0 and data.sequence.splits is None:  # frames of a split are seldom consecutive
             beside = data.frame(neighbor, 0, tools)
             pair = [(drawn.colors, frame), (drawn_at(beside).colors, beside)]
             row |= over_time(pair if neighbor > t else pair[::-1])
@@ -112,8 +113,8 @@ def judge(
 
 
 def _other_counts(data: DeformData, t: int, tools: Tools) -> bool:
-    """Whether another camera can judge frame t. If tools were left out, it needs a mask, as its pictures show
-    the tools."""
+    """Whether frame t can be scored in another camera. If tools are left out, this needs a mask, because the
+    camera's pictures show the tools."""
     seen = data.sequence
     if seen.num_cameras < 2:
         return False
@@ -121,7 +122,7 @@ def _other_counts(data: DeformData, t: int, tools: Tools) -> bool:
 
 
 class Drawn(NamedTuple):
-    """A deforming scene where and when a frame was seen.
+    """A deforming scene rendered from the camera and at the time of a frame.
 
     Attributes:
         colors: 0 to 1, on the host.
@@ -141,13 +142,13 @@ def draw(
     plan: Plan,
     background: tuple[float, float, float] | None = None,
 ) -> Drawn:
-    """The scene where and when a frame of one camera was seen. Views that nothing was learned from may need a
-    larger plan, and get it.
+    """Renders the scene from the camera and at the time of a frame. Views other than the training views may
+    need a larger plan, and get it.
 
     Args:
         scene, moving: the scene, and where its field is evaluated.
         frame: of one camera, on the host.
-        plan: that frames were drawn with.
+        plan: the plan that frames were rendered with.
         background: RGB behind the scene, 0 to 1 (default: black).
     """
     behind = None if background is None else jnp.array([background], jnp.float32)
@@ -201,7 +202,8 @@ def _of_frame(drawn: Drawn, frame: Frame) -> dict[str, Any]:
 
 
 def _filled(colors: np.ndarray, frame: Frame) -> Float[np.ndarray, "h w 3"]:
-    """What is drawn where it counts, and the photograph elsewhere: windows that reach there find nothing."""
+    """The render where pixels count, and the photograph elsewhere, so that windows that reach there find no
+    difference."""
     counts = _counted(frame)
     if counts is None:
         return np.asarray(colors, np.float64)
@@ -211,8 +213,8 @@ def _filled(colors: np.ndarray, frame: Frame) -> Float[np.ndarray, "h w 3"]:
 def _of_classes(
     drawn: Drawn, frame: Frame, data: DeformData, t: int, overlap: LabelOverlap
 ) -> dict[str, Any]:
-    """f-PSNR of a frame, on the teacher's grid; the classes of its pixels that count, by the nearest code,
-    are added to `overlap`, against the teacher's."""
+    """The f-PSNR of a frame, on the teacher's grid. Also adds the classes of the pixels that count, by the
+    nearest code, and the teacher's to `overlap`."""
     labels = data.labels(t)
     if labels is None or data.meaning is None or drawn.features is None:
         return {"f_psnr": None}
@@ -227,13 +229,13 @@ def _of_classes(
 
 @jax.jit
 def classes_of_pixels(features: Float[Array, "h w c"], codebook: Float[Array, "k c"]) -> Int[Array, "h w"]:
-    """The row whose code is the nearest; -1 where all are as near, as where nothing is drawn."""
+    """The row of each pixel's nearest code; -1 where all are equally near, as where nothing is drawn."""
     likely = prompt_probabilities(features, codebook)
     return jnp.where(likely.max(axis=-1) > likely.min(axis=-1), likely.argmax(axis=-1), IGNORED_LABEL)
 
 
 def _classes(overlap: LabelOverlap, names: Iterable[str]) -> list[dict[str, Any]]:
-    """The name of each class, and how far what is drawn and what was seen of it overlap, over all frames."""
+    """The name of each class, and the overlap of its rendered and its true pixels over all frames."""
     return [
         {"class": name, "iou": overlap.iou(row), "dice": overlap.dice(row), "f1": overlap.f1(row)}
         for row, name in enumerate(names)
@@ -250,14 +252,15 @@ def _means_of_classes(overlap: LabelOverlap, count: int) -> dict[str, float | No
 
 
 def over_time(pair: list[tuple[np.ndarray, Frame]]) -> dict[str, Any]:
-    """How steady two neighbouring frames are, as they are drawn and as they were recorded; empty for pictures
-    that are smaller than windows.
+    """The temporal consistency of two neighbouring frames, as rendered and as recorded; empty if pictures
+    are smaller than the windows of the scores.
 
-    Held-out frames stand alone, so each makes a pair with the frame after it (the last one of a recording
-    with that before it), which as a rule was learned from. What does not count is as it was photographed.
+    Held-out frames have no held-out neighbours, so each is paired with the next frame (the last frame of a
+    recording with the one before it), usually a training frame. Pixels that do not count are taken from the
+    photographs.
 
     Args:
-        pair: drawn colours and the frame, of the earlier one and of the later one.
+        pair: rendered colours and the frame, of the earlier and of the later one.
     """
     sides = sorted(pair[0][1].images.shape[1:3])
     if sides[0] < _LEAST_SIDE or sides[1] < _LEAST_LONGER_SIDE:
@@ -276,7 +279,7 @@ def over_time(pair: list[tuple[np.ndarray, Frame]]) -> dict[str, Any]:
 
 
 def _panels(drawn: Drawn, frame: Frame, data: DeformData) -> np.ndarray:
-    """The photograph, what is drawn, their difference, and, of a scene that knows it, what is what."""
+    """The photograph, the render, their difference and, if the scene has features with a meaning, classes."""
     pictures = (to_uint8(frame.images[0]), to_uint8(drawn.colors), _difference(drawn.colors, frame))
     named = dict(zip(PANELS, pictures, strict=True))
     if data.meaning is not None and drawn.features is not None:
@@ -286,13 +289,13 @@ def _panels(drawn: Drawn, frame: Frame, data: DeformData) -> np.ndarray:
 
 
 def _difference(colors: np.ndarray, frame: Frame) -> np.ndarray:
-    """Five times the difference; grey where nothing counts."""
+    """Five times the absolute difference; grey where pixels do not count."""
     off, counts = 5 * np.abs(colors - _photograph(frame)), _counted(frame)
     return to_uint8(np.clip(off if counts is None else np.where(counts[..., None], off, 0.25), 0, 1))
 
 
 def _fps(drawn_at: Callable[[Frame], Drawn], frame: Frame) -> float:
-    """How often a second the scene is deformed and drawn; the median."""
+    """The median rate, per second, at which the scene is deformed and rendered."""
     took = []
     for i in range(_TIMED):
         begun = perf_counter()
@@ -304,8 +307,8 @@ def _fps(drawn_at: Callable[[Frame], Drawn], frame: Frame) -> float:
 def track_errors(
     scene: DeformingScene, moving: Moving, data: DeformData, tools: Tools
 ) -> dict[str, float] | None:
-    """How far points that the first frame sees are from where they truly are, over all later frames, and how
-    far they would be if nothing moved; None without truth.
+    """Distances of the points that the first frame sees from their true positions, over all later frames, and
+    the same if nothing moved; None without ground truth.
 
     Args:
         scene, moving: the scene, and where its field is evaluated.

@@ -1,4 +1,5 @@
-"""The start of `gsjax.deform`: that of `gsjax deform`, but with all frames, and with warnings for notes."""
+"""The start of the function `gsjax.deform`: as in the command `gsjax deform`, but with all frames, and with
+Python warnings instead of notes."""
 
 import warnings
 from dataclasses import replace
@@ -27,8 +28,8 @@ def start_from(
     first: int | None,
     gaussians: Gaussians | None,
 ) -> tuple[Deform, Problem, Run]:
-    """The method, its problem, and the run before its first step; each kind of oddity of the data becomes one
-    warning.
+    """The method, its problem, and the run before its first step. Warns once of each kind of oddity in the
+    data.
 
     Args:
         config, extra_losses, sequence, teacher, tools, tool_values, first, gaussians: as for `gsjax.deform`.
@@ -40,7 +41,7 @@ def start_from(
     choice.check(optional=True)
     quiet = Console(quiet=True)
     notes = Notes(quiet, of_all=True)
-    every = replace(sequence, splits=None)  # what is learned from is selected by whoever calls
+    every = replace(sequence, splits=None)  # the caller selects the training frames
     try:
         with notes:
             plane = (config or DeformConfig()).plane_depth

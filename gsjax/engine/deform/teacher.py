@@ -1,5 +1,5 @@
-"""What teaches a deforming scene's features: classes of masks, or features of files or of an encoder, brought
-into the scene's few channels."""
+"""What teaches the features of a deforming scene: classes of masks, or features from files or an encoder,
+projected to the few channels of the scene."""
 
 from collections import Counter
 from collections.abc import Mapping
@@ -25,9 +25,9 @@ from gsjax.perception.codebook import ClassCodebook
 from gsjax.scene.frame import Frame
 
 GROUPS = 8
-"""The most kinds into which features without names are split."""
-_SAMPLE = 2000  # of the vectors that are split into kinds, because all pairs are compared
-_ALIKE = 0.98  # cosine of directions that are of one kind
+"""The largest number of groups into which features without names are clustered."""
+_SAMPLE = 2000  # vectors, at most, that are clustered, because all pairs are compared
+_ALIKE = 0.98  # cosine above which directions belong to one group
 
 
 class Labels(NamedTuple):
@@ -47,8 +47,8 @@ class Taught(NamedTuple):
 
     Attributes:
         lesson: labels of the training frames.
-        held_out: labels of held-out frames, by their index; those that have none are left out.
-        digest: of all that is taught beside the ids of frames, in hexadecimal.
+        held_out: labels of held-out frames, by their index; frames without any are left out.
+        digest: of everything taught other than the ids of frames, in hexadecimal.
     """
 
     lesson: Lesson
@@ -64,10 +64,10 @@ def taught_by_classes(
     size: tuple[int, int],
     channels: int,
 ) -> Taught:
-    """A code for each class of the masks: a stand-in for a model, which knows the labels' names.
+    """Labels with a code for each class of the masks, in place of a foundation model's features.
 
     Args:
-        masks: of frames; pixels of a frame without one have no label.
+        masks: of frames; pixels of a frame without a mask have no label.
         train, test: indices of the training frames and of the held-out ones.
         names: of mask values.
         size: width and height of the masks, pixels.
@@ -105,12 +105,12 @@ def taught_by_features(
     notes: Notes,
     console: Console,
 ) -> Taught:
-    """Features of files, or of an encoder, brought into the scene's channels.
+    """Labels with features from files, or of an encoder, projected to the scene's channels.
 
     Args:
         teaching: the teacher of the recording, frame by frame.
         frames: training frames, of one camera each.
-        test: indices of the held-out frames, with the recording's own numbers of these.
+        test: the held-out frames: their numbers in the recording, by index.
         channels: of a Gaussian's feature.
         notes: receives what is learned, and which held-out frames cannot be read; these are left out.
         console: shows what is learned.
@@ -157,8 +157,8 @@ def taught_by_features(
 def basis_of(
     vectors: Many[Float[np.ndarray, "_ D"]], channels: int
 ) -> tuple[Float[np.ndarray, "D channels"], float]:
-    """Orthonormal columns onto which the projection of some vectors keeps most of their squared lengths, and
-    the share that it keeps. Columns beyond the rank of the vectors are zeros."""
+    """An orthonormal basis, in columns, of the subspace in which vectors keep most of their squared lengths,
+    and the share that they keep. Columns beyond the rank of the vectors are zeros."""
     products = sum(np.asarray(some, np.float64).T @ np.asarray(some, np.float64) for some in vectors)
     squares, axes = np.linalg.eigh(products)
     squares, axes = np.maximum(squares[::-1], 0), axes[:, ::-1]
@@ -171,14 +171,14 @@ def basis_of(
 def groups_of(
     codes: Float[np.ndarray, "n channels"], weights: Float[np.ndarray, "n"]
 ) -> Float[np.ndarray, "k channels"]:
-    """Means of codes that point the same way, the heaviest group first; at most `GROUPS` of them.
+    """Clusters codes by direction; returns the mean of each group, heaviest first, at most `GROUPS` of them.
 
-    Ward's method joins directions; it stops where to join two more costs most beside what it cost before, and
-    goes on while two groups are alike.
+    Directions are merged by Ward's method. The number of groups is that before the merge whose cost exceeds
+    the previous one's by the largest factor; then groups are merged further while two of them are alike.
 
     Args:
         codes: not all zeros.
-        weights: of each code, the number of its pixels.
+        weights: the number of pixels of each code.
     """
     chosen = np.unique(np.linspace(0, len(codes) - 1, _SAMPLE).astype(int))
     codes, weights = codes[chosen], weights[chosen]
@@ -188,8 +188,8 @@ def groups_of(
     group = np.ones(len(codes), int)
     if len(codes) > 1:
         tree = ward(directions)
-        alike = np.sqrt(2 - 2 * _ALIKE)  # what it costs to join two directions of one kind
-        last = tree[: -GROUPS - 1 : -1, 2][: GROUPS - 1]  # costs of the last joins, the last first
+        alike = np.sqrt(2 - 2 * _ALIKE)  # cost of merging two directions that are just alike
+        last = tree[: -GROUPS - 1 : -1, 2][: GROUPS - 1]  # costs of the last merges, the last first
         costs = np.maximum(np.append(last, alike), alike)
         count = 2 + int(np.argmax(costs[:-1] / costs[1:])) if len(costs) > 1 else 1
         group = fcluster(tree, count, "maxclust")
@@ -208,14 +208,14 @@ def _means(
 
 
 def _closest(vectors: Float[np.ndarray, "k c"]) -> float:
-    """The largest cosine of two of some vectors."""
+    """The largest cosine between two of the vectors."""
     directions = vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-12)
     return float((directions @ directions.T - 2 * np.eye(len(vectors))).max())
 
 
 def as_photographs(sequence: Sequence) -> Photographs:
-    """The frames of camera 0, named as their pictures' files, or by their number where they have none.
-    Without depth, by which a segmenter would find planes, which do not deform."""
+    """The frames of camera 0, named after their picture files, or by number if they have none. Without
+    depth, in which a segmenter would find planes, which do not deform."""
     alone = photographs_of(sequence.select(cameras=[sequence.camera_ids[0]]))
     files = [Path(alone.where("image", i)) for i in range(alone.num)]
     names = [file.name for file in files if file.is_file()]
@@ -225,10 +225,10 @@ def as_photographs(sequence: Sequence) -> Photographs:
 
 
 def _counts(ids: Many[Int[np.ndarray, "h w"]], rows: int, frames: Many[Frame]) -> Float[np.ndarray, "n"]:
-    """How many of the pixels that count have each vector, for `rows` vectors.
+    """The number of pixels that count with each of `rows` vectors.
 
     Raises:
-        ValueError: grids differ, or no pixel has any.
+        ValueError: grids differ, or no pixel has a vector.
     """
     grids = Counter(one.shape for one in ids)
     if len(grids) > 1:
@@ -246,7 +246,7 @@ def _counts(ids: Many[Int[np.ndarray, "h w"]], rows: int, frames: Many[Frame]) -
 
 
 def _vectors(teacher: Teacher) -> list[Float[np.ndarray, "_ D"]]:
-    """Its vectors: rows of its codebook, or a block of them for each map, whose pixels have one each."""
+    """The vectors of a teacher: its codebook, or a block for each map, with a vector per pixel."""
     if teacher.codebook is not None:
         return [teacher.codebook]
     assert teacher.maps is not None
@@ -254,12 +254,12 @@ def _vectors(teacher: Teacher) -> list[Float[np.ndarray, "_ D"]]:
 
 
 def _codes(teacher: Teacher, basis: Float[np.ndarray, "D channels"]) -> Float[np.ndarray, "n channels"]:
-    """All of its vectors, in the scene's channels."""
+    """All vectors of a teacher, projected to the scene's channels."""
     return np.concatenate([block @ basis for block in _vectors(teacher)])
 
 
 def _ids(teacher: Teacher) -> list[Int[np.ndarray, "h w"]]:
-    """The row of its vectors for each pixel of each view; -1 where there is none, as where a map is zero."""
+    """The row in `_vectors` of each pixel of each view; -1 where there is none, or where a map is zero."""
     if teacher.maps is None:
         return teacher.ids
     ids, begin = [], 0

@@ -1,4 +1,5 @@
-"""field.npz: a feature field in a file of its own, beside its scene; see `DistillResult.write`."""
+"""Reading field.npz, the file of a feature field, which is separate from that of its scene; see
+`DistillResult.write`."""
 
 from pathlib import Path
 from typing import Any
@@ -27,7 +28,7 @@ def read_field(path: Path) -> DistillResult:
 
     Raises:
         FileNotFoundError: there is no such file.
-        ValueError: it holds no field, or numbers that are not finite.
+        ValueError: it does not hold a field, or holds numbers that are not finite.
     """
     if not path.is_file():
         raise FileNotFoundError(f"{path}: expected a field that `gsjax distill` wrote, found no file")

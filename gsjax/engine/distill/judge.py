@@ -1,4 +1,4 @@
-"""Scores of a distilled field: agreement with the teacher, and classes found in held-out views."""
+"""Scoring a distilled field in held-out views: agreement with the teacher, and segmentation by class."""
 
 from itertools import tee
 from typing import Any
@@ -41,17 +41,17 @@ def judge(
     notes: Notes,
     budget: Budget | None = None,
 ) -> dict[str, Any]:
-    """Compares held-out views, or some of those that taught where none is held out, with the teacher, and
-    draws some. A photograph that cannot be read is noted and not compared.
+    """Compares held-out views, or some training views if none is held out, with the teacher, and draws some
+    of them. A photograph that cannot be read is noted and not compared.
 
     Args:
         folder: of the run, for pictures.
         scene: the scene and its photographs.
-        teaching: the teacher of any photograph.
+        teaching: gives the teacher's features of any photograph.
         result: the field.
         config: its settings.
         notes: receives warnings.
-        budget: the time that is left; of more views than it allows, some are scored.
+        budget: the time that is left; if it does not allow all views, some of them are scored.
     """
     held_out, photographs = len(scene.held_out) > 0, scene.photographs
     which = scene.held_out if held_out else scene.taught[:: max(1, len(scene.taught) // _SHOWN)][:_SHOWN]
@@ -103,12 +103,12 @@ def judge(
 
 
 def feature_colors(field: FeatureField, located: Located | None) -> tuple[Float[Array, "n three"], PcaColors]:
-    """The three principal components of each Gaussian's feature, and the colours that stand for them."""
+    """The first three principal components of each Gaussian's feature, and their mapping to colours."""
     parts = rendered_features(field, located)
     some = parts.values[:: max(1, len(parts.values) // _PCA_GAUSSIANS)]
     pca = fit_pca_colors(np.asarray(parts.channels_of(parts.joined(some, jnp.ones(len(some), some.dtype)))))
     axes = jnp.asarray(pca.axes, parts.values.dtype)
-    # Linear, as rendering is: three channels are painted, not all.
+    # Both the projection and rendering are linear, so three channels are rendered instead of all.
     ones = jnp.ones(len(parts.values), parts.values.dtype)
     numbers = jnp.matmul(parts.joined(parts.values, ones), parts.lifted(axes.T).T, precision="highest")
     return numbers, pca._replace(mean=pca.mean @ pca.axes, axes=np.eye(3))
@@ -117,12 +117,12 @@ def feature_colors(field: FeatureField, located: Located | None) -> tuple[Float[
 def draw_features(
     numbers: Float[Array, "n three"], frozen: Frozen, pca: PcaColors
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """A view in the colours of its features; pixels that show little of the scene are near black.
+    """A view coloured by its features; pixels that show little of the scene are near black.
 
     Args:
         numbers: components of each Gaussian, from `feature_colors`.
         frozen: the view.
-        pca: their colours, from `feature_colors`.
+        pca: the mapping to colours, from `feature_colors`.
     """
     image, alphas = (np.asarray(a) for a in paint(frozen[0], numbers, frozen[1]))
     alphas = alphas[..., None]

@@ -1,5 +1,5 @@
-"""What a query of a field finds, over the frames of the tracked run whose Gaussians carry the field along: no
-encoder runs again."""
+"""The result of a query of a field, followed over the frames of the tracked run that its scene is from: the
+Gaussians carry the field along, so no encoder runs again."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -28,12 +28,12 @@ from gsjax.viz.viewer.drawing import Drawer
 
 @dataclass(frozen=True, eq=False)
 class OverTime:
-    """The tracked run whose first frame the scene of a field is.
+    """A tracked run whose first frame is the scene of a field.
 
     Attributes:
         tracking: the scene over time.
-        origin: what its places are relative to, where they lie far from 0.
-        saved: the run with its recording; None where that is gone.
+        origin: what its positions are relative to, if they lie far from 0.
+        saved: the run with its recording; None if the recording is gone.
     """
 
     tracking: Tracking
@@ -62,8 +62,8 @@ class OverTime:
         film: Callable[[np.ndarray], dict[str, np.ndarray]] | None = None,
     ) -> None:
         """Write over_time.npz: the number of each frame (`frames`), the means of what was found [T,n,3], and
-        what `film` returns of it. Where most of what was found is of objects, what is not stays behind as
-        they move, and is left out.
+        what `film` returns. If most of the Gaussians found belong to objects, the others are left out, as
+        they would stay behind when the objects move.
 
         Args:
             folder: for the file.
@@ -86,17 +86,17 @@ class OverTime:
         console: Console,
         selected: Bool[np.ndarray, "n"],
     ) -> dict[str, np.ndarray]:
-        """Write the frames of a camera with what was found in its colours and the rest dimmed; returns the
-        time of each frame (`times`) and the number of pixels that show what was found (`pixels`), nothing
-        without the recording.
+        """Write a video of a camera's frames in which what was found keeps its colours and the rest is
+        dimmed. Returns the time of each frame (`times`) and the number of pixels that show what was found
+        (`pixels`); nothing without the recording.
 
         Args:
             path: the video.
-            paint: paints the scene, red 1 in what is given, else 0.
-            camera: its name (default, and where a photograph of another name was asked about: the first
-                held-out one, else the first tracked).
-            drawer: draws the scene.
-            notes: receives a warning where nothing can be filmed.
+            paint: colours the scene: red is 1 for the Gaussians given, else 0.
+            camera: its name (default, and if no camera has that name: the first held-out one, else the first
+                tracked).
+            drawer: renders the scene.
+            notes: receives a warning if nothing can be filmed.
             console: shows the progress.
             selected: what was found.
         """
@@ -131,7 +131,7 @@ class OverTime:
 
 
 def over_time_of(run: FieldRun, notes: Notes) -> OverTime | None:
-    """The tracked run of a field's scene; None where the scene is not that of a tracked run.
+    """The tracked run of a field's scene; None if the scene is not from a tracked run.
 
     Args:
         run: the field and its scene.
@@ -154,7 +154,7 @@ def over_time_of(run: FieldRun, notes: Notes) -> OverTime | None:
 
 
 def with_rows_of(run: FieldRun, over_time: OverTime, notes: Notes) -> OverTime | None:
-    """The tracked run, if its rows are those of the field; else None, and a warning.
+    """The tracked run if it has as many Gaussians as the field's scene; else None, with a warning.
 
     Args:
         run: the field and its scene.

@@ -37,15 +37,15 @@ from gsjax.viz.viewer.drawing import Drawer, recolored
 if TYPE_CHECKING:
     from gsjax.engine.distill.over_time import OverTime
 else:
-    OverTime = Any  # slow to import, as all that tracks is
+    OverTime = Any  # the module is slow to import, like all tracking modules
 
-_LEAST_LENGTH = 0.05  # of a feature; those that teach have a mean length of 1
+_LEAST_LENGTH = 0.05  # of a feature; the teacher's have a mean length of 1
 _LEAST_ALPHA = 0.5  # share of a pixel's light that the scene must send
 _PANEL_HEIGHT = 240  # pixels, at least
 
 
 class QueryableField(Queryable):
-    """A field and its scene: it stands still in one frame, 0, unless the run that tracked it is given.
+    """A field and its scene, which is static, with a single frame 0, unless the run that tracked it is given.
 
     Args:
         run: the field and its scene.
@@ -99,7 +99,7 @@ class QueryableField(Queryable):
     def prompt(self, question: Question, frame: int) -> Prompt:
         prompt = self._prompt(question)
         level = question.level
-        if level is None and question.point is not None:  # by itself it cannot say how much is meant
+        if level is None and question.point is not None:  # a point does not say how large a thing is meant
             level = self.run.stored.smallest
         return prompt._replace(level=level or self.run.stored.best_level(prompt.vectors))
 
@@ -117,7 +117,7 @@ class QueryableField(Queryable):
             vector = self._of_image(question.image)
         else:
             vector = self._at_point(question)
-            if source.kind == "classes":  # the point means the class that it is nearest to
+            if source.kind == "classes":  # a point stands for the class nearest to it
                 names = list(source.names.values())
                 codes = np.stack([run.encoder.embed_text(name) for name in names])
                 name = names[int((codes @ vector).argmax())]
@@ -138,13 +138,13 @@ class QueryableField(Queryable):
 
     def draw(self, folder: Path, found: Selection, notes: Notes, console: Console) -> dict[str, int] | None:
         """Writes masks/CAMERA.png, 255 where more than half of a pixel's light comes from the selected
-        Gaussians, and overview.png, for the photograph that shows most of them: the photograph, a heat map of
-        the scores, and the scenes with the selected Gaussians removed, alone, recoloured and moved. Of a
-        scene that was tracked also what `OverTime.write` writes, without pictures too.
+        Gaussians, and overview.png for the photograph that shows most of them: the photograph, a heat map of
+        the scores, and the scene with the selected Gaussians removed, alone, recoloured and moved. For a
+        tracked scene, also writes what `OverTime.write` does, even without pictures.
 
-        All are drawn by one program for each size of picture, with one colour per Gaussian, because compiling
-        takes longer than drawing. Gaussians that should not be seen are made invisible rather than removed,
-        so their number stays the same."""
+        All are rendered by one compiled program per picture size, with one colour per Gaussian, because
+        compiling takes longer than rendering. Gaussians that should not be seen are made invisible rather
+        than removed, so that their number stays the same."""
         run, question, photographs = self.run, found.question, self.run.photographs
         if photographs is None or not question.pictures:
             if self._over_time is not None:
@@ -188,7 +188,7 @@ class QueryableField(Queryable):
         }
         for words, scene in shown.items():
             panels[words] = to_uint8(drawer(_seen_from(scene, camera), camera).colors)
-        if len(panels) % 2:  # two rows, and no place in them is empty
+        if len(panels) % 2:  # fill two rows without a gap
             panels = {behind_is: behind, **panels}
         write_png(folder / "overview.png", in_rows(panels, len(panels) // 2, _PANEL_HEIGHT))
         if self._over_time is not None:
@@ -212,13 +212,13 @@ class QueryableField(Queryable):
         opaque = picture[..., 3] > 127 if picture.shape[2] == 4 else np.ones(picture.shape[:2], bool)
         if not opaque.any():
             raise ValueError(f"--image {path}: expected something opaque in it, found nothing")
-        label = max(self._source.names, default=0) + 1  # one without a name, which is known by sight
+        label = max(self._source.names, default=0) + 1  # without a name: encoded by its appearance
         image = np.ascontiguousarray(picture[..., 2::-1])
         labels = np.where(opaque, label, 0).astype(np.int32)
         return np.asarray(self.run.encoder.embed_objects(image, labels, label))[-1]
 
     def _at_point(self, question: Question) -> np.ndarray:
-        """The field's feature at a pixel, in the teacher's channels of a level."""
+        """The field's feature at a pixel, in the teacher's channels for one level."""
         run, photographs = self.run, self.run.photographs
         assert question.point is not None
         assert question.camera is not None
@@ -251,15 +251,15 @@ class QueryableField(Queryable):
 
 
 def _changed_at(file: Path) -> int | None:
-    """When a file was written last; None where it is not."""
+    """When a file was last written; None if it does not exist."""
     return file.stat().st_mtime_ns if file.is_file() else None
 
 
 def _index(photographs: Photographs, camera: str) -> int:
-    """The index of a photograph by its name, in short or in full.
+    """The index of a photograph by its short or full name.
 
     Raises:
-        ValueError: there is none of that name.
+        ValueError: no photograph has that name.
     """
     names = short_names(photographs.names)
     for known in (names, photographs.names):
@@ -274,7 +274,7 @@ def _one(camera: Camera) -> Camera:
 
 
 def _ends(scores: Float[np.ndarray, "n"]) -> tuple[float, float]:
-    """The least and largest score, without a few outliers at the lower end."""
+    """The smallest and largest score, without a few outliers at the lower end."""
     scores = np.nan_to_num(scores)
     return float(np.percentile(scores, 1)), float(scores.max())
 
@@ -282,13 +282,13 @@ def _ends(scores: Float[np.ndarray, "n"]) -> tuple[float, float]:
 def _with_shares(
     gaussians: Gaussians, selected: Bool[np.ndarray, "n"], shares: Float[np.ndarray, "n"]
 ) -> Gaussians:
-    """The scene with red 1 in what is selected, and green the shares."""
+    """The scene with selected Gaussians' red at 1, and green set to the shares."""
     colors = np.stack([selected, shares, np.zeros(len(shares))], axis=1)
     return _painted(gaussians, colors.astype(np.float32))
 
 
 def _seen_from(gaussians: Gaussians, camera: Camera) -> Gaussians:
-    """The scene with the colours that one camera sees, the same from all sides."""
+    """The scene with the colours that one camera sees, made independent of the view."""
     return _painted(gaussians, np.asarray(_colors(gaussians, camera)))
 
 
@@ -299,5 +299,5 @@ def _colors(gaussians: Gaussians, camera: Camera) -> Float[Array, "n 3"]:
 
 
 def _painted(gaussians: Gaussians, colors: Float[np.ndarray, "n 3"]) -> Gaussians:
-    """The scene with one colour a Gaussian and no features."""
+    """The scene with one colour per Gaussian and no features."""
     return eqx.tree_at(lambda g: g.features, recolored(gaussians, colors), None, is_leaf=lambda x: x is None)

@@ -1,4 +1,4 @@
-"""The summary of a distillation: agreement with the teacher, classes, pictures of the features."""
+"""The summary of a distillation: agreement with the teacher, classes, and pictures of the features."""
 
 from gsjax.engine.folder import RunFolder
 from gsjax.engine.messages import counted
@@ -37,7 +37,7 @@ _VIEWS = (Column("view", "view"), Column("cosine to the teacher", "cosine", "", 
 
 
 def asked_by(features: str) -> str:
-    """What `gsjax query` is given, as its usage has it: an unknown encoder reads no texts.
+    """The arguments of `gsjax query` for a field, as in its usage line; an unknown encoder reads no texts.
 
     Args:
         features: the kind of the features.
@@ -46,7 +46,7 @@ def asked_by(features: str) -> str:
 
 
 def summarize(folder: RunFolder, found: Metrics) -> Summary:
-    """The summary of a distillation, whose losses are drawn into the folder."""
+    """The summary of a distillation; also draws its losses into the folder."""
     plots, judged, views = [], found["judged_by"], found["views"]
     if len(found["curve"]) > 1:
         plot = save(losses_over_steps(found["curve"]), folder.plot("losses"))

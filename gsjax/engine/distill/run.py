@@ -116,7 +116,7 @@ def run(options: Options) -> int:
         ticks = drive(method, problem, run)
         total, losses = method.total(problem), means_of("rec", "cos", "contrast", "tv")
         schedule = Schedule("distilling", total, losses, _words)
-        if not options.distill.iterations:  # each pass over the views ends with an objective of its own
+        if not options.distill.iterations:  # each pass over the views has its own objective, known at its end
             of_pass = method.period(problem)
             schedule = Schedule(
                 "distilling", total, lambda now, infos: losses(now, infos[-1:]), _words, of_pass
@@ -168,13 +168,13 @@ def _write(folder: RunFolder, result: DistillResult) -> None:
 
 
 def with_paths(options: Options) -> Options:
-    """The options with paths as they are found from any folder."""
+    """The options with paths that are valid from any folder."""
     images = None if options.images is None else located(options.images)
     return replace(options, **options.located(), scene=Path(located(str(options.scene))), images=images)
 
 
 def _note_unused(config: DistillConfig, notes: Notes) -> None:
-    """Warn of settings that differ from the defaults and change nothing, as no training follows."""
+    """Warn of settings that were changed without effect, because no training follows."""
     plain, given = asdict(DistillConfig()), asdict(config)
     if config.iterations == 0:
         changed = [name for name in _OF_TRAINING if given[name] != plain[name]]
@@ -194,7 +194,7 @@ def _out(options: Options, scene: Path) -> Path:
     """The folder for the field.
 
     Raises:
-        ValueError: there is none, or the scene lies in it and would be removed when the field is replaced.
+        ValueError: there is none, or it contains the scene, which replacing the field would remove.
     """
     if options.out is None and options.scene.is_file():
         raise ValueError(f"{options.scene}: a file has no folder of its own; --out names one for the field")

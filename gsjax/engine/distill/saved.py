@@ -1,4 +1,4 @@
-"""The folder of `gsjax distill` read back: the field, its scene, and the photographs of it."""
+"""The folder of `gsjax distill` read back: the field, its scene, and the photographs of the scene."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -29,7 +29,7 @@ _OF_IMAGES = ("images", "scale", "frames", "cameras", "eval_cameras", "test_ever
 
 @dataclass(frozen=True)
 class Whereabouts:
-    """Current places of a field's scene, photographs and encoder (default: where they were).
+    """Current locations of a field's scene, photographs and encoder (default: where they were).
 
     Attributes:
         scene: the scene's file.
@@ -56,9 +56,9 @@ class FieldRun:
         gaussians: the scene.
         rows: row of the file of each Gaussian.
         num_rows: number of rows in the file, including Gaussians that cannot be drawn.
-        labels: label of each Gaussian, where the file has them.
-        origin: what places are relative to, where the file's lie far from 0.
-        photographs: of the scene; None where these are no longer there.
+        labels: label of each Gaussian, if the file has them.
+        origin: what positions are relative to, if those of the file lie far from 0.
+        photographs: of the scene; None if they are no longer there.
         weights: folder of CLIP's weights (default: where they were).
     """
 
@@ -94,7 +94,7 @@ class FieldRun:
 
 
 def field_of(path: Path) -> Path | None:
-    """The folder of the field at `path`, or in the run there; None where there is none."""
+    """The folder of the field: `path` itself, or the one inside the run at `path`; None if there is none."""
     return next((folder for folder in (path, path / FOLDER) if (folder / NAME).is_file()), None)
 
 
@@ -131,7 +131,7 @@ def open_field_run(
 
 
 def _scene_file(folder: Path, stored: DistillResult, given: Path | None, notes: Notes) -> Path:
-    """The file of a field's scene, recognised by its content wherever it was moved to."""
+    """The file of a field's scene, recognised by its content if it was moved."""
     was, parent = Path(stored.scene.get("file") or folder / "scene.ply"), folder.absolute().parent
     beside = (parent / "scene.ply", parent / "canonical" / "scene.ply", folder / "scene.ply")
     there = [file for file in (was, *beside) if file.is_file()] if given is None else [given]
@@ -158,7 +158,7 @@ def _photographs(
     images: str | None,
     notes: Notes,
 ) -> Photographs | None:
-    """The photographs that the field learned from; None, and a warning, where they cannot be read.
+    """The photographs that the field learned from; None, with a warning, if they cannot be read.
 
     Raises:
         ValueError: they are not where `images` says.
@@ -189,7 +189,7 @@ def _options(settings: Any, folder: Path, file: Path, images: str | None) -> Sce
         chosen["images"] = images
     run, parent = Path(settings["scene"]), folder.absolute().parent
     if not is_scene(run) and not run.exists() and folder.name == FOLDER and is_run(parent):
-        run = parent  # that was moved whole
+        run = parent  # the run was moved as a whole
     return SceneOptions(run if run.is_dir() else file, read=read_options(settings["read"]), **chosen)
 
 

@@ -1,5 +1,5 @@
-"""The scene that a field is distilled for, and photographs of it: those of a run, or of a file of another
-program."""
+"""The scene that a field is distilled for, and its photographs: those of a run, or given along with a file of
+another program."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -36,9 +36,9 @@ class SceneAndImages:
     """Folder of a run of `gsjax fit`, `gsjax track` (its first frame) or `gsjax parts` (its canonical frame);
     or a file of Gaussians from any program (.ply, .spz, .sog, .splat, .ksplat), with --images and --out."""
     images: str | None = None
-    """Photographs of a file's scene, with poses in its coordinates, among which --frames, --cameras,
-    --eval-cameras and --test-every select. For a run: the present folder of its photographs, if they
-    were moved."""
+    """Photographs of a file's scene, with poses in its coordinates; --frames, --cameras, --eval-cameras
+    and --test-every select among them. For a run: the current folder of its photographs, if they were
+    moved."""
 
 
 @dataclass(frozen=True)
@@ -75,7 +75,7 @@ def open_field_scene(options: SceneOptions, read_scene: Read | None = None) -> F
         read_scene: its Gaussians and the report about them, if they were read already.
 
     Raises:
-        ValueError, OSError: they do not exist, or options are given that the run has chosen itself.
+        ValueError, OSError: they do not exist, or options are given that the run has already settled.
     """
     path = options.scene
     if path.is_file():
@@ -181,7 +181,7 @@ def _read(file: Path) -> Read:
 
 
 def _as_learned(photographs: Photographs, file: Path) -> Photographs:
-    """The photographs with the poses that the fit refined, where it did."""
+    """The photographs with the poses that the fit refined, if it did."""
     if not file.is_file():
         return photographs
     arrays = read_arrays(file, ("names", "viewmats"), _AGAIN)

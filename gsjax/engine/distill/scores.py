@@ -35,11 +35,11 @@ Frozen = tuple[FrozenView, Plan]
 
 
 class ClassScores:
-    """Masks of classes in views, by either query, against true labels.
+    """Overlap of class masks with true labels over views, for 2D and 3D queries.
 
     Attributes:
-        by_pixel: overlaps of each class by pixels' own features (2D query).
-        in_space: overlaps by Gaussians, each drawn as the class that it is nearest to (3D query).
+        by_pixel: overlap of each class if pixels are classified by their own features (2D query).
+        in_space: overlap if each Gaussian is classified, and rendered as its nearest class (3D query).
     """
 
     def __init__(self, names: Mapping[int, str]):
@@ -69,7 +69,7 @@ class ClassScores:
             self.in_space[label].add(in_space == label, truth == label)
 
     def rows(self) -> list[dict[str, Any]]:
-        """Name, iou and boundary_iou by either query, for each class that occurred."""
+        """Name, IoU and boundary IoU by both queries, for each class that occurred."""
         found = []
         for label, name in self.names.items():
             ours, theirs = self.by_pixel[label], self.in_space[label]
@@ -124,8 +124,8 @@ def classes_of(
 
 
 def angle_error(config: DistillConfig) -> Callable[[FeatureField, Located | None, Frozen, Teacher], float]:
-    """A function for 1 - cosine to the teacher of one view, a mean over its pixels, compiled once for views
-    of one kind.
+    """Returns a function that computes 1 - cosine to the teacher, averaged over the pixels of a view; it is
+    compiled once for views of one kind.
 
     Args:
         config: of the field.
@@ -134,15 +134,15 @@ def angle_error(config: DistillConfig) -> Callable[[FeatureField, Located | None
     loss = jax.jit(partial(distill_loss(quiet), step=0, key=None), compiler_options=host_options())
 
     def error(field: FeatureField, located: Located | None, frozen: Frozen, teacher: Teacher) -> float:
-        rows = 1 << (max_rows(teacher) - 1).bit_length()  # few lengths, so few programs
+        rows = 1 << (max_rows(teacher) - 1).bit_length()  # few lengths, so few compilations
         return float(loss(field, view_batch(teacher, 0, rows, located, frozen))[1]["cos"])
 
     return error
 
 
 def one_by_one(gaussians: Gaussians, cameras: Iterable[Camera], rasterize_mode: str) -> Iterator[Frozen]:
-    """The scene in each camera, one at a time in memory. Lists are padded to few lengths, which never
-    shrink, so that views of one size share a compiled program.
+    """The scene as each camera sees it, one view in memory at a time. Lists are padded to a few lengths,
+    which never shrink, so that views of one size share a compiled program.
 
     Args:
         gaussians: the scene.

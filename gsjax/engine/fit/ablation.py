@@ -25,15 +25,15 @@ def ablate(
     rows: Sequence[Mapping[str, Any]],
     judge: Judge,
 ) -> list[dict[str, Any]]:
-    """Rows of the `part` of the scene that is kept, its number of `gaussians`, its `sh_degree` (None if it
-    was not logged), and the mean `psnr` of the views. Nothing is fitted again: a fit of that size does
-    better.
+    """Returns a row per reduced scene: the `part` that is kept, its number of `gaussians`, its `sh_degree`
+    (None if it was not logged), and the mean `psnr` of the views. Nothing is fitted again: a fit of that
+    size does better.
 
     Args:
         gaussians: the scene, perhaps with empty slots after it.
         light: from `light_of`; Gaussians with the least light are removed first.
-        frames: the held-out views of the curve.
-        rows: the curve of the fit.
+        frames: the held-out views that were evaluated during the fit.
+        rows: the logged rows of the fit.
         judge: scores views.
     """
 
@@ -53,7 +53,8 @@ def ablate(
 
 
 def ablate_time(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """The same after a fraction of the time: at the last evaluation before it, if there was one."""
+    """Rows, as in `ablate`, of the whole scene after a fraction of the time: of the last evaluation up to
+    then, if there was one."""
     found = []
     for name, share in _MINUTES.items():
         before = [r for r in evaluated(rows) if r["seconds"] <= share * rows[-1]["seconds"]]
@@ -64,7 +65,7 @@ def ablate_time(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
 
 
 def _emptied(gaussians: Gaussians, rows: np.ndarray) -> Gaussians:
-    """The scene without some rows; their slots stay, so that one program draws all parts."""
+    """The scene without some rows; their slots stay, so that one compiled program renders all parts."""
     logits = np.array(gaussians.logit_opacities)
     logits[rows] = EMPTY_LOGIT
     return eqx.tree_at(lambda g: g.logit_opacities, gaussians, jax.device_put(logits))

@@ -1,4 +1,4 @@
-"""What a fit of given minutes can afford, by what steps cost."""
+"""What a fit can afford within given minutes, from an estimate of the cost of a step."""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -6,20 +6,20 @@ from dataclasses import replace
 from gsjax.methods.fit import FitConfig
 
 LEAST_STEPS = 150
-"""Steps on photographs of a size, without which smaller ones give more."""
-_STEP_S = (0.01, 2.5e-7, 7.5e-7)  # a step, and more for a pixel and a slot, on two cores of an AMD EPYC
-_STEPS = 0.6  # of the minutes: steps, without reading, matching, compiling, scores and the report
+"""Fewest steps that make photographs of a size worthwhile; with fewer, smaller photographs give more."""
+_STEP_S = (0.01, 2.5e-7, 7.5e-7)  # of a step, plus per pixel and per slot; two cores of an AMD EPYC
+_STEPS = 0.6  # share of the minutes for steps: not reading, matching, compiling, scores and the report
 _LEAST_SIDE = 32  # pixels
 _SLOTS_A_STEP = 20  # docs/choosing.md
 _LEAST_SLOTS, _MOST_SLOTS = 5_000, 1_000_000
 
 
 def affordable(config: FitConfig, size: tuple[int, int], minutes: float) -> tuple[FitConfig, int]:
-    """The settings with as many slots for Gaussians, and spherical harmonics of such a degree, as pay in
-    these minutes; and how many steps there should be.
+    """Returns the settings with the number of slots for Gaussians and the SH degree that pay off in these
+    minutes, and the number of steps to expect.
 
-    Twenty slots a step are near the best of two scenes (docs/choosing.md). A degree pays if it is unlocked in
-    the first half.
+    Twenty slots per step are close to the best for two scenes (docs/choosing.md). A degree pays off if it is
+    unlocked in the first half of the steps.
 
     Args:
         config: of a fit, with its default settings.
@@ -38,8 +38,8 @@ def affordable(config: FitConfig, size: tuple[int, int], minutes: float) -> tupl
 
 
 def last_shrink(config: FitConfig, size: tuple[int, int], seconds: float) -> int:
-    """The factor by which photographs are downscaled at the end: that of the largest for which a fifth of the
-    time should be enough for 150 steps.
+    """The factor by which photographs are downscaled at the end of a fit: the smallest with which a fifth of
+    the time should suffice for 150 steps.
 
     Args:
         config: of a fit.
@@ -57,14 +57,14 @@ def last_shrink(config: FitConfig, size: tuple[int, int], seconds: float) -> int
 
 
 def step_seconds(pixels: float, slots: int) -> float:
-    """Seconds of a step with a photograph of so many pixels and so many slots for Gaussians: a guess, for
-    before any is measured."""
+    """Estimates the seconds of a step from the pixels of its photograph and the slots for Gaussians; used
+    until steps have been timed."""
     constant, a_pixel, a_slot = _STEP_S
     return constant + a_pixel * pixels + a_slot * slots
 
 
 def _steps_within(seconds: float, config: FitConfig, size: tuple[int, int], slots: int) -> int:
-    """The steps of a fit that begins with smaller photographs."""
+    """The number of steps of a fit that begins with smaller photographs."""
     last, coarse = last_shrink(config, size, seconds), config.coarse_until
     pixels = size[0] * size[1] / last**2
     stages = ((coarse / 3, 16), (2 * coarse / 3, 4), (1 - coarse, 1))

@@ -1,4 +1,4 @@
-"""What follows the steps of a fit, as far as there is time: pruning, scores, and a video."""
+"""What follows the steps of a fit, as far as time allows: pruning, scores, an ablation, and a video."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -27,14 +27,15 @@ JUDGED_AT_MOST = 4
 _COMPILING_S, _SCORING_S = 6.0, 1.5  # before the first view
 _A_PIXEL_S = 1e-6  # for SSIM and a picture, beside rendering
 _SLACK = 1.1
-_A_PRUNING = 3.0  # of the time of a view, as it is differentiated
+_A_PRUNING = 3.0  # times that of rendering a view, as gradients are computed
 _ABLATING = "ablating parts of the scene"
 _PARTS = 8  # of a scene, at most
 
 
 @dataclass
 class Ending:
-    """The stages after the last step. An error or Ctrl-C ends one of them, and the run still gets its report.
+    """The stages after the last step. An error or Ctrl-C ends only the current one; the run still gets its
+    report.
 
     Attributes:
         judge: scores views.
@@ -57,7 +58,8 @@ class Ending:
     _left_out: list[str] = field(default_factory=list)
 
     def expected_s(self) -> dict[str, float]:
-        """Seconds that each stage will take, from those of a view; infinite before any is known."""
+        """Seconds that each stage should take, estimated from those of a view; infinite until a view or a
+        step has been timed."""
         view, pace = self.judge.view_s, self.progress.pace
         if not np.isfinite(view) and pace:
             view = 0.5 / pace
@@ -70,7 +72,7 @@ class Ending:
         }
 
     def rest_s(self, most: float) -> float:
-        """Seconds of the stages, in the order of their worth, and of the report that there is time for."""
+        """Seconds to keep for the report and for the stages that fit into `most`, most valuable first."""
         kept, expected = REPORT_S, self.expected_s()
         if np.isfinite(self.judge.view_s):  # the last steps are evaluated too
             kept += self.judge.view_s * len(some_of(self.judged))
@@ -84,8 +86,8 @@ class Ending:
     def pruned(
         self, gaussians: Gaussians, frames: Sequence[Frame], config: FitConfig
     ) -> tuple[Gaussians, Float[np.ndarray, "n"] | None]:
-        """The `gaussians` that some of the `frames` need, and the light of each, which is None if that was
-        left out; `config` has the share of light that is not needed."""
+        """The `gaussians` that at least one of the `frames` needs, and the light of each, or None if pruning
+        was left out; `config.prune` is the share of light that may be lost."""
         keep = self.expected_s()["scores"] + REPORT_S
 
         def work() -> tuple[Gaussians, Float[np.ndarray, "n"]]:
@@ -121,8 +123,8 @@ class Ending:
     def filmed(
         self, gaussians: Gaussians, frames: Sequence[Frame], focus: Float[np.ndarray, "3"], folder: RunFolder
     ) -> None:
-        """Write the video of a path about the `focus` of `gaussians` into `folder`, between the cameras of
-        `frames`, and note what was left out."""
+        """Write a video of `gaussians` into `folder`, on a path around `focus` between the cameras of
+        `frames`, and note which stages were left out."""
         camera = self.fitted[len(self.fitted) // 2].cameras
         viewmats = np.concatenate([frame.cameras.viewmat for frame in frames])
         work = partial(write_orbit, folder, camera, viewmats, focus, gaussians, self.judge)
@@ -133,7 +135,7 @@ class Ending:
     def _if_time(
         self, name: str, words: str, work: Callable[[], T], otherwise: T, keep: float = REPORT_S
     ) -> T:
-        """The result of a stage, or `otherwise`, where there is no time for it or nobody waits for it."""
+        """The result of a stage, or `otherwise` if there is no time for it or the run was stopped early."""
         if self.budget.allows(self.expected_s()[name], keep):
             return self._stage(name, words, work, otherwise)
         if not self.budget.hurried:

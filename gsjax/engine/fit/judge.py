@@ -39,14 +39,15 @@ class Scores:
 
 @dataclass(eq=False)
 class Judge:
-    """Renders the views of photographs and compares them; all views of one size share one program.
+    """Renders the views of photographs and compares the two; views of one size share a compiled program.
 
     Attributes:
         config: the settings of the fit.
         background: RGB behind the scene; None is black.
-        sizes: common sizes of photographs; a smaller one is rendered at one of these, whose program is there.
+        sizes: common sizes of photographs; a smaller photograph is rendered at one of these, whose program
+            is already compiled.
         plans: a large enough plan for each size of photograph.
-        view_s: seconds that the last view took; infinite before the second, as the first compiles.
+        view_s: seconds that the last view took; infinite until a view did not have to be compiled.
     """
 
     config: FitConfig
@@ -58,7 +59,7 @@ class Judge:
     def __call__(
         self, gaussians: Gaussians, frames: Iterable[tuple[str, Frame]], folder: RunFolder | None = None
     ) -> Scores:
-        """Score named views; with a folder, pictures are written side by side there."""
+        """Score named views; with a folder, also write side-by-side pictures of them there."""
         rows = []
         for name, frame in frames:
             begun, is_known = perf_counter(), self._size(frame.cameras) in self.plans
@@ -93,7 +94,7 @@ class Judge:
         )
 
     def compare(self, gaussians: Gaussians, frame: Frame) -> "Compared":
-        """The Gaussians rendered from the camera of `frame`, beside its photograph. The frame is on the host
+        """The Gaussians rendered from the camera of `frame`, with its photograph. The frame is on the host
         and has one camera."""
         camera, size = frame.cameras, self._size(frame.cameras)
         at = replace(camera, width=size[0], height=size[1])

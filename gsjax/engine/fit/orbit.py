@@ -27,7 +27,7 @@ def write_orbit(
     Args:
         folder: of the run.
         camera: gives the size of the pictures, and the field of view.
-        viewmats: of the photographs, as the fit refined them.
+        viewmats: of the photographs, as refined by the fit.
         focus: centre of the path.
         gaussians: the scene.
         judge: renders it.

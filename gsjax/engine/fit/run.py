@@ -133,7 +133,7 @@ def run(options: Options) -> int:
         write_cameras(folder, names, found_frames, run.params, photographs.origin)
         gaussians, light = ending.pruned(gaussians, found_frames, config)
         write_scene(folder.scene, gaussians, origin=photographs.origin, antialiased=config.antialiased)
-        # In the slots of the fit, so that its programs draw it.
+        # In the slots of the fit, so that its compiled programs can render it.
         shown = in_slots(gaussians, run.params.gaussians.num) if gaussians.num else gaussians
         scores = ending.scored(shown, (photographs.names[chosen[0]], fitted[0]), folder)
         ablation = ending.ablated(shown, light)
@@ -169,7 +169,7 @@ def run(options: Options) -> int:
 
 
 def _at_scale(photographs: Photographs, scale: float | None, notes: Notes, console: Console) -> Photographs:
-    """The photographs at the size of the fit; it is said if that is smaller and nobody asked for it."""
+    """The photographs at the size of the fit; says so if that is smaller without having been asked for."""
     scaled = smaller(photographs, scale)
     if scale is None and (shrunk := (scaled.sizes < photographs.sizes).any(1)).any():
         largest = int(photographs.sizes.prod(1).argmax())
@@ -184,7 +184,7 @@ def _at_scale(photographs: Photographs, scale: float | None, notes: Notes, conso
 def _affordable(
     config: FitConfig, size: tuple[int, int], minutes: float, notes: Notes, console: Console
 ) -> FitConfig:
-    """The settings for these minutes, which are said."""
+    """The settings that pay off in these minutes, which are also printed and noted."""
     found, steps = affordable(config, size, minutes)
     words = (
         f"up to {found.cap:,} Gaussians with colours of degree {found.sh_degree}, as there should be time "
@@ -204,22 +204,22 @@ def _fitted(
     ending: Ending,
     board: TensorBoard | None,
 ) -> Drive:
-    """The fit until its steps, its minutes or the wanted PSNR are reached, or it is stopped."""
+    """Fit until the steps or minutes are used up, the wanted PSNR is reached, or the run is stopped."""
     budget, progress, judge, judged = ending.budget, ending.progress, ending.judge, ending.judged
     goal, steps = options.until_psnr, method.config.steps
 
     def is_met(run: Run) -> bool:
-        """Whether the wanted PSNR is reached: by some views, and then by all of them."""
+        """Whether the wanted PSNR is reached: by the views evaluated last, and then by all held-out views."""
         if goal is None or not any(row["test_psnr"] >= goal for row in evaluated(progress.rows)[-1:]):
             return False
         found = judge(run.params.gaussians, judged).mean()["psnr"]
         return found is not None and found >= goal
 
     def share(step: int) -> float:
-        """The share of the fit that is done: of its steps or of their time, whichever is larger."""
+        """The share of the fit that is done: of its steps or of its time for them, whichever is larger."""
         return max(step / steps, budget.share)
 
-    shrink = problem.shrink  # asked for a row, `Sizes` must not go on to the next size
+    shrink = problem.shrink  # logging a row must not make `Sizes` advance to the next size
     shown = (lambda _: shrink.now) if isinstance(shrink, Sizes) else shrink
     ticks = drive(method, problem, run, progress=(lambda step: 1.0) if is_met(run) else share)
     watch(
@@ -273,7 +273,7 @@ def write_cameras(
         names: of the photographs.
         frames: their frames, with the cameras as learned.
         model: what was learned.
-        origin: what cameras are relative to; it is put back.
+        origin: what the cameras are relative to; it is added back.
     """
     if model.twists is None and model.exposures is None:
         return

@@ -1,4 +1,4 @@
-"""The logged rows of a fit, and when held-out photographs are evaluated."""
+"""What a fit logs, and when it evaluates held-out photographs."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -14,12 +14,13 @@ from gsjax.engine.progress import Progress, Schedule
 
 _LOGGED_EVERY = 100  # steps
 _EXTRA = 10  # evaluations under --minutes, besides those of --judge-every
-_JUDGING = 0.05  # of the time, at most, goes into evaluations under --minutes
+_JUDGING = 0.05  # largest share of the time for evaluations under --minutes
 
 
 def schedule_of(steps: int, shrink: Callable[[float], int], progress: Progress) -> Schedule:
-    """Rows of a fit: loss and psnr (of the photograph of that step), the number of Gaussians (alive), the
-    factor by which the photograph was downscaled (shrink), and test_psnr of held-out photographs, or None."""
+    """A schedule whose rows have the loss and psnr (of the photograph of that step), the number of Gaussians
+    (alive), the factor by which the photograph was downscaled (shrink), and the test_psnr of held-out
+    photographs, or None."""
 
     def row(now: Tick, infos: list[Mapping[str, Any]]) -> dict[str, Any]:
         last = infos[-1] if infos else {}
@@ -38,7 +39,7 @@ def schedule_of(steps: int, shrink: Callable[[float], int], progress: Progress) 
 
 
 def _finite(value: Any) -> float | None:
-    """A finite number or None: JSON has no infinity, the PSNR of a perfect picture."""
+    """The number if it is finite, else None: JSON has no infinity, which is the PSNR of a perfect picture."""
     return None if value is None or not np.isfinite(value) else float(value)
 
 
@@ -53,12 +54,12 @@ class Evaluation:
 
     Attributes:
         judge: scores photographs.
-        some: the held-out photographs to evaluate meanwhile.
+        some: the held-out photographs to evaluate during the fit.
         every: steps between evaluations.
         steps: steps of the fit.
-        awaited: whether the fit ends when a score is reached, so that none may be missing.
-        budget: of the fit; with minutes there are ten evaluations besides, and none where they take more than
-            a twentieth of the time, unless it is awaited.
+        awaited: whether the fit ends when a score is reached, so that no evaluation may be skipped.
+        budget: of the fit; with minutes there are ten more evaluations, but while evaluations take more than
+            a twentieth of the time they are skipped, except for regular ones if a score is awaited.
     """
 
     judge: Judge
@@ -72,7 +73,7 @@ class Evaluation:
     _is_known: bool = field(default=False, init=False)  # the first evaluation compiles
 
     def __call__(self, now: Tick) -> dict[str, Any] | None:
-        """The scores for the row of a step; None if there is no evaluation after it."""
+        """The scores for the row of a step; None if nothing is evaluated after it."""
         begun, tenths = perf_counter(), int(_EXTRA * self.budget.share)
         regular, extra = now.step % self.every == 0, tenths > self._tenths
         costly = self.budget.minutes is not None and self._seconds > _JUDGING * self.budget.used

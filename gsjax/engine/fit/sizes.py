@@ -1,4 +1,4 @@
-"""The size of photographs in a fit of given minutes, by the measured pace of its steps."""
+"""The size of photographs in a fit of given minutes, chosen by the measured pace of its steps."""
 
 from rich.console import Console
 
@@ -9,15 +9,15 @@ from gsjax.engine.progress import Progress
 from gsjax.methods.fit import FitConfig
 
 _COMPILING_S = 5.0
-_DEARER = 3.5  # a step on photographs of twice the width and height; docs/choosing.md
+_DEARER = 3.5  # cost of a step on photographs of twice the width and height; docs/choosing.md
 
 
 class Sizes:
-    """progress -> the factor by which photographs are downscaled.
+    """Maps the progress of a fit to the factor by which photographs are downscaled.
 
-    As in a fit without minutes, a sixth of the time goes to photographs of a quarter of the last size, a
-    third to those of half of it, and a half to the last size. That size is the largest for which there will
-    be 150 steps; it is guessed from what steps cost elsewhere, then found from what they cost here.
+    As in a fit without minutes, a sixth of the time goes to photographs at a quarter of the final size, a
+    third to those at half of it, and half to the final size. The final size is the largest that leaves time
+    for 150 steps; it is first estimated from the usual cost of a step, then found from the measured pace.
     """
 
     def __init__(
@@ -45,13 +45,13 @@ class Sizes:
 
     @property
     def now(self) -> int:
-        """The present factor; 0 before the first step."""
+        """The current factor; 0 before the first step."""
         return self._now
 
     def __call__(self, progress: float) -> int:
         if not self._now:
             self._now = self._first()
-        if self._resumed:  # what was decided then is not decided again
+        if self._resumed:  # earlier decisions are not made again
             self._times, self._resumed = [t for t in self._times if t > progress], False
         if self._now > 1 and self._times and progress >= self._times[0] and (pace := self._progress.pace):
             self._times.pop(0)
@@ -59,13 +59,13 @@ class Sizes:
             left = int((self._budget.steps_s - _COMPILING_S) * pace / _DEARER)
             if left >= LEAST_STEPS:
                 self._now //= 2
-                self._progress.pace = 0.0  # which is not known at the new size
+                self._progress.pace = 0.0  # unknown at the new size
             elif last:
                 self._say(max(0, left))
         return self._now
 
     def _first(self) -> int:
-        """The factor at the beginning: four times that of the largest size for which there should be time."""
+        """The initial factor: four times that of the largest size for which there should be time."""
         if not self._times:
             return 1
         return 4 * last_shrink(self._config, self._size, self._budget.steps_s)

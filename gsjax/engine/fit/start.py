@@ -1,5 +1,5 @@
-"""The points from which a fit starts: those of the data, or, if it has neither points nor depth, matches
-between its photographs."""
+"""The points from which a fit starts: those of the data or, if it has neither points nor depth, points
+triangulated from matches between its photographs."""
 
 from contextlib import nullcontext
 from dataclasses import replace
@@ -13,9 +13,9 @@ from gsjax.methods.fit import FitConfig
 from gsjax.perception.matching import filled_up, match_points
 from gsjax.scene.frame import Frame
 
-_MOST_MATCHED = 150  # photographs; of more, this many evenly spread ones
+_MOST_MATCHED = 150  # photographs; of more, this many are matched, evenly spread
 LEAST_MATCHED = 100
-"""Least number of matched points for a start from matches."""
+"""Fewest matched points from which a fit starts."""
 
 
 def start_from(
@@ -27,7 +27,7 @@ def start_from(
         photographs: perhaps with points.
         frames: the photographs to fit.
         config: names the source of the start.
-        console: announces the matching (default: nothing).
+        console: announces the matching (default: no message).
 
     Raises:
         ValueError: matches are required, and the photographs share too few points.

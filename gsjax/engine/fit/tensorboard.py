@@ -1,4 +1,4 @@
-"""The curve of a fit as TensorBoard's event files, beside metrics.jsonl; an optional extra."""
+"""The curve of a fit as TensorBoard event files, in addition to metrics.jsonl; an optional extra."""
 
 import math
 import shutil
@@ -16,14 +16,14 @@ _FLUSHED_EVERY_S = 1
 
 
 class TensorBoard:
-    """Writes event files into RUN/tensorboard, a row of a fit's curve at a time.
+    """Writes event files into RUN/tensorboard, one row of a fit's curve at a time.
 
     Each row is on disk a second after `add`. If a run was killed, there may be rows from after the checkpoint
-    from which it is resumed: they are purged, so that none is shown twice.
+    from which it resumes: they are purged, so that none is shown twice.
 
     Args:
         folder: of the run.
-        rows: the rows of a resumed run; without any, the files of an earlier run are removed.
+        rows: the rows of a resumed run; if there are none, the files of an earlier run are removed.
 
     Raises:
         MissingExtra: tensorboardX is not installed.

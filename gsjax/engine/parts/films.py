@@ -43,7 +43,7 @@ VIDEO = "video.mp4"
 _METRICS, _PLY = "metrics.json", "ply"
 _THUMBNAIL, _COMPARED = 160, 5  # pixels, and number of moments, for comparing cameras
 _CHANGED = 0.05  # smallest difference of colours, 0 to 1, that counts as a change
-_NAME = re.compile(r"\w[\w .-]*")  # a folder name that stays within its parent
+_NAME = re.compile(r"\w[\w .-]*")  # a folder name that cannot lead out of its parent
 
 
 class Shot(NamedTuple):
@@ -52,7 +52,7 @@ class Shot(NamedTuple):
     Attributes:
         image: the rendered frame.
         gaussians: the Gaussians in it.
-        seconds: time of both; None if something was compiled.
+        seconds: time to place and render them; None if something was compiled.
     """
 
     image: Float[np.ndarray, "height width 3"]
@@ -65,11 +65,11 @@ Watch = Callable[[Iterable[Shot], int], Iterable[Shot]]
 
 
 def edited(script: Script, saved: PartsRun) -> tuple[Film, list[str]]:
-    """The film of an edited run, and warnings about it, a sentence each. Points of the script are in the
+    """The film of an edited run, and warnings about it, a sentence each. Points in the script are in the
     coordinates of the data.
 
     Raises:
-        ValueError, OSError: there is no such part or other run, or the edits cannot be applied.
+        ValueError, OSError: a part or another run does not exist, or the edits cannot be applied.
     """
     origin = saved.recording.judged.origin
     script = relative(script, origin)
@@ -81,7 +81,7 @@ def edited(script: Script, saved: PartsRun) -> tuple[Film, list[str]]:
         frames = len(recorded.trajectory.times)
         doubts.append(f"{saved.path} is a partial run: only {frames} of its frames are there")
     beyond = describe_beyond(_beyond(recorded, now), now.times, saved.names)
-    if beyond:  # as one: two that differ only in numbers would count as one kind
+    if beyond:  # as one warning: two that differ only in numbers would be taken for repetitions
         doubts.append(". ".join(beyond))
     if idle := _idle(script, film, saved, known):
         doubts.append(f"no visible effect: {', '.join(idle)}")
@@ -89,7 +89,7 @@ def edited(script: Script, saved: PartsRun) -> tuple[Film, list[str]]:
 
 
 def telling_camera(film: Film, saved: PartsRun, script: Script) -> int:
-    """The id of the camera in which the film differs most from the recording.
+    """The id of the camera in which the film differs most from the unedited recording.
 
     Args:
         film: the edited film.
@@ -119,8 +119,8 @@ def telling_camera(film: Film, saved: PartsRun, script: Script) -> int:
 
 
 def read_film(folder: Path) -> tuple[Script, Path]:
-    """The edits of a film, and the run that it was made from; if that is gone, the one that the folder lies
-    in, as films do by default.
+    """The edits of a film, and the run it was made from; if that is gone, the run that contains the folder,
+    as it does by default.
 
     Raises:
         ValueError: the edits cannot be read.
@@ -151,7 +151,7 @@ def read_edits_of(folder: Path) -> Script:
 
 
 def new_folder(parent: Path, name: str) -> Path:
-    """A new folder of that name, with a number appended if it is taken.
+    """Create a folder of that name, with a number appended if it is taken.
 
     Raises:
         ValueError: the name is not valid for a folder.
@@ -178,7 +178,7 @@ def write_film(
     watch: Watch,
     ply: bool = False,
 ) -> dict[str, Any]:
-    """Write a film: its script, video and metrics replace an earlier film in the folder.
+    """Write a film: its script, video and metrics, which replace an earlier film in the folder.
 
     Args:
         folder: the folder of the film.
@@ -191,8 +191,8 @@ def write_film(
         ply: whether to write the Gaussians of each frame too.
 
     Returns:
-        The contents of its metrics.json. A film that was stopped is not `complete`, but can be watched so
-        far.
+        The contents of its metrics.json. A film that was stopped is not `complete`, but can be watched up to
+        that frame.
     """
     for name in (SCRIPT, VIDEO, _METRICS):
         (folder / name).unlink(missing_ok=True)
@@ -236,7 +236,7 @@ def write_film(
 def frames_of(
     film: Film, blend: Blend, order: Int[np.ndarray, "n"] | None = None
 ) -> Callable[[int], Gaussians]:
-    """A function from the index of a frame to the Gaussians of a film in it.
+    """Returns a function from the index of a frame to the Gaussians of a film in that frame.
 
     The moment is selected on the host, so that the length of a film is not compiled in.
 
@@ -292,8 +292,8 @@ def _beyond(recorded: Layer, now: Trajectory) -> Beyond:
 
 
 def _idle(script: Script, film: Film, saved: PartsRun, known: LoadScene) -> list[str]:
-    """Labels of the edits that change neither the film nor the result of earlier edits, such as the second of
-    two equal ones."""
+    """Labels of the edits without effect: removing one does not change the film, and adding it to the edits
+    before it does not either, as with the second of two equal ones."""
     length = _lasting(script, film, saved)
 
     @cache
@@ -323,7 +323,7 @@ def _lasting(script: Script, film: Film, saved: PartsRun) -> float:
 
 
 def _edited_moments(film: Film, plain: Film) -> Int[np.ndarray, "m"]:
-    """The moments at which a film differs from that without edits; all if something was added."""
+    """The moments at which a film differs from the one without edits; all if something was added."""
     both = film[0].trajectory, plain[0].trajectory
     count = min(len(one.times) for one in both)
     if len(film) > 1:

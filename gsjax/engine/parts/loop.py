@@ -1,4 +1,4 @@
-"""The steps of `gsjax parts`: parts are tracked through all frames, and then the scene is refined."""
+"""The steps of `gsjax parts`: tracking parts through all frames, then refining the scene."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -40,7 +40,7 @@ class Loop:
     console: Console
 
     def follow(self) -> None:
-        """Find the poses of all frames, with a row of the progress for each."""
+        """Find the poses of all frames, and log a row of progress for each."""
         steps, frames = self.method.config.stream.iterations, self.problem.sequence.num_frames
         total, progress = self.method.steps_of_frames(self.problem), self.progress
 
@@ -75,8 +75,8 @@ class Loop:
             self.notes.warn("no part is needed to explain the pictures; the result is the canonical scene")
 
     def refine(self) -> None:
-        """Fit the scene and all poses to all frames, until it is stopped. An OSError ends it early, and the
-        run is complete all the same."""
+        """Fit the scene and all poses to all frames. If an OSError ends this early, the run still counts as
+        complete."""
         steps, begun = self.method.steps_of_refinement(self.problem), perf_counter()
         first, total = self.method.steps_of_frames(self.problem), self.method.total(self.problem)
         skipped = self.progress.skipped
@@ -100,7 +100,7 @@ class Loop:
         warn_of_returns(self.progress, self.notes)
 
     def _watch(self, schedule: Schedule) -> None:
-        """Run to the last step of a schedule."""
+        """Run up to the last step of a schedule."""
         ticks = drive(
             self.method,
             self.problem,
@@ -120,7 +120,7 @@ def update_seconds(progress: Progress) -> list[float]:
 
 
 def _losses(infos: list[Mapping[str, Any]]) -> list[float] | None:
-    """The losses of a frame at its first and at its last steps; None if none was finite."""
+    """The mean losses of a frame over its first and its last steps; None if none was finite."""
     losses = np.array([float(info["now"]) for info in infos])
     few = max(1, len(losses) // 8)
     return [float(losses[:few].mean()), float(losses[-few:].mean())] if len(losses) else None

@@ -1,4 +1,4 @@
-"""The files of a run of `gsjax parts`: parts.npz, scene.ply, videos, and the scores of metrics.json."""
+"""The files of a run of `gsjax parts`: parts.npz, scene.ply, videos, and the scores in metrics.json."""
 
 from pathlib import Path
 from typing import Any
@@ -37,7 +37,7 @@ def finished(
     notes: Notes,
     console: Console,
 ) -> dict[str, Any]:
-    """Write parts.npz, scene.ply and videos, and return the contents of metrics.json but for notes.
+    """Write parts.npz, scene.ply and videos, and return the contents of metrics.json except for its notes.
 
     Args:
         folder: of the run.
@@ -116,7 +116,7 @@ def finished(
 
 
 def _note_absences(trajectory: Trajectory, done: Bool[np.ndarray, "T"], notes: Notes) -> None:
-    """Say which parts are not there in which frames."""
+    """Note which parts are absent in which frames."""
     absent = (np.asarray(trajectory.opacities) == 0) & done[:, None]
     for part in np.flatnonzero(absent.any(0)).tolist():
         frames = np.flatnonzero(absent[:, part]).tolist()
@@ -124,7 +124,7 @@ def _note_absences(trajectory: Trajectory, done: Bool[np.ndarray, "T"], notes: N
 
 
 def _runs(frames: list[int]) -> str:
-    """Frames as runs of successive ones: 3 to 5, 9."""
+    """Frames as ranges of consecutive ones: "3 to 5, 9"."""
     ends = [t for t in frames if t + 1 not in frames]
     begins = [t for t in frames if t - 1 not in frames]
     return ", ".join(f"{a} to {b}" if b > a else f"{a}" for a, b in zip(begins, ends, strict=True))
@@ -140,15 +140,15 @@ def write_parts(
     """Write parts.npz. At time t, a point x with weights w is at sum_p w_p (R_p (x - c_p) + c_p + t_p); part
     0 is the background, which does not move. All in metres, seconds and the world's axes.
 
-    anchor (frame index), means0 [N,3], weights [N,P], labels [N], centres [P,3], R [T,P,3,3], t [T,P,3],
-    times [T]. Where some part is not there in some frame: opacities [T,P], 0 there and else 1, factors on
-    those of its Gaussians.
+    The arrays are anchor (frame index), means0 [N,3], weights [N,P], labels [N], centres [P,3],
+    R [T,P,3,3], t [T,P,3] and times [T]. If a part is absent in a frame, there is also opacities [T,P]: 0
+    where a part is absent, else 1; it multiplies the opacities of the part's Gaussians.
 
     Args:
         path: the file.
         scene, trajectory: the parts and their motion.
         anchor: index of the canonical frame.
-        origin: what places are relative to; it is put back.
+        origin: what positions are relative to; it is added back.
     """
     arrays = {
         "anchor": np.array(anchor),

@@ -1,4 +1,4 @@
-"""The summary of a run of `gsjax parts`: its parts, their joints, and the scores."""
+"""The summary of a run of `gsjax parts`: its parts, their joints, and their scores."""
 
 import shlex
 from collections.abc import Callable
@@ -36,7 +36,7 @@ SCORES = (
     Score("Gaussians", "num_gaussians", "", None, "less", at("num_gaussians")),
     Score("time of a frame", "update_s", "s", 2, "less", at("update_s", "median"), "machine"),
 )
-"""Means are over the parts whose truth is known."""
+"""Means are over the parts whose ground truth is known."""
 _PARTS = (
     Column("part", "name"),
     Column("true part", "true_name"),
@@ -116,12 +116,12 @@ def _next_steps(folder: RunFolder, found: Metrics) -> list[tuple[str, str]]:
 
 
 def example_edit(run: str, found: Metrics) -> str:
-    """A command that edits the part of a run whose motion shows most.
+    """A command that edits the part of a run whose motion is most visible.
 
     Args:
-        run: its folder, as a shell reads it.
+        run: its folder, quoted for a shell.
         found: its metrics, with parts.
     """
     part = max(found["parts"], key=lambda row: row.get("gaussians", 0) * row.get("moved_mm", 0))["part"]
-    fps = " --fps 15" if found["frames"]["followed"] == 2 else ""  # of two states nothing is seen in between
+    fps = " --fps 15" if found["frames"]["followed"] == 2 else ""  # two states alone show no motion
     return f'gsjax edit {run} --op "speed:parts={part},factor=2"{fps}'

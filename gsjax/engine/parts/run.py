@@ -156,7 +156,7 @@ def _check(options: Options, recording: Recording) -> None:
 def _masks(
     sequence: Sequence, anchor: Anchor, moved: Bool[np.ndarray, "C F H W"], options: Options
 ) -> Int[np.ndarray, "C H W"] | None:
-    """The moving pieces by the recording's own masks; None if a segmenter finds them."""
+    """The moving pieces according to the recording's own masks; None if a segmenter finds them."""
     if options.masks == "segment":
         return None
     labels = [sequence.mask(anchor.frame, c) for c in range(sequence.num_cameras)]
@@ -190,7 +190,7 @@ def _fitted(
 
 
 def _ply_of(path: Path) -> Path:
-    """The file itself, or that of a run of `gsjax fit`."""
+    """The scene file: `path` itself, or the scene of the run of `gsjax fit` in it."""
     if path.is_dir():
         expect_run(path, "`gsjax fit`")
         return path / "scene.ply"

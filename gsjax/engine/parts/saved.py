@@ -30,7 +30,7 @@ _ARRAYS = {
     "R": ("T", "P", 3, 3),
     "t": ("T", "P", 3),
 }
-_OPTIONAL = {"opacities": ("T", "P")}  # only where some part is not there in some frame
+_OPTIONAL = {"opacities": ("T", "P")}  # only if a part is absent in some frame
 _AGAIN = "run gsjax parts again with this version of gsjax, or name another folder"
 
 
@@ -41,7 +41,7 @@ class PartsRun:
     Attributes:
         path: the folder.
         layer: the scene, and its parts at the tracked frames.
-        names: numbers of the parts by name: "part 1", and the name of the true part if that is known.
+        names: numbers of the parts by name: "part 1", and the name of the true part if it is known.
         complete: whether all frames were tracked.
         recording: the frames and cameras of the run.
         blend: how rotations are blended.
@@ -67,7 +67,7 @@ def open_parts_run(path: Path) -> PartsRun:
     """Read the folder of a run, and open its recording.
 
     Raises:
-        FileNotFoundError: there is no such folder, it is no run's, or a file of it is missing.
+        FileNotFoundError: there is no such folder, it is not that of a run, or one of its files is missing.
         ValueError: a file is not as the run wrote it, or its recording cannot be opened.
     """
     layer, names, complete, origin = _read(path)
@@ -76,7 +76,7 @@ def open_parts_run(path: Path) -> PartsRun:
 
 
 def blend_of(path: Path) -> Blend:
-    """How a run blends rotations, without opening its recording; the default if it does not say."""
+    """How a run blends rotations, read without opening its recording; the default if it does not say."""
     try:
         return _blend(parse_yaml((path / "config.yml").read_text(encoding="utf-8")))
     except (OSError, ValueError, KeyError, TypeError):
@@ -145,7 +145,7 @@ def _read(path: Path) -> tuple[Layer, dict[str, int], bool, Float[np.ndarray, "3
 
 
 def _kind(file: Path) -> str | None:
-    """The command that made a run; None if its scores do not say."""
+    """The command that made a run; None if its metrics do not say."""
     try:
         return parse_json(file.read_text(encoding="utf-8")).get("kind")
     except (OSError, ValueError, AttributeError):
@@ -182,6 +182,6 @@ def _of_metrics(file: Path, frames: int) -> tuple[dict[str, int], int]:
     if type(followed) is not int or not 1 <= followed <= frames:
         expected = f"1 to {frames} tracked frames, as parts.npz has {frames}"
         raise ValueError(f"{file}: expected {expected}, found {brief(repr(followed))}; {_AGAIN}")
-    # True names come last: of two names, messages use the last.
+    # True names come last, because messages use the last of two names.
     names = {name: part for part, name, _ in called}
     return names | {true.lower().replace(" ", "_"): part for part, _, true in called if true}, followed

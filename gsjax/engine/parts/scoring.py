@@ -1,4 +1,4 @@
-"""Scores of the parts found: how they moved, and how they and their joints compare with the truth."""
+"""Scores of the parts found: how they moved, and how they and their joints compare with ground truth."""
 
 from typing import Any
 
@@ -16,8 +16,8 @@ from gsjax.metrics.parts import adjusted_rand_index, joint_error, match_parts
 from gsjax.metrics.tracking import relative_motion, score_tracks
 from gsjax.scene.handles import Blend
 
-_NAMED_IOU = 0.25  # least overlap with a true part for a part to get its name
-_BUT_OUTLIERS = (0.02, 0.98)  # quantiles between which a scene extends
+_NAMED_IOU = 0.25  # smallest overlap with a true part for a part to get its name
+_BUT_OUTLIERS = (0.02, 0.98)  # quantiles that bound a scene
 _AROUND = 0.05 * np.concatenate([np.eye(3), -np.eye(3)])  # metres, around an object without Gaussians
 _STILL_MM = 2.0  # a true part that moves less cannot be found by its motion, and counts as background
 
@@ -56,7 +56,7 @@ def part_rows(
 
 
 def warn_of_strays(rows: list[dict[str, Any]], scene: PartScene, notes: Notes) -> None:
-    """Warn of parts that move farther than the scene is wide: what they are is not known well enough.
+    """Warn of parts that move farther than the scene is wide: their motion is poorly determined.
 
     Args:
         rows: from `part_rows`.
@@ -82,13 +82,14 @@ def score_parts(
     blend: Blend,
     notes: Notes,
 ) -> dict[str, Any]:
-    """Scores of the scene; those of each part are added to its row. Empty if the recording has no truth.
+    """Scores of the scene; those of each part are added to its row. Empty if the recording has no ground
+    truth.
 
     Args:
         scene, trajectory: the parts, and their motion.
         joints: the joint fitted to each part's motion, by part.
         rows: from `part_rows`; each gets the scores of its part.
-        recording: with the truth.
+        recording: with the ground truth.
         anchor: the canonical frame.
         blend: how rotations of several parts are blended.
         notes: collects what was not scored.
@@ -111,7 +112,7 @@ def score_parts(
     poses = {int(label): truth.poses[:, k] for k, label in enumerate(truth.label_ids)}
     scores = score_tracks(_tracks(scene, trajectory, blend), labels, poses, anchor)
     means = np.asarray(scene.gaussians.means, np.float64)
-    # By its true position: an object without Gaussians moves all the same, and is missed.
+    # An object without Gaussians is judged by points around its true position: if it moves, it was missed.
     ways = {k: relative_motion(pose, anchor) for k, pose in poses.items()}
     around = {k: pose[anchor, :3, 3] + _AROUND for k, pose in poses.items()}
     far = {k: _farthest_mm(ways[k], means[labels == k] if k in labels else around[k]) for k in poses}
@@ -151,7 +152,7 @@ def _score_joint(
     points: Float[np.ndarray, "n 3"],
     anchor: int,
 ) -> None:
-    """Add the errors of a part's joint to its row, if there is a joint to compare with."""
+    """Add the errors of a part's joint to its row, if there is a true joint to compare it with."""
     if joint is not None and fitted.joint is not None:
         row |= joint_error(fitted.joint, joint, points.mean(0), anchor)._asdict()
         row["value"] = row["value_deg"] if joint.kind == "revolute" else row["value_mm"]
@@ -166,8 +167,8 @@ def _score_joints(
     anchor: int,
     notes: Notes,
 ) -> dict[str, Any]:
-    """Scores where nothing tells which Gaussians are truly of which part: each part is compared with the true
-    motion that moves it most alike, if the two differ by less than half of its way."""
+    """Scores where the true part of each Gaussian is unknown: each part, largest first, is matched with the
+    true motion most similar to its own, if the two differ by less than half of how far the part moved."""
     notes.add("Each part is compared with the true joint that moves it most alike; there are no masks.")
     means, labels = np.asarray(scene.gaussians.means, np.float64), np.asarray(scene.labels)
     motions = motions_in_world(scene, trajectory)

@@ -1,4 +1,4 @@
-"""The start of a discovery of parts: the anchor frame, motion, and the fit of the canonical scene."""
+"""The start of a discovery of parts: the anchor frame, what moves, and the candidate parts."""
 
 import jax
 import numpy as np
@@ -16,17 +16,17 @@ FIT = FitConfig(
     steps=3_000, cap=15_000, sh_degree=0, depth_weight=0.5, exposure=True, start=StartConfig(count=10_000)
 )
 """Default settings of the fit of the canonical scene."""
-_STANDS = 1e-3  # largest difference of the poses of a camera that stands still, metres or of a rotation
+_STANDS = 1e-3  # largest change of an entry of a static camera's pose: metres, or of the rotation matrix
 
 
 def has_two_states(tracked: Sequence) -> bool:
-    """Whether a recording shows two states, with depth, each by cameras of its own, and no motion between
-    them."""
+    """Whether a recording shows two states with depth, each seen by its own cameras, without the motion
+    between them."""
     return tracked.has_depth and _looks_from_elsewhere(tracked)
 
 
 def _looks_from_elsewhere(tracked: Sequence) -> bool:
-    """Whether there are two frames, and most of the cameras stand elsewhere in the second."""
+    """Whether there are exactly two frames, and most cameras have another pose in the second."""
     if tracked.num_frames != 2:
         return False
     apart = np.abs(tracked.viewmats[0] - tracked.viewmats[1]).max((-1, -2))
@@ -36,13 +36,13 @@ def _looks_from_elsewhere(tracked: Sequence) -> bool:
 def detect_motion(
     tracked: Sequence, config: PartsConfig, anchor: int | None
 ) -> tuple[Anchor, Bool[np.ndarray, "C F H W"] | None]:
-    """The anchor frame, and the pixels of its pictures that change in each of F other frames; None for two
-    states, which are compared in space.
+    """The anchor frame, and the pixels of its pictures that change in each of F other frames; for two states
+    None in place of the pixels, as they are compared in 3D.
 
     Args:
         tracked: the tracked cameras.
         config: settings of the discovery.
-        anchor: index of the frame (default: the one that differs most from the others; of two states, the
+        anchor: index of the frame (default: the one that differs most from the others; for two states, the
             first).
 
     Raises:
@@ -76,7 +76,7 @@ def discover(
     segmenter: Segmenter | None,
     masks: Int[np.ndarray, "C H W"] | None = None,
 ) -> Start:
-    """Candidate parts; of two states, the parts themselves and their motions.
+    """Candidate parts; for two states, the parts themselves and their motions.
 
     Args:
         tracked: the tracked cameras.

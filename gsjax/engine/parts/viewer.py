@@ -1,4 +1,4 @@
-"""A run of `gsjax parts` in the viewer: as a film that can be edited, as with `gsjax edit`."""
+"""A run of `gsjax parts` in the viewer, as a film that can be edited as with `gsjax edit`."""
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
@@ -42,7 +42,7 @@ class Filmed:
     shots: Shots | None
 
     def viewable(self, film: Film, editing: Editing | None = None) -> Viewable:
-        """A film to view. Gaussians that change come first; each frame is made when it is shown."""
+        """A film to view. Gaussians that change come first; each frame is computed when it is shown."""
         times = np.asarray(film[0].trajectory.times)
         moves = np.concatenate([_moves(layer) for layer in film])
         order = np.argsort(~moves, kind="stable")
@@ -62,7 +62,7 @@ class Filmed:
 
 
 def editing_of(saved: PartsRun, filmed: Filmed) -> Editing:
-    """The edits of a run in the viewer."""
+    """What the viewer needs for editing a run: the operations, parts and cameras, a preview, and saving."""
     cameras = camera_names(saved.recording)
     first = saved.camera(None)
     called = {part: name for name, part in {"background": BACKGROUND, **saved.names}.items()}
@@ -102,7 +102,7 @@ def script_of(lines: Sequence[str]) -> Script:
     """The edits that lines describe.
 
     Raises:
-        ValueError: one is invalid; the message names the edit by its number.
+        ValueError: a line is invalid; the message gives its number.
     """
     return Script(edits=tuple(parse_op(line, number) for number, line in enumerate(lines, 1)))
 
@@ -114,7 +114,7 @@ def camera_names(recording: Recording) -> dict[str, int]:
 
 
 def _moves(layer: Layer) -> Bool[np.ndarray, "n"]:
-    """The Gaussians of a layer that are not the same at all moments."""
+    """The Gaussians of a layer that change over time."""
     trajectory, parts = layer.trajectory, layer.scene.num_parts
     changes = np.zeros(parts, bool)
     for leaf in map(np.asarray, jax.tree.leaves((trajectory.poses, trajectory.opacities, trajectory.scales))):
@@ -123,7 +123,7 @@ def _moves(layer: Layer) -> Bool[np.ndarray, "n"]:
 
 
 def _labels(film: Film, names: Names) -> tuple[Int[np.ndarray, "n"], dict[int, str]]:
-    """Labels of all Gaussians of a film, and their names; parts of other runs follow those of the run."""
+    """Labels of all Gaussians of a film, and their names; parts of other runs follow those of this run."""
     known: dict[int, Any] = {part: name for name, part in names.items()}  # true names come last
     labels, behind = [], film[0].scene.num_parts
     for layer in film:
@@ -136,7 +136,7 @@ def _labels(film: Film, names: Names) -> tuple[Int[np.ndarray, "n"], dict[int, s
 
 
 def _at_times(shots: Shots, recorded: np.ndarray, times: np.ndarray) -> Shots:
-    """The photographs nearest to these times of the recording."""
+    """The photographs nearest in time to `times`."""
     rows = np.interp(times, recorded, np.arange(len(recorded))).round().astype(int)
     load = shots.load_image
     return Shots(

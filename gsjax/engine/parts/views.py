@@ -1,4 +1,4 @@
-"""Views of a scene with parts from each camera, frame by frame."""
+"""Renders of a scene with parts from each camera, frame by frame."""
 
 from collections.abc import Callable, Iterator
 from functools import cache, partial

@@ -1,4 +1,4 @@
-"""Outputs of encoders and segmenters, kept on disk under a hash of their inputs."""
+"""An on-disk cache of the outputs of encoders and segmenters, keyed by a hash of their inputs."""
 
 import hashlib
 import json
@@ -15,17 +15,17 @@ Arrays = Mapping[str, np.ndarray]
 
 
 def cache_folder() -> Path | None:
-    """The default folder of outputs; its content may be deleted. None for a user without a home."""
+    """The default folder of the cache; its contents may be deleted. None for a user without a home."""
     root = user_cache()
     return None if root is None else root / "features"
 
 
 class FeatureCache:
-    """Outputs kept in the user's cache folder, if there is one. A damaged one is computed again, and one that
-    cannot be written is not kept.
+    """Outputs kept in the user's cache folder, if there is one. Damaged outputs are computed again; outputs
+    that cannot be written are not kept.
 
     Attributes:
-        found, asked: number of outputs that were there, and of those that had to be computed.
+        found, asked: number of outputs found in the cache, and of those that had to be computed.
     """
 
     def __init__(self):
@@ -33,7 +33,7 @@ class FeatureCache:
         self.found = self.asked = 0
 
     def __call__(self, key: str, inputs: Arrays, compute: Callable[[], Arrays]) -> dict[str, np.ndarray]:
-        """An output for some inputs.
+        """The output for some inputs, from the cache or computed.
 
         Args:
             key: everything else that the output depends on: the encoder, its weights, its settings.
@@ -55,13 +55,13 @@ class FeatureCache:
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             write_npz(path, output)
-        except OSError:  # a full disk: then it is computed next time too
+        except OSError:  # such as a full disk; the output is computed again next time
             pass
         return output
 
 
 def folder_digest(folder: Path) -> str:
-    """SHA-256 over the names and contents of a folder's files, which identifies weights."""
+    """SHA-256 over the names and contents of the files in a folder; it identifies weights."""
     digest = hashlib.sha256()
     for file in sorted(entry for entry in folder.iterdir() if entry.is_file()):
         with open(file, "rb") as stream:

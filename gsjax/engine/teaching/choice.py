@@ -15,7 +15,7 @@ Second = Literal["none", "maskclip"]
 OneLevel = Level | Literal["default"]
 Levels = OneLevel | Literal["each"]
 NO_TEACHER = "none"
-"""The value of `features` by which nothing teaches, where a method can do without."""
+"""The value of `features` for no teacher, for methods that can do without."""
 OF_CLIP = ("clip", "maskclip")
 
 
@@ -39,11 +39,11 @@ class TeacherOptions(SamWeights, ClipWeights):
 
 @dataclass(frozen=True)
 class TeacherChoice(TeacherOptions):
-    """Which masks and features teach, with what `gsjax distill` alone offers."""
+    """Which masks and features teach, with the options that only `gsjax distill` has."""
 
     level: Levels = "default"
     """Size of objects in LangSplat's files, or of SAM's masks: large (things), medium (their parts), small
-    (the parts of these), or each: all three at once, and a query says on which it found what it found.
+    (the parts of these), or each: all three at once; a query then reports the level of what it found.
     default: as the files have it; of SAM's masks, the smallest."""
     second: Second = "none"
     """Second teacher beside --features clip, which gives one vector per mask: maskclip gives CLIP's vector of
@@ -54,7 +54,7 @@ class TeacherChoice(TeacherOptions):
 
     @property
     def levels(self) -> tuple[str, ...]:
-        """The levels of the features, one after another in their channels; none where there is one alone."""
+        """The levels whose features are concatenated along the channels; empty if there is only one."""
         return LEVELS if self.level == EACH else ()
 
     @property
@@ -63,13 +63,13 @@ class TeacherChoice(TeacherOptions):
         return self.features not in ("auto", NO_TEACHER, *KINDS)
 
     def located(self) -> dict[str, Any]:
-        """Its paths as they are found from any folder, by the options that name them."""
+        """Its paths in a form that is valid from any folder, by the options that name them."""
         paths = {"sam": self.sam, "weights": self.weights}
         found: dict[str, Any] = {name: path and Path(located(str(path))) for name, path in paths.items()}
         return found | ({"features": located(self.features)} if self.of_files else {})
 
     def check(self, *, optional: bool = False) -> None:
-        """Check the choice before anything takes time.
+        """Check the choice, before anything slow begins.
 
         Args:
             optional: whether the method can do without a teacher.

@@ -1,4 +1,4 @@
-"""The encoder of a field's features, which takes texts and pictures into the same space."""
+"""Where features come from, and the encoder that maps texts and pictures into the same space."""
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
@@ -19,7 +19,7 @@ ABOUT = {
     "files": "features from files",
 }
 GENERIC = ("object", "things", "stuff", "texture")
-"""Negatives of a text by default (Kerr et al. 2023, "LERF", section 3.4)."""
+"""Default negatives of a text (Kerr et al. 2023, "LERF", section 3.4)."""
 
 
 @dataclass(frozen=True)
@@ -28,9 +28,9 @@ class Source:
 
     Attributes:
         kind: the encoder; "files" for features of an unknown one.
-        names: names of the labels, where the features depend on them.
+        names: names of the labels, if the features depend on them.
         weights: folder of the encoder's weights, or of the feature files.
-        levels: levels of the features, whose channels follow one another; none where there is one alone.
+        levels: levels whose features are concatenated along the channels; empty if there is only one.
     """
 
     kind: Kind
@@ -43,7 +43,7 @@ class Source:
         """The inverse of `plain`.
 
         Raises:
-            KeyError, TypeError, ValueError: `stored` is not what `plain` makes.
+            KeyError, TypeError, ValueError: `stored` is not what `plain` returns.
         """
         names = {int(label): str(name) for label, name in stored["names"].items()}
         if stored["kind"] not in ABOUT:
@@ -51,7 +51,7 @@ class Source:
         return Source(stored["kind"], names, stored["weights"], tuple(map(str, stored.get("levels", ()))))
 
     def plain(self) -> dict[str, Any]:
-        """The source as JSON has it."""
+        """The source as values for JSON."""
         return asdict(self) | {"names": {str(label): name for label, name in self.names.items()}}
 
     def encoder(self, weights: Path | None = None) -> LanguageEncoder:
@@ -84,7 +84,7 @@ class Source:
             raise FileNotFoundError(f"{error}; give their folder with --weights") from error
 
     def hint(self, weights: Path | None = None) -> str:
-        """The queries that the encoder reads, in words.
+        """Describes the queries that the encoder understands.
 
         Args:
             weights: as for `encoder`.
@@ -98,7 +98,7 @@ class Source:
         return "Any words"
 
     def negatives(self, text: str) -> tuple[str, ...]:
-        """Negatives of a text by default: all other classes; with CLIP, words for nothing in particular."""
+        """Default negatives of a text: all other classes, none (closed vocabulary), or generic words."""
         if self.kind == "classes":
             return ClassCodebook(self.names).others(text)
         return () if self.kind == "closed" else GENERIC

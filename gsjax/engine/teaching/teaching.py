@@ -1,4 +1,4 @@
-"""The teacher of photographs, which frames of one camera are too: their masks, and features of these."""
+"""Teachers of photographs, or of the frames of one camera: their masks, and features of masks or pixels."""
 
 import warnings
 from collections.abc import Callable, Mapping, Sequence
@@ -25,9 +25,9 @@ from gsjax.perception.outlines import snap_outlines
 from gsjax.perception.segmenters import PieceSegmenter, PlaneOrRegionSegmenter
 
 _OF_OBJECTS = ("classes", "closed", "clip")
-_STRETCH = 0.02  # tolerance of the logarithm of the aspect ratio of a feature file's masks
+_STRETCH = 0.02  # tolerance of the log aspect ratio of the masks in a feature file
 _IN_FILES = "in the feature files"
-_VERSION = 2  # of cached outputs; those of other versions are computed again
+_VERSION = 2  # of cached outputs; outputs of other versions are computed again
 
 
 class _View(NamedTuple):
@@ -35,7 +35,7 @@ class _View(NamedTuple):
 
     Attributes:
         ids: index in `labels` of each pixel's label; -1 where unknown.
-        labels: the labels that occur, in ascending order; 0 is the background, which is a thing like others.
+        labels: the labels that occur, in ascending order; 0 is the background, which is a label like others.
     """
 
     ids: Int[np.ndarray, "h w"]
@@ -43,19 +43,19 @@ class _View(NamedTuple):
 
 
 _Objects = tuple[list[np.ndarray], list[np.ndarray], list[np.ndarray] | None]
-"""Of each photograph, the row of a vector for each pixel, -1 where unknown, these vectors, and, with levels,
-those that are filled from others (`Teacher.filled`)."""
+"""For each photograph: the row of each pixel's vector, -1 where unknown; the vectors; and, with levels, which
+levels of a pixel are filled from others (`Teacher.filled`)."""
 
 
 class Teaching:
-    """The teacher of a scene's photographs. The encoder and the names are settled by the photographs to learn
-    from, so that held-out photographs have features in the same terms.
+    """The teacher of a scene's photographs. The training photographs determine the encoder and the names, so
+    that the features of held-out photographs are comparable.
 
     Attributes:
         teacher: features of the training photographs, in their order.
         source: the source of these features.
         masks: source of the masks: "files", "segment", "sam", "in the feature files", or "none".
-        about: the features in words.
+        about: a description of the features.
     """
 
     def __init__(
@@ -82,7 +82,7 @@ class Teaching:
         self._photographs, self._indices = photographs, list(indices)
         self._choice, self._cache = choice, cache
         self._dimension: int | None = None  # of the features that teach, once they are known
-        # What may be missing comes first, and then what takes long.
+        # What may be missing is checked first; what takes long comes last.
         clip, weights = (None, "") if choice.weights is None else _clip(choice.weights)
         self._patches = _patches(clip) if "maskclip" in (choice.features, choice.second) else None
         reads = choice.masks != "segment" and choice.sam is None
@@ -101,7 +101,7 @@ class Teaching:
             choice.levels,
         )
         self.about = ABOUT[kind] + (", and its vectors of patches" if choice.second == "maskclip" else "")
-        # For an encoder labels are 1 to n, whatever their values; CLIP needs no names.
+        # Encoders are given labels renumbered from 1 to n; CLIP needs no names.
         self._named = () if kind == "clip" else tuple(names)
         named = {n: names[label] for n, label in enumerate(self._named, start=1)}
         self._encoder: Any = Source(kind, named).encoder() if kind in ("classes", "closed") else clip
@@ -111,7 +111,7 @@ class Teaching:
         self._dimension = self.teacher.dimension
 
     def of(self, i: int) -> Teacher | None:
-        """The teacher of one photograph, by its masks or else by its map; None where nothing is known.
+        """The teacher of one photograph, from its masks or its feature map; None if it has no features.
 
         Raises:
             ValueError, OSError: it cannot be read, or its file of features does not fit.
@@ -125,7 +125,7 @@ class Teaching:
         return teacher_of_objects([ids], [rows]) if known else None
 
     def digest(self) -> str:
-        """SHA-256 over the teacher and the poses: equal where two distillations learn the same."""
+        """SHA-256 over the teacher and the cameras: equal if two distillations learn from the same data."""
         teacher, photographs = self.teacher, self._photographs
         arrays = {f"ids {v}": ids for v, ids in enumerate(teacher.ids)}
         arrays |= {f"map {v}": one for v, one in enumerate(teacher.maps or ())}
@@ -140,7 +140,7 @@ class Teaching:
             return found
         if self.source.kind == "files":
             self.masks = _IN_FILES
-        with warnings.catch_warnings():  # named below
+        with warnings.catch_warnings():  # the warning below names the views
             warnings.filterwarnings("ignore", "views without any mask")
             teacher = teacher_of_objects(*found)
         if self._choice.second != "none":
@@ -184,14 +184,14 @@ class Teaching:
         return ids, rows, filled if self.source.levels else None
 
     def _views(self, indices: Sequence[int], console: Console) -> list[list[_View]] | None:
-        """Masks of photographs on each level; None where features have no need of them."""
+        """Masks of photographs on each level; None if the features do not need them."""
         if self.masks in ("none", _IN_FILES):
             return None
         return [self._levels(i) for i in track(indices, "masks", console=console, transient=True)]
 
     def _levels(self, i: int) -> list[_View]:
-        """Masks of a photograph: those of its file, or a segmenter's, of which SAM's may be on several
-        levels."""
+        """Masks of a photograph on each level: from its file, or from a segmenter, of which only SAM has
+        several levels."""
         photographs = self._photographs
         file = photographs.labels(i) if self.masks == "files" else None
         labels = np.full(photographs.sizes[i][::-1], UNKNOWN_ID) if file is None else file.astype(np.int64)
@@ -202,12 +202,12 @@ class Teaching:
             labels = found["labels"].astype(np.int64)
             if labels.ndim == 3 and (level := self._choice.level) not in ("default", EACH):
                 labels = labels_on_level(labels, level)
-            if self.masks == "sam" or depth is None:  # no background here: 0 is what lies in no mask
+            if self.masks == "sam" or depth is None:  # 0 is not the background, but what lies in no mask
                 labels = np.where(labels == 0, UNKNOWN_ID, labels)
         return [self._view(i, level) for level in labels.reshape(-1, *labels.shape[-2:])]
 
     def _view(self, i: int, labels: Int[np.ndarray, "h w"]) -> _View:
-        """The masks of labels, of pixels that count."""
+        """The masks of a label map, restricted to the pixels that count."""
         if self._choice.snap:
             labels = snap_outlines(labels, self._photographs.image(i), self._choice.snap)
         if (counted := self._photographs.mask(i)) is not None:
@@ -217,7 +217,7 @@ class Teaching:
         return _View((place.reshape(labels.shape) - unknown).astype(np.int32), there[unknown:])
 
     def _embedded(self, i: int, view: _View) -> Float[np.ndarray, "n d"]:
-        """The vectors of a photograph's labels; zeros for one that the encoder does not know."""
+        """The vectors of a photograph's labels; zeros for a label that the encoder does not know."""
         numbers = {label: n for n, label in enumerate(self._named, start=1)}
         of_labels = [numbers.setdefault(label, len(numbers) + 1) for label in view.labels.tolist()]
         image = self._photographs.image(i)
@@ -225,14 +225,14 @@ class Teaching:
         def embed() -> dict[str, np.ndarray]:
             shown = np.array([0, *of_labels])[view.ids + 1]
             rows = np.asarray(self._encoder.embed_objects(image, shown, max(1, len(numbers))), np.float32)
-            return {"rows": rows[np.array(of_labels or [1]) - 1]}  # zeros where there is no label
+            return {"rows": rows[np.array(of_labels or [1]) - 1]}  # one row of zeros without any label
 
         return self._cache(self._encoder_key, {"image": image, **view._asdict()}, embed)["rows"]
 
     def _of_patches(
         self, indices: Sequence[int], views: list[list[_View]] | None, console: Console
     ) -> Teacher:
-        """MaskCLIP's maps; masks, if any, define which pixels form one object."""
+        """A teacher of MaskCLIP's maps; masks, if any, define which pixels form one object."""
         encoder, maps = self._patches, []
         assert encoder is not None
         for i in track(indices, "patches", console=console, transient=True):
@@ -281,7 +281,7 @@ def teacher_for(photographs: Photographs, wanted: Teacher | TeacherChoice | str)
 
 
 def _settled(choice: TeacherChoice, files: bool, name: str) -> tuple[Any, str]:
-    """The kind of features and the source of masks, with "auto" settled by whether there are mask files."""
+    """The kind of features and the source of masks; "auto" is resolved by whether there are mask files."""
     if choice.masks == "files" and not files:
         raise ValueError(f"--masks files: {name} has none of these photographs; use --masks segment")
     masks = "sam" if choice.sam is not None else "files" if files else "segment"
@@ -309,7 +309,7 @@ def _clip(weights: Path) -> tuple[LanguageEncoder, str]:
 
 
 def _patches(clip: Any) -> Callable[[np.ndarray], np.ndarray]:
-    """MaskCLIP, by CLIP's weights."""
+    """MaskCLIP, with CLIP's weights."""
     from gsjax.perception.maskclip import MaskClipEncoder
 
     try:
@@ -319,8 +319,8 @@ def _patches(clip: Any) -> Callable[[np.ndarray], np.ndarray]:
 
 
 def _segmenter(choice: TeacherChoice, masks: str) -> tuple[Callable[..., np.ndarray] | None, str]:
-    """The segmenter, where one is needed, and what identifies it in the cache. Its labels are [H,W], or on
-    each level."""
+    """The segmenter, if one is needed, and what identifies it in the cache. Its labels are [H,W], or [L,H,W]
+    with levels."""
     if masks in ("files", "none"):
         return None, ""
     if choice.sam is None:
@@ -350,10 +350,10 @@ def _ids(views: list[list[_View]] | None) -> list[np.ndarray] | None:
 
 
 def _expect_shape(one: PictureFeatures, photographs: Photographs, i: int) -> None:
-    """Raises ValueError if a file belongs to a picture of another shape."""
+    """Raises ValueError if the aspect ratio of a file is not that of its photograph."""
     width, height = (int(side) for side in photographs.sizes[i])
     rows, columns = np.shape(one.ids if one.map is None else one.map)[:2]
-    # A grid of square patches leaves up to one of them at the far side of each axis.
+    # A grid of square patches may leave up to one patch uncovered at the far end of each axis.
     stretch = _STRETCH if one.map is None else np.log(1 + 1.5 / min(rows, columns))
     if abs(np.log((columns / rows) / (width / height))) > stretch:
         what, axes = ("masks", "[H,W]") if one.map is None else ("features", "[h,w,C]")
@@ -364,7 +364,7 @@ def _expect_shape(one: PictureFeatures, photographs: Photographs, i: int) -> Non
 
 
 def _as_large(masks: np.ndarray | None, photographs: Photographs, i: int) -> np.ndarray:
-    """What a file says of its pixels, as large as its photograph."""
+    """The masks of a feature file, resized to its photograph."""
     assert masks is not None
     width, height = (int(side) for side in photographs.sizes[i])
     if masks.shape[:2] == (height, width):
