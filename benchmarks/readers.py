@@ -14,7 +14,7 @@ import yaml
 from benchmarks.readers_of_data import CLOUDS, LAYOUTS, PICTURES, SCENES, Arrays, Reader, written
 from gsjax.data.text import decoded
 from gsjax.engine import locks
-from gsjax.engine.deform.file import read_beside, read_deformation, write_deformation
+from gsjax.engine.deform.file import read_deformation, read_metadata, write_deformation
 from gsjax.engine.distill.file import read_field
 from gsjax.engine.folder import SIGNATURE
 from gsjax.engine.locks import LOCK
@@ -111,7 +111,7 @@ def _deforming(root: Path) -> None:
 
 def _deformation(root: Path) -> Arrays:
     path = root / "deformation.npz"
-    result, beside = read_deformation(path), read_beside(path)
+    result, beside = read_deformation(path), read_metadata(path)
     return result.scene.gaussians.means, result.timeline.viewmats, beside.origin
 
 

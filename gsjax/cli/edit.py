@@ -15,7 +15,7 @@ from gsjax.engine.folder import SCRIPT, holds_something
 from gsjax.engine.locks import lock, releasing_locks
 from gsjax.engine.messages import Notes, counted, stage
 from gsjax.engine.options import Common, Overwriting
-from gsjax.engine.parts.films import VIDEO, Shot, edited, new_folder, telling_camera, write_film
+from gsjax.engine.parts.films import VIDEO, Shot, edited, most_changed_camera, new_folder, write_film
 from gsjax.engine.parts.results import example_edit, table_of_parts
 from gsjax.engine.parts.saved import open_parts_run
 from gsjax.engine.terminal import print_table
@@ -74,7 +74,7 @@ def run(options: Options) -> int:
         with stage(console, "editing"):
             film, doubts = edited(script, saved)
         with stage(console, "looking for the camera that sees most of the edits"):
-            camera = telling_camera(film, saved, script) if given is None else given
+            camera = most_changed_camera(film, saved, script) if given is None else given
         folder = _folder(options)
         for doubt in doubts:
             notes.warn(doubt)

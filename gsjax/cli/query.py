@@ -12,7 +12,7 @@ from jaxtyping import Float
 from rich.console import Console
 
 from gsjax.engine.distill.file import FOLDER
-from gsjax.engine.distill.saved import Whereabouts, field_of, open_field_run
+from gsjax.engine.distill.saved import Locations, field_of, open_field_run
 from gsjax.engine.folder import DEFORMATION, OF_QUERY, expect_folder, expect_ours, is_run
 from gsjax.engine.messages import Notes, describe, stage
 from gsjax.engine.options import Common, ObjectText
@@ -220,7 +220,7 @@ def _query_field(options: Options, path: Path, console: Console) -> None:
         raise ValueError("--point: expected --camera too, found none; name the photograph that it is in")
     with Notes(console) as notes:
         with stage(console, "reading the field"):
-            now = Whereabouts(options.field.scene, options.field.images, options.weights)
+            now = Locations(options.field.scene, options.field.images, options.weights)
             found = open_field_run(path, notes, now)
         over_time = None
         if found.file.with_name("trajectory.npz").is_file():
@@ -237,7 +237,7 @@ def _query_field(options: Options, path: Path, console: Console) -> None:
 
 def _query_deformation(options: Options, console: Console) -> None:
     """Query a scene that deforms, or label all of it."""
-    from gsjax.engine.deform.file import read_beside, read_deformation, warn_of_partial
+    from gsjax.engine.deform.file import read_deformation, read_metadata, warn_of_partial
     from gsjax.engine.deform.query import QueryableScene, label_everything
 
     begun, folder = perf_counter(), _folder(options)
@@ -257,7 +257,7 @@ def _query_deformation(options: Options, console: Console) -> None:
     with Notes(console) as notes:
         with stage(console, "reading the scene"):
             file = options.run / DEFORMATION
-            result, beside = read_deformation(file), read_beside(file)
+            result, beside = read_deformation(file), read_metadata(file)
         warn_of_partial(options.run, notes)
         scene = QueryableScene(options.run, result, options.weights, *beside)
         if ways:

@@ -11,7 +11,7 @@ import numpy as np
 import tyro
 from rich.console import Console
 
-from gsjax.engine.distill.saved import Whereabouts
+from gsjax.engine.distill.saved import Locations
 from gsjax.engine.messages import Notes, stage
 from gsjax.engine.options import Common
 from gsjax.engine.streams import say_error
@@ -62,7 +62,7 @@ def run(options: Options) -> int:
     console = Console(stderr=True, highlight=False)
     with Notes(console) as notes:
         with stage(console, f"reading {options.path}"):
-            now = Whereabouts(options.scene, options.images, options.weights)
+            now = Locations(options.scene, options.images, options.weights)
             scene, folder = open_viewable(options.path, notes, now)
         if options.up != "auto":
             scene = replace(scene, up=UP[options.up])

@@ -98,13 +98,13 @@ def open_field(path: str | os.PathLike, scene: str | os.PathLike | None = None) 
     """
     from rich.console import Console
 
-    from gsjax.engine.distill.saved import Whereabouts, field_of, open_field_run
+    from gsjax.engine.distill.saved import Locations, field_of, open_field_run
     from gsjax.engine.messages import Notes
 
     folder = field_of(Path(path))
     if folder is None:
         raise FileNotFoundError(f"{path}: expected a field (field.npz), found none; gsjax distill makes one")
-    notes, now = Notes(Console(quiet=True)), Whereabouts(None if scene is None else Path(scene))
+    notes, now = Notes(Console(quiet=True)), Locations(None if scene is None else Path(scene))
     found = open_field_run(folder, notes, now, photographs=False).stored
     for text in notes.warnings:
         warnings.warn(text, UserWarning, stacklevel=2)

@@ -12,12 +12,12 @@ from gsjax.data.ordered import open_as_sequence
 from gsjax.data.origin import relative_to_origin
 from gsjax.data.photographs import Photographs
 from gsjax.engine.asking import asking_of
-from gsjax.engine.deform.file import read_beside, read_deformation
+from gsjax.engine.deform.file import read_deformation, read_metadata
 from gsjax.engine.deform.query import QueryableScene, probabilities_of
 from gsjax.engine.distill.file import NAME
-from gsjax.engine.distill.over_time import OverTime, with_rows_of
+from gsjax.engine.distill.over_time import OverTime, if_same_size
 from gsjax.engine.distill.query import QueryableField
-from gsjax.engine.distill.saved import AS_IT_WAS, FieldRun, Whereabouts, field_of, open_field_run
+from gsjax.engine.distill.saved import UNMOVED, FieldRun, Locations, field_of, open_field_run
 from gsjax.engine.files import read_drawable, read_frames, reopen
 from gsjax.engine.folder import DEFORMATION, SCRIPT, expect_run, is_run
 from gsjax.engine.messages import Notes, describe
@@ -48,7 +48,7 @@ _AGAIN = "reconstruct it again with this version of gsjax"
 
 
 def open_viewable(
-    path: Path, notes: Notes, now: Whereabouts = AS_IT_WAS, *, photographs: bool = True
+    path: Path, notes: Notes, now: Locations = UNMOVED, *, photographs: bool = True
 ) -> tuple[Viewable, Path]:
     """The scene at a path, and the folder for screenshots.
 
@@ -127,14 +127,14 @@ def _of_files(path: Path, files: list[Path], notes: Notes) -> Viewable:
     )
 
 
-def _expect_only(used: tuple[str, ...], now: Whereabouts, because: str) -> None:
+def _expect_only(used: tuple[str, ...], now: Locations, because: str) -> None:
     """Raises a ValueError if a path is given that does not apply."""
     unused = [f.name for f in fields(now) if f.name not in used and getattr(now, f.name) is not None]
     if unused:
         raise ValueError(f"--{unused[0]}: {because}, to which it does not apply; leave it out")
 
 
-def _of_field(path: Path, notes: Notes, now: Whereabouts) -> Viewable:
+def _of_field(path: Path, notes: Notes, now: Locations) -> Viewable:
     """The scene of a field, with its photographs if they are still there."""
     run = open_field_run(path, notes, now)
     folder = path.absolute()
@@ -150,7 +150,7 @@ def _of_field(path: Path, notes: Notes, now: Whereabouts) -> Viewable:
     )
 
 
-def _field_of_run(path: Path, notes: Notes, now: Whereabouts, used: tuple[str, ...] = ()) -> FieldRun | None:
+def _field_of_run(path: Path, notes: Notes, now: Locations, used: tuple[str, ...] = ()) -> FieldRun | None:
     """The field of a run's scene, if it has one that can be queried; `used` are paths that the run uses."""
     folder = field_of(path)
     if folder is None:
@@ -168,7 +168,7 @@ def _field_of_run(path: Path, notes: Notes, now: Whereabouts, used: tuple[str, .
     return run
 
 
-def _of_fit(path: Path, notes: Notes, now: Whereabouts, shown: bool) -> Viewable:
+def _of_fit(path: Path, notes: Notes, now: Locations, shown: bool) -> Viewable:
     """The scene of a run of `gsjax fit`, with its field, and its photographs if they are still there."""
     field, config = _field_of_run(path, notes, now, used=("images",)), path / "config.yml"
     if field is None:
@@ -212,7 +212,7 @@ def _of_deformation(path: Path, notes: Notes, weights: Path | None, shown: bool)
     if weights is not None and kind in (None, "classes", "closed"):
         raise ValueError(f"--weights: {path} has no CLIP features; leave it out")
     first, labels, asking, times = result.at(0.0), None, None, result.timeline.times
-    origin, background = read_beside(path / DEFORMATION)
+    origin, background = read_metadata(path / DEFORMATION)
     if result.meaning is not None and first.features is not None:
         asking = asking_of(QueryableScene(path, result, weights, origin, background))
         likely = probabilities_of(first.features, jnp.asarray(result.meaning.codebook, jnp.float32))
@@ -232,7 +232,7 @@ def _of_deformation(path: Path, notes: Notes, weights: Path | None, shown: bool)
     )
 
 
-def _of_track(path: Path, notes: Notes, now: Whereabouts) -> Viewable:
+def _of_track(path: Path, notes: Notes, now: Locations) -> Viewable:
     """The scene of a run of `gsjax track` over time, with its cameras if the recording is still there; it can
     be queried if it has a field."""
     field, asking = _field_of_run(path, notes, now), None
@@ -249,7 +249,7 @@ def _of_track(path: Path, notes: Notes, now: Whereabouts) -> Viewable:
         origin = recording.origin
         shots, times = _shots_of_recording(saved.recording), recording.times[: tracking.num_frames]
     if field is not None:
-        over_time = with_rows_of(field, OverTime(tracking, origin, saved), notes)
+        over_time = if_same_size(field, OverTime(tracking, origin, saved), notes)
         asking = None if over_time is None else asking_of(QueryableField(field, over_time))
     count = tracking.scene.num_moving
     return Viewable(

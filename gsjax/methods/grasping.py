@@ -190,7 +190,7 @@ def score_grasp(
     sound = jnp.isfinite(pose).all()
     pose = jnp.where(sound, pose, jnp.eye(4, dtype=pose.dtype))
     axes = pose[:3, :3]
-    local = _into(pose, points)
+    local = _to_tool(pose, points)
     between = valid & _at_fingers(local, gripper)
     low = jnp.min(jnp.where(between, local[:, 1], jnp.inf))
     high = jnp.max(jnp.where(between, local[:, 1], -jnp.inf))
@@ -210,7 +210,7 @@ def score_grasp(
     pose = pose.at[:3, 3].add(middle * axes[:, 1])
     in_palm = _in_palm(local - jnp.array([0.0, 1.0, 0.0]) * middle, gripper) & valid
     obstacle_valid = obstacle_valid & jnp.isfinite(obstacles).all(axis=1)
-    obstacles = _into(pose, jnp.where(obstacle_valid[:, None], obstacles, 0.0))
+    obstacles = _to_tool(pose, jnp.where(obstacle_valid[:, None], obstacles, 0.0))
     blocked = (_in_fingers(obstacles, width, gripper) | _in_palm(obstacles, gripper)) & obstacle_valid
     feasible = sound & holds & (width <= gripper.max_width) & ~in_palm.any() & ~blocked.any()
     if approach is not None:
@@ -257,7 +257,7 @@ def _along(vectors: Float[Array, "n 3"], axis: Float[Array, "3"]) -> Float[Array
     return jnp.sum(vectors * axis, axis=-1)
 
 
-def _into(pose: Float[Array, "4 4"], points: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
+def _to_tool(pose: Float[Array, "4 4"], points: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
     """Points in the tool's frame."""
     shifted = points - pose[:3, 3]
     return jnp.stack([_along(shifted, pose[:3, i]) for i in range(3)], axis=-1)

@@ -76,11 +76,11 @@ def _shifted(pose: jaxlie.SE3, by: Float[Array, "3"]) -> jaxlie.SE3:
 
 def _leg(start: jaxlie.SE3, end: jaxlie.SE3, steps: int) -> Float[Array, "s 4 4"]:
     """Poses after `start`, up to and including `end`: linear in position, at a constant angular velocity."""
-    turn = (start.rotation().inverse() @ end.rotation()).log()
+    rotvec = (start.rotation().inverse() @ end.rotation()).log()
     move = end.translation() - start.translation()
 
     def at(share):
-        rotation = start.rotation() @ jaxlie.SO3.exp(share * turn)
+        rotation = start.rotation() @ jaxlie.SO3.exp(share * rotvec)
         translation = start.translation() + share * move
         return jaxlie.SE3.from_rotation_and_translation(rotation, translation).as_matrix()
 

@@ -4,7 +4,7 @@ from itertools import pairwise
 
 import pytest
 
-from gsjax.engine.fit.costs import affordable, last_shrink, step_seconds
+from gsjax.engine.fit.costs import final_shrink, settings_within, step_seconds
 from gsjax.methods.fit import FitConfig
 
 MINUTES = (0.2, 1, 2, 5, 15, 60, 600, 10_000)
@@ -12,7 +12,7 @@ MINUTES = (0.2, 1, 2, 5, 15, 60, 600, 10_000)
 
 @pytest.mark.parametrize("size", [(270, 480), (1600, 900)])
 def test_more_minutes_buy_more_gaussians_of_higher_degrees(size):
-    found = [affordable(FitConfig(), size, minutes) for minutes in MINUTES]
+    found = [settings_within(FitConfig(), size, minutes) for minutes in MINUTES]
     for (config, steps), (more, later) in pairwise(found):
         assert config.cap <= more.cap
         assert config.sh_degree <= more.sh_degree
@@ -23,7 +23,7 @@ def test_more_minutes_buy_more_gaussians_of_higher_degrees(size):
 
 @pytest.mark.parametrize("minutes", MINUTES)
 def test_slots_follow_from_steps_and_a_degree_is_unlocked_in_the_first_half(minutes):
-    config, steps = affordable(FitConfig(), (270, 480), minutes)
+    config, steps = settings_within(FitConfig(), (270, 480), minutes)
     assert config.cap == 5_000 or config.cap <= 20 * steps
     assert config.start.count <= min(config.cap, FitConfig().start.count)
     assert config.sh_degree * config.sh_every <= steps / 2
@@ -32,8 +32,8 @@ def test_slots_follow_from_steps_and_a_degree_is_unlocked_in_the_first_half(minu
 def test_the_last_size_leaves_time_for_its_steps():
     config, size = FitConfig(), (1600, 900)
     for seconds in (10.0, 100.0, 1000.0, 1e5):
-        factor = last_shrink(config, size, seconds)
+        factor = final_shrink(config, size, seconds)
         pixels = size[0] * size[1] / factor**2
         fits = 150 * step_seconds(pixels, config.start.count) <= seconds / 5
         assert fits or 900 / factor < 8 * 32
-    assert last_shrink(config, size, 1e5) == 1
+    assert final_shrink(config, size, 1e5) == 1

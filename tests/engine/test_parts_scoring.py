@@ -8,7 +8,7 @@ import pytest
 from rich.console import Console
 
 from gsjax.engine.messages import Notes
-from gsjax.engine.parts.scoring import warn_of_strays
+from gsjax.engine.parts.scoring import warn_of_runaways
 from gsjax.methods.parts import PartScene
 from gsjax.scene.initialize import gaussians_from_points
 
@@ -25,6 +25,6 @@ def test_a_part_that_moves_farther_than_the_scene_is_wide_is_warned_of(moved_mm)
         {"part": 2, "gaussians": 38, "moved_mm": moved_mm},
     ]
     with Notes(Console(file=io.StringIO())) as notes:
-        warn_of_strays(rows, scene, notes)
+        warn_of_runaways(rows, scene, notes)
         assert len(notes.all) == (moved_mm > 2000)
         assert all("2 (38 Gaussians)" in one for one in notes.all)

@@ -113,7 +113,7 @@ def compare(records: Sequence[Record], same_views: Callable[[list[Record], str],
             words = "was stopped" if record.metrics else "is still going on, or was killed"
             notes.append(f"{label} {words}: it is shown, and not among the best.")
     if kind == "fit":
-        notes += _what_eval_adds(labelled)
+        notes += _missing_scores(labelled)
     ordered = {label: labelled[label] for group in groups.values() for label in group.labels}
     options = _differing(ordered, notes)
     return Comparison(kind, ordered, scores, list(groups.values()), options, notes)
@@ -235,7 +235,7 @@ def _comparable_fits(members: Mapping[str, Record], views: list[str], notes: lis
     return keys
 
 
-def _what_eval_adds(records: Mapping[str, Record]) -> list[str]:
+def _missing_scores(records: Mapping[str, Record]) -> list[str]:
     """Notes on the fits without MS-SSIM or LPIPS, and on how to get them."""
     judged = [label for label, record in records.items() if _held_out(record)]
     never = [label for label in judged if records[label].evaluation is None]

@@ -59,17 +59,17 @@ def with_depth(sequence: Sequence, wanted: Depth, plane: float, notes: Notes) ->
     if wanted == "data" or (wanted == "auto" and sequence.has_depth):
         return sequence, "data"
     if wanted == "stereo" or (wanted == "auto" and two):
-        return _of_two_eyes(sequence, notes)
+        return _from_stereo(sequence, notes)
     if wanted == "hull" or (wanted == "auto" and goes_around(sequence.viewmats[:, 0])):
         notes.add(
             "There is no depth: the scene starts as random points within its visual hull, which is what most "
             "frames show before the background. Its depth is learned from images alone, and is not scored."
         )
         return _without_depth(sequence), "hull"
-    return _of_a_plane(sequence, plane, notes)
+    return _from_plane(sequence, plane, notes)
 
 
-def _of_two_eyes(sequence: Sequence, notes: Notes) -> tuple[Sequence, DepthSource]:
+def _from_stereo(sequence: Sequence, notes: Notes) -> tuple[Sequence, DepthSource]:
     def load(t: int, c: int) -> np.ndarray | None:
         if c != 0:
             return None
@@ -98,7 +98,7 @@ def _of_two_eyes(sequence: Sequence, notes: Notes) -> tuple[Sequence, DepthSourc
     return replace(sequence, load_depth=load), "stereo"
 
 
-def _of_a_plane(sequence: Sequence, plane: float, notes: Notes) -> tuple[Sequence, DepthSource]:
+def _from_plane(sequence: Sequence, plane: float, notes: Notes) -> tuple[Sequence, DepthSource]:
     """The first camera alone, without depth; notes the distance of the plane."""
     notes.add(
         f"There is no depth: the scene starts on a plane {plane:g} in front of the first camera. Its depth "

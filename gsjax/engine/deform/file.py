@@ -37,7 +37,7 @@ def write_deformation(
     save_checkpoint(path, result, {name: value for name, value in beside.items() if value is not None})
 
 
-class Beside(NamedTuple):
+class Metadata(NamedTuple):
     """The metadata that `write_deformation` stores with a scene.
 
     Attributes:
@@ -49,7 +49,7 @@ class Beside(NamedTuple):
     background: tuple[float, ...] | None
 
 
-def read_beside(path: str | os.PathLike) -> Beside:
+def read_metadata(path: str | os.PathLike) -> Metadata:
     """The metadata of a scene that `write_deformation` wrote.
 
     Raises:
@@ -57,11 +57,11 @@ def read_beside(path: str | os.PathLike) -> Beside:
         ValueError: it is damaged.
     """
     stored = load_metadata(path)
-    found = {name: stored.get(name) for name in Beside._fields}
+    found = {name: stored.get(name) for name in Metadata._fields}
     origin, background = (
         None if value is None else as_numbers(Path(path), name, value, (3,)) for name, value in found.items()
     )
-    return Beside(origin, None if background is None else tuple(background.tolist()))
+    return Metadata(origin, None if background is None else tuple(background.tolist()))
 
 
 def read_deformation(path: str | os.PathLike) -> DeformResult:

@@ -16,7 +16,7 @@ NAME = "poses.npz"
 """Refined view matrices of all frames and cameras, in the folder of a run."""
 
 
-def as_refined(
+def with_refined_poses(
     folder: RunFolder, problem: Problem, scene: DeformingScene, data: DeformData, notes: Notes
 ) -> tuple[DeformData, dict[str, Any] | None]:
     """Returns the data with refined poses, which are also written, and the entry of metrics.json about them;

@@ -20,7 +20,7 @@ from gsjax.engine.budget import Budget, note_if_few
 from gsjax.engine.deform.data import Tools, deform_data
 from gsjax.engine.deform.depth import METRIC, Depth, DepthSource, shows_one_object, with_depth
 from gsjax.engine.deform.file import write_deformation
-from gsjax.engine.deform.poses import as_refined
+from gsjax.engine.deform.poses import with_refined_poses
 from gsjax.engine.deform.results import summarize
 from gsjax.engine.deform.scores import judge
 from gsjax.engine.drive import drive
@@ -46,8 +46,8 @@ from gsjax.methods.deform import PRESETS, Deform, DeformConfig
 from gsjax.methods.deform.method import PLAN
 from gsjax.methods.deform.update import LOSSES
 
-_HARDLY = 0.95  # of the error of a static scene: above it, motion was hardly learned
-_UNLIKE = 0.6  # IoU below which a warning is given
+_STATIC_SHARE = 0.95  # of the error of a static scene: above it, motion was hardly learned
+_LEAST_IOU = 0.6  # IoU below which a warning is given
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -135,7 +135,7 @@ def run(options: Options, by_preset: Callable[[str], Options]) -> int:
         schedule = Schedule("reconstructing", method.total(problem), row, _in_words)
         watch(ticks, progress, schedule, folder, console, budget=budget)
         run, result = ticks.run, ticks.result
-        data, refined = as_refined(folder, problem, run.params, data, notes)
+        data, refined = with_refined_poses(folder, problem, run.params, data, notes)
         write_deformation(folder.path / DEFORMATION, result, sequence.origin, sequence.background)
         write_scene(folder.scene, jax.device_get(result.at(0.0)), origin=sequence.origin)
         with stage(console, "scoring held-out frames"):
@@ -171,7 +171,7 @@ def _warn_of_oddities(progress: Progress, judged: Mapping[str, Any], notes: Note
     if progress.stopped is not None:
         return
     tracks = judged["tracks"]
-    if tracks is not None and tracks["median_mm"] > _HARDLY * tracks["still_median_mm"]:
+    if tracks is not None and tracks["median_mm"] > _STATIC_SHARE * tracks["still_median_mm"]:
         off, still = tracks["median_mm"], tracks["still_median_mm"]
         how = "worse" if off > still else "hardly better"
         went_wrong = progress.skipped or progress.returns
@@ -179,7 +179,7 @@ def _warn_of_oddities(progress: Progress, judged: Mapping[str, Any], notes: Note
         notes.warn(
             f"tracks are {how} than those of a static scene (median {off:.3g} and {still:.3g} mm); try {do}"
         )
-    unlike = [f"{one['class']} {one['iou']:.2f}" for one in judged["classes"] if one["iou"] < _UNLIKE]
+    unlike = [f"{one['class']} {one['iou']:.2f}" for one in judged["classes"] if one["iou"] < _LEAST_IOU]
     if unlike:
         notes.warn(
             f"rendered classes hardly overlap the recorded ones (IoU): {', '.join(unlike)}; more steps?"

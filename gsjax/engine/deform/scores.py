@@ -318,7 +318,7 @@ def track_errors(
     truth, count = data.sequence.truth, data.sequence.num_frames
     if truth is None or truth.tracks is None or count < 2:
         return None
-    seen = _seen(truth.tracks[0], data.frame(0, 0, tools))
+    seen = _visible(truth.tracks[0], data.frame(0, 0, tools))
     start = truth.tracks[0][seen]
     if not len(start):
         return None
@@ -337,7 +337,7 @@ def track_errors(
     }
 
 
-def _seen(points: Float[np.ndarray, "n 3"], frame: Frame) -> Bool[np.ndarray, "n"]:
+def _visible(points: Float[np.ndarray, "n 3"], frame: Frame) -> Bool[np.ndarray, "n"]:
     """Which points a frame sees, by its depth and mask."""
     camera = frame.cameras
     column, row, z, inside = pixels_of(points, camera.viewmat[0], camera.K[0], camera.width, camera.height)

@@ -27,7 +27,7 @@ from gsjax.scene.frame import Frame
 GROUPS = 8
 """The largest number of groups into which features without names are clustered."""
 _SAMPLE = 2000  # vectors, at most, that are clustered, because all pairs are compared
-_ALIKE = 0.98  # cosine above which directions belong to one group
+_SAME_GROUP = 0.98  # cosine above which directions belong to one group
 
 
 class Labels(NamedTuple):
@@ -188,12 +188,12 @@ def groups_of(
     group = np.ones(len(codes), int)
     if len(codes) > 1:
         tree = ward(directions)
-        alike = np.sqrt(2 - 2 * _ALIKE)  # cost of merging two directions that are just alike
+        alike = np.sqrt(2 - 2 * _SAME_GROUP)  # cost of merging two directions that are just alike
         last = tree[: -GROUPS - 1 : -1, 2][: GROUPS - 1]  # costs of the last merges, the last first
         costs = np.maximum(np.append(last, alike), alike)
         count = 2 + int(np.argmax(costs[:-1] / costs[1:])) if len(costs) > 1 else 1
         group = fcluster(tree, count, "maxclust")
-        while count > 1 and _closest(_means(directions, weights, group)) > _ALIKE:
+        while count > 1 and _max_cosine(_means(directions, weights, group)) > _SAME_GROUP:
             count -= 1
             group = fcluster(tree, count, "maxclust")
     heavy = [weights[group == kind].sum() for kind in np.unique(group)]
@@ -207,7 +207,7 @@ def _means(
     return np.stack([np.average(vectors[some], axis=0, weights=weights[some]) for some in kinds])
 
 
-def _closest(vectors: Float[np.ndarray, "k c"]) -> float:
+def _max_cosine(vectors: Float[np.ndarray, "k c"]) -> float:
     """The largest cosine between two of the vectors."""
     directions = vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-12)
     return float((directions @ directions.T - 2 * np.eye(len(vectors))).max())

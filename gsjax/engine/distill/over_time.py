@@ -150,10 +150,10 @@ def over_time_of(run: FieldRun, notes: Notes) -> OverTime | None:
     except (ValueError, OSError) as error:
         notes.warn(f"what is found is not followed over time: {describe(error)}")
         return None
-    return with_rows_of(run, OverTime(tracking, origin, saved), notes)
+    return if_same_size(run, OverTime(tracking, origin, saved), notes)
 
 
-def with_rows_of(run: FieldRun, over_time: OverTime, notes: Notes) -> OverTime | None:
+def if_same_size(run: FieldRun, over_time: OverTime, notes: Notes) -> OverTime | None:
     """The tracked run if it has as many Gaussians as the field's scene; else None, with a warning.
 
     Args:

@@ -156,19 +156,19 @@ class QueryableField(Queryable):
         selected, scores = found.selected, found.scores
         drawer = Drawer(antialiased=run.rasterize_mode == "antialiased", compiler_options=host_options())
         names, pixels = short_names(photographs.names), {}
-        low, high = _ends(scores)
+        low, high = _score_range(scores)
         shares = np.clip((np.nan_to_num(scores) - low) / max(high - low, 1e-6), 0, 1)
         values = _with_shares(run.gaussians, selected, shares)
         best: tuple[float, int, np.ndarray] | None = None
         for v in track(which, "drawing", console=console, transient=True):
-            drawn = drawer(values, _one(photographs.camera(v))).colors
+            drawn = drawer(values, _batched(photographs.camera(v))).colors
             mask = drawn[..., 0] > MOST
             pixels[names[v]] = write_mask(folder, names[v], mask)
             if best is None or mask.mean() > best[0]:
                 best = (float(mask.mean()), v, drawn)
         assert best is not None
         _, v, drawn = best
-        camera, there = _one(photographs.camera(v)), jnp.asarray(selected)
+        camera, there = _batched(photographs.camera(v)), jnp.asarray(selected)
         shown = {"the object alone": hidden(run.gaussians, ~there)}
         if not selected.all():
             shown["without it"] = hidden(run.gaussians, there)
@@ -268,12 +268,12 @@ def _index(photographs: Photographs, camera: str) -> int:
     raise ValueError(f"--camera: expected one of {shortened(names, 12)}, found {camera}")
 
 
-def _one(camera: Camera) -> Camera:
+def _batched(camera: Camera) -> Camera:
     """A batch of one."""
     return jax.tree.map(lambda a: a[None], camera)
 
 
-def _ends(scores: Float[np.ndarray, "n"]) -> tuple[float, float]:
+def _score_range(scores: Float[np.ndarray, "n"]) -> tuple[float, float]:
     """The smallest and largest score, without a few outliers at the lower end."""
     scores = np.nan_to_num(scores)
     return float(np.percentile(scores, 1)), float(scores.max())

@@ -28,7 +28,7 @@ _OF_IMAGES = ("images", "scale", "frames", "cameras", "eval_cameras", "test_ever
 
 
 @dataclass(frozen=True)
-class Whereabouts:
+class Locations:
     """Current locations of a field's scene, photographs and encoder (default: where they were).
 
     Attributes:
@@ -42,7 +42,7 @@ class Whereabouts:
     weights: Path | None = None
 
 
-AS_IT_WAS = Whereabouts()
+UNMOVED = Locations()
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,7 +99,7 @@ def field_of(path: Path) -> Path | None:
 
 
 def open_field_run(
-    folder: Path, notes: Notes, now: Whereabouts = AS_IT_WAS, *, photographs: bool = True
+    folder: Path, notes: Notes, now: Locations = UNMOVED, *, photographs: bool = True
 ) -> FieldRun:
     """Read a field and its scene.
 

@@ -46,9 +46,9 @@ def ablate(
     order = np.argsort(-light, kind="stable")
     for name, divisor in _SHARES.items():
         kept = -(-count // divisor)
-        found.append(row(name, _emptied(gaussians, order[kept:]), kept, degree))
+        found.append(row(name, _without_rows(gaussians, order[kept:]), kept, degree))
     for less in reversed(range(degree)):
-        found.append(row(f"colours of degree {less}", _plainer(gaussians, less), count, less))
+        found.append(row(f"colours of degree {less}", _lower_degree(gaussians, less), count, less))
     return found + ablate_time(rows)
 
 
@@ -64,14 +64,14 @@ def ablate_time(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     return found
 
 
-def _emptied(gaussians: Gaussians, rows: np.ndarray) -> Gaussians:
+def _without_rows(gaussians: Gaussians, rows: np.ndarray) -> Gaussians:
     """The scene without some rows; their slots stay, so that one compiled program renders all parts."""
     logits = np.array(gaussians.logit_opacities)
     logits[rows] = EMPTY_LOGIT
     return eqx.tree_at(lambda g: g.logit_opacities, gaussians, jax.device_put(logits))
 
 
-def _plainer(gaussians: Gaussians, degree: int) -> Gaussians:
+def _lower_degree(gaussians: Gaussians, degree: int) -> Gaussians:
     """The scene with spherical harmonics of a lower degree."""
     shN = np.array(gaussians.shN)
     shN[:, (degree + 1) ** 2 - 1 :] = 0

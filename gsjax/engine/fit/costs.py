@@ -10,11 +10,11 @@ LEAST_STEPS = 150
 _STEP_S = (0.01, 2.5e-7, 7.5e-7)  # of a step, plus per pixel and per slot; two cores of an AMD EPYC
 _STEPS = 0.6  # share of the minutes for steps: not reading, matching, compiling, scores and the report
 _LEAST_SIDE = 32  # pixels
-_SLOTS_A_STEP = 20  # docs/choosing.md
+_SLOTS_PER_STEP = 20  # docs/choosing.md
 _LEAST_SLOTS, _MOST_SLOTS = 5_000, 1_000_000
 
 
-def affordable(config: FitConfig, size: tuple[int, int], minutes: float) -> tuple[FitConfig, int]:
+def settings_within(config: FitConfig, size: tuple[int, int], minutes: float) -> tuple[FitConfig, int]:
     """Returns the settings with the number of slots for Gaussians and the SH degree that pay off in these
     minutes, and the number of steps to expect.
 
@@ -28,8 +28,8 @@ def affordable(config: FitConfig, size: tuple[int, int], minutes: float) -> tupl
     """
     slots, steps = next(
         (slots, steps)
-        for slots in _fewer_and_fewer(_MOST_SLOTS)
-        if (steps := _steps_within(60 * minutes * _STEPS, config, size, slots)) * _SLOTS_A_STEP >= slots
+        for slots in _slot_counts(_MOST_SLOTS)
+        if (steps := _steps_within(60 * minutes * _STEPS, config, size, slots)) * _SLOTS_PER_STEP >= slots
         or slots == _LEAST_SLOTS
     )
     start = replace(config.start, count=min(config.start.count, slots))
@@ -37,7 +37,7 @@ def affordable(config: FitConfig, size: tuple[int, int], minutes: float) -> tupl
     return replace(config, cap=slots, sh_degree=degree, start=start), steps
 
 
-def last_shrink(config: FitConfig, size: tuple[int, int], seconds: float) -> int:
+def final_shrink(config: FitConfig, size: tuple[int, int], seconds: float) -> int:
     """The factor by which photographs are downscaled at the end of a fit: the smallest with which a fifth of
     the time should suffice for 150 steps.
 
@@ -65,13 +65,13 @@ def step_seconds(pixels: float, slots: int) -> float:
 
 def _steps_within(seconds: float, config: FitConfig, size: tuple[int, int], slots: int) -> int:
     """The number of steps of a fit that begins with smaller photographs."""
-    last, coarse = last_shrink(config, size, seconds), config.coarse_until
+    last, coarse = final_shrink(config, size, seconds), config.coarse_until
     pixels = size[0] * size[1] / last**2
     stages = ((coarse / 3, 16), (2 * coarse / 3, 4), (1 - coarse, 1))
     return int(seconds * sum(share / step_seconds(pixels / fewer, slots) for share, fewer in stages))
 
 
-def _fewer_and_fewer(slots: float) -> Iterator[int]:
+def _slot_counts(slots: float) -> Iterator[int]:
     while slots > _LEAST_SLOTS:
         yield int(float(f"{slots:.2g}"))
         slots /= 1.25

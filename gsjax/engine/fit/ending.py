@@ -22,12 +22,12 @@ from gsjax.scene.frame import Frame
 from gsjax.scene.gaussians import Gaussians
 
 T = TypeVar("T")
-JUDGED_AT_MOST = 4
+MAX_JUDGED = 4
 """Most held-out views that are evaluated during the fit."""
 _COMPILING_S, _SCORING_S = 6.0, 1.5  # before the first view
-_A_PIXEL_S = 1e-6  # for SSIM and a picture, beside rendering
+_PIXEL_S = 1e-6  # for SSIM and a picture, beside rendering
 _SLACK = 1.1
-_A_PRUNING = 3.0  # times that of rendering a view, as gradients are computed
+_PRUNING_VIEWS = 3.0  # times that of rendering a view, as gradients are computed
 _ABLATING = "ablating parts of the scene"
 _PARTS = 8  # of a scene, at most
 
@@ -65,9 +65,9 @@ class Ending:
             view = 0.5 / pace
         pixels = sum(frame.cameras.width * frame.cameras.height for _, frame in self.judged)
         return {
-            "pruning": _COMPILING_S + _A_PRUNING * view * len(self.fitted),
-            "scores": _SCORING_S + view * max(1, len(self.judged)) + _A_PIXEL_S * pixels,
-            "parts": _PARTS * view * len(some_of(self.judged)),
+            "pruning": _COMPILING_S + _PRUNING_VIEWS * view * len(self.fitted),
+            "scores": _SCORING_S + view * max(1, len(self.judged)) + _PIXEL_S * pixels,
+            "parts": _PARTS * view * len(judged_subset(self.judged)),
             "video": _COMPILING_S + view * FRAMES,
         }
 
@@ -75,7 +75,7 @@ class Ending:
         """Seconds to keep for the report and for the stages that fit into `most`, most valuable first."""
         kept, expected = REPORT_S, self.expected_s()
         if np.isfinite(self.judge.view_s):  # the last steps are evaluated too
-            kept += self.judge.view_s * len(some_of(self.judged))
+            kept += self.judge.view_s * len(judged_subset(self.judged))
         certain = kept
         for name in ("scores", "pruning", "parts", "video"):
             if _SLACK * (kept + expected[name]) > most:
@@ -117,7 +117,7 @@ class Ending:
             self._left_out.append(_ABLATING)
         if not self.judged or light is None or not len(light):
             return []
-        work = partial(ablate, gaussians, light, some_of(self.judged), self.progress.rows, self.judge)
+        work = partial(ablate, gaussians, light, judged_subset(self.judged), self.progress.rows, self.judge)
         return self._if_time("parts", _ABLATING, work, [])
 
     def filmed(
@@ -153,6 +153,6 @@ class Ending:
         return found
 
 
-def some_of(judged: Sequence[tuple[str, Frame]]) -> Sequence[tuple[str, Frame]]:
+def judged_subset(judged: Sequence[tuple[str, Frame]]) -> Sequence[tuple[str, Frame]]:
     """The held-out views that are evaluated during the fit; at its end, all of them are."""
-    return judged[:: max(1, len(judged) // JUDGED_AT_MOST)][:JUDGED_AT_MOST]
+    return judged[:: max(1, len(judged) // MAX_JUDGED)][:MAX_JUDGED]

@@ -14,8 +14,8 @@ from gsjax.engine.budget import Budget
 from gsjax.engine.drive import Drive, drive
 from gsjax.engine.ending import ended, exit_code, finish
 from gsjax.engine.files import write_scene
-from gsjax.engine.fit.costs import affordable
-from gsjax.engine.fit.ending import Ending, some_of
+from gsjax.engine.fit.costs import settings_within
+from gsjax.engine.fit.ending import Ending, judged_subset
 from gsjax.engine.fit.judge import Judge
 from gsjax.engine.fit.results import summarize
 from gsjax.engine.fit.schedule import Evaluation, evaluated, schedule_of
@@ -150,7 +150,7 @@ def run(options: Options) -> int:
             "photographs": {
                 "fitted": len(chosen),
                 "held_out": len(held_out),
-                "looked_at": len(some_of(judged)),
+                "looked_at": len(judged_subset(judged)),
             },
             "size": photographs.sizes.max(0),
             "start": problem.start,
@@ -185,7 +185,7 @@ def _affordable(
     config: FitConfig, size: tuple[int, int], minutes: float, notes: Notes, console: Console
 ) -> FitConfig:
     """The settings that pay off in these minutes, which are also printed and noted."""
-    found, steps = affordable(config, size, minutes)
+    found, steps = settings_within(config, size, minutes)
     words = (
         f"up to {found.cap:,} Gaussians with colours of degree {found.sh_degree}, as there should be time "
         f"for {steps:,} steps"
@@ -230,7 +230,9 @@ def _fitted(
         ending.console,
         budget=budget,
         save_every=options.save_every,
-        evaluate=Evaluation(judge, some_of(judged), options.judge_every, steps, goal is not None, budget),
+        evaluate=Evaluation(
+            judge, judged_subset(judged), options.judge_every, steps, goal is not None, budget
+        ),
         enough=lambda now, row: row["test_psnr"] is not None and is_met(now.run),
         listeners=() if board is None else (board.add,),
     )

@@ -14,7 +14,7 @@ from gsjax.engine.progress import Progress, Schedule
 
 _LOGGED_EVERY = 100  # steps
 _EXTRA = 10  # evaluations under --minutes, besides those of --judge-every
-_JUDGING = 0.05  # largest share of the time for evaluations under --minutes
+_EVAL_SHARE = 0.05  # largest share of the time for evaluations under --minutes
 
 
 def schedule_of(steps: int, shrink: Callable[[float], int], progress: Progress) -> Schedule:
@@ -76,7 +76,7 @@ class Evaluation:
         """The scores for the row of a step; None if nothing is evaluated after it."""
         begun, tenths = perf_counter(), int(_EXTRA * self.budget.share)
         regular, extra = now.step % self.every == 0, tenths > self._tenths
-        costly = self.budget.minutes is not None and self._seconds > _JUDGING * self.budget.used
+        costly = self.budget.minutes is not None and self._seconds > _EVAL_SHARE * self.budget.used
         due = (regular and self.awaited) or ((regular or extra) and not costly)
         self._tenths = tenths
         if not due and not self.budget.is_over and now.step < self.steps:

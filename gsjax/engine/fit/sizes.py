@@ -3,13 +3,13 @@
 from rich.console import Console
 
 from gsjax.engine.budget import Budget
-from gsjax.engine.fit.costs import LEAST_STEPS, last_shrink
+from gsjax.engine.fit.costs import LEAST_STEPS, final_shrink
 from gsjax.engine.messages import Notes
 from gsjax.engine.progress import Progress
 from gsjax.methods.fit import FitConfig
 
 _COMPILING_S = 5.0
-_DEARER = 3.5  # cost of a step on photographs of twice the width and height; docs/choosing.md
+_COST_RATIO = 3.5  # cost of a step on photographs of twice the width and height; docs/choosing.md
 
 
 class Sizes:
@@ -56,7 +56,7 @@ class Sizes:
         if self._now > 1 and self._times and progress >= self._times[0] and (pace := self._progress.pace):
             self._times.pop(0)
             last = not self._times
-            left = int((self._budget.steps_s - _COMPILING_S) * pace / _DEARER)
+            left = int((self._budget.steps_s - _COMPILING_S) * pace / _COST_RATIO)
             if left >= LEAST_STEPS:
                 self._now //= 2
                 self._progress.pace = 0.0  # unknown at the new size
@@ -68,7 +68,7 @@ class Sizes:
         """The initial factor: four times that of the largest size for which there should be time."""
         if not self._times:
             return 1
-        return 4 * last_shrink(self._config, self._size, self._budget.steps_s)
+        return 4 * final_shrink(self._config, self._size, self._budget.steps_s)
 
     def _say(self, left: int) -> None:
         width, height = self._size

@@ -83,12 +83,12 @@ def edited(script: Script, saved: PartsRun) -> tuple[Film, list[str]]:
     beyond = describe_beyond(_beyond(recorded, now), now.times, saved.names)
     if beyond:  # as one warning: two that differ only in numbers would be taken for repetitions
         doubts.append(". ".join(beyond))
-    if idle := _idle(script, film, saved, known):
+    if idle := _without_effect(script, film, saved, known):
         doubts.append(f"no visible effect: {', '.join(idle)}")
     return film, doubts
 
 
-def telling_camera(film: Film, saved: PartsRun, script: Script) -> int:
+def most_changed_camera(film: Film, saved: PartsRun, script: Script) -> int:
     """The id of the camera in which the film differs most from the unedited recording.
 
     Args:
@@ -96,7 +96,7 @@ def telling_camera(film: Film, saved: PartsRun, script: Script) -> int:
         saved: the run.
         script: the edits.
     """
-    plain = apply(replace(script, edits=(), length=_lasting(script, film, saved)), saved.layer, saved.names)
+    plain = apply(replace(script, edits=(), length=_length_of(script, film, saved)), saved.layer, saved.names)
     moments = _edited_moments(film, plain)
     if not len(moments):
         return saved.camera(None)
@@ -291,10 +291,10 @@ def _beyond(recorded: Layer, now: Trajectory) -> Beyond:
     return Beyond(*(np.asarray(values)[:length] for values in beyond_captured(recorded, longer)))
 
 
-def _idle(script: Script, film: Film, saved: PartsRun, known: LoadScene) -> list[str]:
+def _without_effect(script: Script, film: Film, saved: PartsRun, known: LoadScene) -> list[str]:
     """Labels of the edits without effect: removing one does not change the film, and adding it to the edits
     before it does not either, as with the second of two equal ones."""
-    length = _lasting(script, film, saved)
+    length = _length_of(script, film, saved)
 
     @cache
     def made(edits: tuple[Edit, ...]) -> Film | None:
@@ -315,7 +315,7 @@ def _idle(script: Script, film: Film, saved: PartsRun, known: LoadScene) -> list
     ]
 
 
-def _lasting(script: Script, film: Film, saved: PartsRun) -> float:
+def _length_of(script: Script, film: Film, saved: PartsRun) -> float:
     """The length, seconds, that makes a film with fewer edits as long as this one."""
     recorded = saved.layer.trajectory.times
     step = 1 / script.fps if script.fps else float(np.median(np.diff(recorded)))

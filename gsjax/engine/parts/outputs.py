@@ -13,7 +13,7 @@ from gsjax.engine.folder import RunFolder
 from gsjax.engine.machine import describe as describe_machine
 from gsjax.engine.messages import Notes, counted, reason
 from gsjax.engine.parts.loop import update_seconds
-from gsjax.engine.parts.scoring import part_rows, score_parts, warn_of_strays
+from gsjax.engine.parts.scoring import part_rows, score_parts, warn_of_runaways
 from gsjax.engine.parts.views import part_views
 from gsjax.engine.pictures import Film
 from gsjax.engine.progress import Progress
@@ -26,7 +26,7 @@ from gsjax.optim.method import Run
 from gsjax.scene.origin import in_world
 
 
-def finished(
+def write_outputs(
     folder: RunFolder,
     recording: Recording,
     start: Start,
@@ -70,7 +70,7 @@ def finished(
             progress.stopped = error if isinstance(error, KeyboardInterrupt) else None
     rows, against_truth = part_rows(scene, trajectory, joints), {}
     _note_absences(trajectory, found.done, notes)
-    warn_of_strays(rows, scene, notes)
+    warn_of_runaways(rows, scene, notes)
     for row in rows if origin is not None else ():
         row["point"] = None if row["point"] is None else in_world(np.array(row["point"]), origin).tolist()
     if complete:

@@ -21,7 +21,7 @@ from gsjax.engine.locks import releasing_locks
 from gsjax.engine.messages import Notes, counted, stage
 from gsjax.engine.options import RESUME_MAY_CHANGE, OfRecording, SamWeights, Seeded, checked
 from gsjax.engine.parts.loop import Loop
-from gsjax.engine.parts.outputs import finished
+from gsjax.engine.parts.outputs import write_outputs
 from gsjax.engine.parts.results import summarize
 from gsjax.engine.parts.start import FIT, detect_motion, discover
 from gsjax.engine.progress import Progress, load_run
@@ -41,7 +41,7 @@ from gsjax.perception.segmenters import PieceSegmenter
 from gsjax.scene.gaussians import Gaussians
 from gsjax.scene.origin import moved_to
 
-_EVERYTHING = 0.6  # fraction of pixels that change above which everything seems to move
+_MOST_MOVES = 0.6  # fraction of pixels that change above which everything seems to move
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -120,7 +120,7 @@ def run(options: Options) -> int:
             loop.refine()
         last = method.brought_up_to_date(problem, loop.run)
         outcome = method.result(problem, last)
-        found = finished(folder, recording, start, last, outcome, progress, seconds, notes, console)
+        found = write_outputs(folder, recording, start, last, outcome, progress, seconds, notes, console)
         found["seconds"]["total"] = perf_counter() - begun
         found["notes"] = notes.all
         finish(folder, found, summarize)
@@ -223,7 +223,7 @@ def _fit_options(options: Options, path: Path, anchor: Anchor, recording: Record
 def _warn_if_doubtful(start: Start, moved: float, options: Options, notes: Notes) -> None:
     """Warn if the parts are doubtful; `moved` is the fraction of pixels that change."""
     pieces = int(start.masks.max())
-    if moved > _EVERYTHING:
+    if moved > _MOST_MOVES:
         notes.warn(
             f"{moved:.0%} of the anchor's pixels change in other frames: everything moves, or the cameras "
             "do; the background is then poorly determined"

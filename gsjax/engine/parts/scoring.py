@@ -17,7 +17,7 @@ from gsjax.metrics.tracking import relative_motion, score_tracks
 from gsjax.scene.handles import Blend
 
 _NAMED_IOU = 0.25  # smallest overlap with a true part for a part to get its name
-_BUT_OUTLIERS = (0.02, 0.98)  # quantiles that bound a scene
+_QUANTILES = (0.02, 0.98)  # quantiles that bound a scene
 _AROUND = 0.05 * np.concatenate([np.eye(3), -np.eye(3)])  # metres, around an object without Gaussians
 _STILL_MM = 2.0  # a true part that moves less cannot be found by its motion, and counts as background
 
@@ -55,7 +55,7 @@ def part_rows(
     return rows
 
 
-def warn_of_strays(rows: list[dict[str, Any]], scene: PartScene, notes: Notes) -> None:
+def warn_of_runaways(rows: list[dict[str, Any]], scene: PartScene, notes: Notes) -> None:
     """Warn of parts that move farther than the scene is wide: their motion is poorly determined.
 
     Args:
@@ -64,7 +64,7 @@ def warn_of_strays(rows: list[dict[str, Any]], scene: PartScene, notes: Notes) -
         notes: receives the warning.
     """
     means = np.asarray(scene.gaussians.means, np.float64)
-    low, high = np.quantile(means[np.isfinite(means).all(axis=1)], _BUT_OUTLIERS, axis=0)
+    low, high = np.quantile(means[np.isfinite(means).all(axis=1)], _QUANTILES, axis=0)
     width = 1000 * float(np.linalg.norm(high - low))
     strays = [row for row in rows if row["moved_mm"] > width]
     if strays:

@@ -16,21 +16,21 @@ FIT = FitConfig(
     steps=3_000, cap=15_000, sh_degree=0, depth_weight=0.5, exposure=True, start=StartConfig(count=10_000)
 )
 """Default settings of the fit of the canonical scene."""
-_STANDS = 1e-3  # largest change of an entry of a static camera's pose: metres, or of the rotation matrix
+_POSE_TOL = 1e-3  # largest change of an entry of a static camera's pose: metres, or of the rotation matrix
 
 
 def has_two_states(tracked: Sequence) -> bool:
     """Whether a recording shows two states with depth, each seen by its own cameras, without the motion
     between them."""
-    return tracked.has_depth and _looks_from_elsewhere(tracked)
+    return tracked.has_depth and _cameras_moved(tracked)
 
 
-def _looks_from_elsewhere(tracked: Sequence) -> bool:
+def _cameras_moved(tracked: Sequence) -> bool:
     """Whether there are exactly two frames, and most cameras have another pose in the second."""
     if tracked.num_frames != 2:
         return False
     apart = np.abs(tracked.viewmats[0] - tracked.viewmats[1]).max((-1, -2))
-    return float(np.mean(apart > _STANDS)) > 0.5
+    return float(np.mean(apart > _POSE_TOL)) > 0.5
 
 
 def detect_motion(
@@ -53,7 +53,7 @@ def detect_motion(
         chosen = anchor or 0
         return Anchor(chosen, 1 - chosen, np.zeros(2)), None
     cameras, discover = tracked.num_cameras, config.discover
-    if discover.difference and _looks_from_elsewhere(tracked):
+    if discover.difference and _cameras_moved(tracked):
         raise ValueError(
             f"{tracked.name}: expected depth of two frames by cameras that stand elsewhere in each, found "
             "none; what moved between two states is searched for in space. Add depth of both, measured or by "

@@ -88,7 +88,7 @@ class Teaching:
         reads = choice.masks != "segment" and choice.sam is None
         reads &= choice.masks == "files" or choice.features in ("auto", *_OF_OBJECTS)
         files = reads and any(photographs.labels(i) is not None for i in indices)
-        kind, self.masks = _settled(choice, files, photographs.name)
+        kind, self.masks = _resolved(choice, files, photographs.name)
         self._segmenter, self._segmenter_key = _segmenter(choice, self.masks)
         views, names = self._views(indices, console), {}
         if views is not None and self.masks == "files" and kind in _OF_OBJECTS:
@@ -170,8 +170,8 @@ class Teaching:
                     f"{len(maps)} and masks with embeddings in {len(found) - len(maps)}"
                 )
             photographs, pairs = self._photographs, list(zip(found, indices, strict=True))
-            ids = [_as_large(one.ids, photographs, i) for one, i in pairs]
-            filled = [_as_large(one.filled, photographs, i) for one, i in pairs if one.filled is not None]
+            ids = [_resized(one.ids, photographs, i) for one, i in pairs]
+            filled = [_resized(one.filled, photographs, i) for one, i in pairs if one.filled is not None]
             rows = [one.codebook for one in found if one.codebook is not None]  # all, without maps
             return ids, rows, filled or None
         assert views is not None
@@ -280,7 +280,7 @@ def teacher_for(photographs: Photographs, wanted: Teacher | TeacherChoice | str)
     return teaching.teacher, teaching.source
 
 
-def _settled(choice: TeacherChoice, files: bool, name: str) -> tuple[Any, str]:
+def _resolved(choice: TeacherChoice, files: bool, name: str) -> tuple[Any, str]:
     """The kind of features and the source of masks; "auto" is resolved by whether there are mask files."""
     if choice.masks == "files" and not files:
         raise ValueError(f"--masks files: {name} has none of these photographs; use --masks segment")
@@ -363,7 +363,7 @@ def _expect_shape(one: PictureFeatures, photographs: Photographs, i: int) -> Non
         )
 
 
-def _as_large(masks: np.ndarray | None, photographs: Photographs, i: int) -> np.ndarray:
+def _resized(masks: np.ndarray | None, photographs: Photographs, i: int) -> np.ndarray:
     """The masks of a feature file, resized to its photograph."""
     assert masks is not None
     width, height = (int(side) for side in photographs.sizes[i])

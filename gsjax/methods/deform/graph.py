@@ -121,7 +121,7 @@ def frame_graphs(
         config: configuration of the graph.
         radius: radius of the scene, metres.
     """
-    labelled = [_labelled(*one, codebook) for one in zip(places, frames, ids, strict=True)]
+    labelled = [_features_at_nodes(*one, codebook) for one in zip(places, frames, ids, strict=True)]
     teacher, valid = (np.stack(column) for column in zip(*labelled, strict=True))
     times = times_of(frames)
     width = min(2 * config.window + 1, len(frames))
@@ -191,8 +191,8 @@ def seen_ids(
         inside = (z > 0) & (x >= 0) & (x < width) & (y >= 0) & (y < height)
         column, row = (jnp.where(inside, axis, 0).astype(jnp.int32) for axis in (x, y))
         seen = depth[row, column]
-        unhidden = (seen == 0) | (jnp.abs(seen - z) < _NEAR * seen)
-        return jnp.where(inside & unhidden, ids[row * high // height, column * wide // width], -1)
+        unoccluded = (seen == 0) | (jnp.abs(seen - z) < _NEAR * seen)
+        return jnp.where(inside & unoccluded, ids[row * high // height, column * wide // width], -1)
 
     found = jax.vmap(one)(cameras.viewmat, cameras.K, ids, depths)
     return jnp.take_along_axis(found, jnp.argmax(found >= 0, axis=0)[None], axis=0)[0]
@@ -230,7 +230,7 @@ def graph_loss(
 _MATCHING = Matching(derivative="implicit")  # row sums are off by 3e-7 at this temperature
 
 
-def _labelled(
+def _features_at_nodes(
     places: Float[np.ndarray, "n 3"],
     frame: Frame,
     ids: Int[np.ndarray, "h w"],
@@ -240,8 +240,8 @@ def _labelled(
     camera = frame.cameras
     column, row, z, inside = pixels_of(places, camera.viewmat[0], camera.K[0], camera.width, camera.height)
     depth = known_depth(frame)[row, column]
-    unhidden = (depth == 0) | (np.abs(depth - z) < _NEAR * depth)
+    unoccluded = (depth == 0) | (np.abs(depth - z) < _NEAR * depth)
     counted = np.ones(len(z), bool) if frame.masks is None else frame.masks[0][row, column]
     high, wide = ids.shape
     here = ids[row * high // camera.height, column * wide // camera.width]
-    return codebook[np.maximum(here, 0)], inside & counted & unhidden & (here >= 0)
+    return codebook[np.maximum(here, 0)], inside & counted & unoccluded & (here >= 0)

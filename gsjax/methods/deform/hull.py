@@ -13,7 +13,7 @@ from gsjax.scene.gaussians import Gaussians
 from gsjax.scene.initialize import gaussians_from_points
 
 _TURNED = 0.1  # mean squared sine of the angles between optical axes and their mean
-_MISSED = 0.25  # share of the distance to the focus by which an optical axis may miss it
+_MAX_MISS = 0.25  # share of the distance to the focus by which an optical axis may miss it
 _VIEWS = 48  # views that carve the hull, evenly spread over time
 _CELLS = 64  # along each edge of the box that is carved
 _LEAST_SHARE = 0.6  # of the best cell's number of views; below 1, as what moves does not stay in one place
@@ -34,7 +34,7 @@ def goes_around(viewmats: Float[np.ndarray, "n 4 4"]) -> bool:
     across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
     towards = viewmats[:, :3, :3] @ extent.focus + viewmats[:, :3, 3]
     missed = np.linalg.norm(towards[:, :2], axis=1)
-    meet = np.median(missed) < _MISSED * np.median(towards[:, 2])
+    meet = np.median(missed) < _MAX_MISS * np.median(towards[:, 2])
     return bool(meet and np.linalg.eigvalsh(across.mean(0))[0] > _TURNED)
 
 

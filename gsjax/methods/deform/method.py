@@ -16,7 +16,7 @@ from gsjax.methods.deform.config import DeformConfig
 from gsjax.methods.deform.graph import FrameGraph, frame_graphs
 from gsjax.methods.deform.hull import hull_gaussians
 from gsjax.methods.deform.meaning import Lesson, counted_ids
-from gsjax.methods.deform.nodes import far_apart, nodes_of
+from gsjax.methods.deform.nodes import farthest_rows, nodes_of
 from gsjax.methods.deform.poses import refined_viewmats, times_of
 from gsjax.methods.deform.result import DeformResult, Timeline, timeline_of
 from gsjax.methods.deform.start import can_start_from, known_depth, start_gaussians, with_plane_depths
@@ -273,7 +273,7 @@ def _graphs(
     """The graph of each frame, from the current positions of the nodes and the current poses."""
     if config.graph.kind == "none" or problem.lesson is None:
         return None
-    nodes = far_apart(scene.gaussians.means, config.graph.nodes)
+    nodes = farthest_rows(scene.gaussians.means, config.graph.nodes)
     at = jax.jit(lambda scene, time: scene.at(time, moving).means[nodes])
     places = np.stack([np.asarray(at(scene, frame.time)) for frame in problem.seen])
     frames, (ids, codebook, _) = problem.frames, problem.lesson
@@ -285,14 +285,16 @@ def _graphs(
     return frame_graphs(places, nodes, frames, ids, codebook, config.graph, problem.radius)
 
 
-def _first_scene(gaussians: Gaussians, config: DeformConfig, frames: int, is_taught: bool) -> DeformingScene:
+def _first_scene(
+    gaussians: Gaussians, config: DeformConfig, frames: int, has_teacher: bool
+) -> DeformingScene:
     """The scene of copies of the valid Gaussians, with zero features and twists."""
     gaussians, _ = cull_invalid(gaussians)
     if not gaussians.num:
         raise ValueError("gaussians: expected at least one that is valid, found none")
     twists = jnp.zeros((frames, 6)) if config.refine_poses else None
     scene = DeformingScene(copied(gaussians), None, twists)
-    if not is_taught:
+    if not has_teacher:
         return scene
     features = jnp.zeros((gaussians.num, config.channels))
     return eqx.tree_at(lambda s: s.gaussians.features, scene, features, is_leaf=lambda leaf: leaf is None)

@@ -13,7 +13,7 @@ from gsjax.scene.gaussians import Gaussians, take
 _BLENDED = 4
 
 
-def far_apart(means: Float[Array | np.ndarray, "n 3"], count: int) -> Int[np.ndarray, "_"]:
+def farthest_rows(means: Float[Array | np.ndarray, "n 3"], count: int) -> Int[np.ndarray, "_"]:
     """Rows of up to `count` Gaussians that lie far from each other, by farthest-point sampling."""
     sample = jax.jit(farthest_points, static_argnums=1)(jnp.asarray(means), min(count, len(means)))
     return np.asarray(sample.indices)[np.asarray(sample.valid)]
@@ -34,7 +34,7 @@ def nodes_of(gaussians: Gaussians, count: int, groups: Int[np.ndarray, "n"] | No
     if groups is not None:
         return _nodes_of_groups(gaussians, count, groups)
     means = np.asarray(gaussians.means)
-    chosen = far_apart(means, count)
+    chosen = farthest_rows(means, count)
     nearest = min(_BLENDED, len(chosen))
     distances, indices = cKDTree(means[chosen]).query(means, k=[*range(1, nearest + 1)])
     width = np.maximum(distances[:, min(1, nearest - 1)], 1e-12)[:, None]

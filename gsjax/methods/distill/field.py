@@ -28,7 +28,7 @@ _MARGIN = 0.02  # by which the box extends beyond the outermost Gaussians, as a 
 _OUTLIERS = 0.01  # share of the Gaussians that may lie far out on either side of an axis
 _RATES = {"table": 2.5e-2, "layers": 5e-3}  # learning rates of the fit to vectors
 _FINAL_RATE, _SOME = 0.1, 4096
-_FAR_OUT = 0.5  # how far the box extends at most beyond the inliers, as a share of their extent
+_OUTLIER_MARGIN = 0.5  # how far the box extends at most beyond the inliers, as a share of their extent
 
 
 class FeatureField(eqx.Module):
@@ -126,7 +126,7 @@ def expect_finite(means: Float[Array, "n 3"]) -> Float[np.ndarray, "some 3"]:
 def _box(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "2 3"]:
     """The bounding box without a few outliers, which would make all cells much larger."""
     low, high = np.quantile(points, [_OUTLIERS, 1 - _OUTLIERS], axis=0).astype(np.float32)
-    room = _FAR_OUT * max((high - low).max(), 1e-3)
+    room = _OUTLIER_MARGIN * max((high - low).max(), 1e-3)
     return np.stack([np.maximum(points.min(0), low - room), np.minimum(points.max(0), high + room)])
 
 

@@ -26,7 +26,7 @@ _SEED, _ITERATIONS = 0, 10  # of clustering
 _AT_ONCE = 32  # kinds that are rendered at once
 
 
-def completed(teacher: Teacher, views: Sequence[tuple[FrozenView, Plan]], num: int) -> Teacher:
+def complete_teacher(teacher: Teacher, views: Sequence[tuple[FrozenView, Plan]], num: int) -> Teacher:
     """The teacher with the votes of all views in place of what was filled in from other levels.
 
     Args:
@@ -44,7 +44,7 @@ def completed(teacher: Teacher, views: Sequence[tuple[FrozenView, Plan]], num: i
     of_gaussians = _kinds_of_gaussians(teacher, views, kinds[place], len(centers), num)
     rows = []  # of each pixel on each level, into the embeddings followed by the centres
     for (view, plan), ids, filled in zip(views, teacher.ids, teacher.filled, strict=True):
-        voted = np.stack([_drawn(view, plan, each, len(centers)) for each in of_gaussians], axis=-1)
+        voted = np.stack([_majority_kind(view, plan, each, len(centers)) for each in of_gaussians], axis=-1)
         row = np.where(filled & (voted >= 0), len(embeddings) + voted, place[np.maximum(ids, 0)])
         rows.append(np.where((ids >= 0)[..., None], row, -1))
     return _with_rows(teacher, rows, np.concatenate([embeddings, centers]))
@@ -89,7 +89,9 @@ def _kinds_of_gaussians(
     return filled_in
 
 
-def _drawn(view: FrozenView, plan: Plan, kinds: Int[np.ndarray, "n"], count: int) -> Int[np.ndarray, "h w"]:
+def _majority_kind(
+    view: FrozenView, plan: Plan, kinds: Int[np.ndarray, "n"], count: int
+) -> Int[np.ndarray, "h w"]:
     """The kind of Gaussians that contributes most to each pixel; -1 where none does."""
     best, most = np.full((plan.height, plan.width), -1), np.zeros((plan.height, plan.width))
     some = min(_AT_ONCE, count)

@@ -20,12 +20,12 @@ from gsjax.methods.distill.field import (
     fitted_to_vectors,
     init_field,
 )
-from gsjax.methods.distill.levels import completed
+from gsjax.methods.distill.levels import complete_teacher
 from gsjax.methods.distill.result import DistillResult
-from gsjax.methods.distill.solve import SolveBatch, passes, solve_step, unsolved
+from gsjax.methods.distill.solve import SolveBatch, num_passes, solve_step, zero_field
 from gsjax.methods.distill.teacher import Teacher, max_rows
 from gsjax.methods.distill.update import contrast_begins, distill_step
-from gsjax.methods.distill.views import Batch, expect_alike, frozen_views, in_basis, view_batch
+from gsjax.methods.distill.views import Batch, check_views, frozen_views, in_basis, view_batch
 from gsjax.methods.sampling import shuffled_index
 from gsjax.optim.guard import resting
 from gsjax.optim.method import Run
@@ -113,14 +113,14 @@ class Distill:
         Raises:
             ValueError: the teacher's views differ in number or size, or no Gaussian has a finite centre.
         """
-        expect_alike(cameras, teacher)
+        check_views(cameras, teacher)
         expect_finite(gaussians.means)
         config, solved, located, rows, untrained = self.config, None, None, None, None
         frozen = frozen_views(gaussians, cameras, rasterize_mode)
         if teacher.filled is not None:
-            teacher = completed(teacher, frozen, gaussians.num)
+            teacher = complete_teacher(teacher, frozen, gaussians.num)
         if config.start != "random":
-            solved = unsolved(teacher, jnp.asarray(gaussians.means), config)
+            solved = zero_field(teacher, jnp.asarray(gaussians.means), config)
             config = replace(config, channels=solved.channels)
         if config.iterations:
             untrained, located = init_field(
@@ -150,7 +150,7 @@ class Distill:
 
     def steps_of_solution(self, problem: Problem) -> int:
         """Number of steps before gradient descent: one for each view in each pass."""
-        return passes(self.config) * len(problem.views)
+        return num_passes(self.config) * len(problem.views)
 
     def total(self, problem: Problem) -> int:
         """Number of steps, those of the solution and `config.iterations`."""

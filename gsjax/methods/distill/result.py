@@ -22,7 +22,7 @@ from gsjax.scene.feature_grid import FeatureGrid, Located, locate
 
 FORMAT = 1
 """Format of field.npz."""
-_BEST, _ALIKE = 32, 0.02  # best Gaussians that decide the level of a query; difference of equal cosines
+_BEST, _TIE = 32, 0.02  # best Gaussians that decide the level of a query; difference of equal cosines
 _UNKNOWN = {"kind": "files", "names": {}, "weights": None}  # an unknown source
 
 
@@ -168,9 +168,9 @@ class DistillResult:
             ValueError: the vectors' number of channels is not the teacher's.
         """
         queries = self._queries(vectors)
-        ahead = {level: float(_best_ahead(*self._directions(level), queries)) for level in self.levels}
+        ahead = {level: float(_best_margin(*self._directions(level), queries)) for level in self.levels}
         most = max(ahead.values(), default=0.0)
-        return next((level for level in reversed(ahead) if ahead[level] > most - _ALIKE), None)
+        return next((level for level in reversed(ahead) if ahead[level] > most - _TIE), None)
 
     def query(
         self,
@@ -254,7 +254,7 @@ def _scores(directions, lifted, queries):
 
 
 @jax.jit
-def _best_ahead(directions, lifted, queries):
+def _best_margin(directions, lifted, queries):
     """By how much the query's cosine exceeds those of its negatives, if any: the mean over the best
     Gaussians, as a single one may score high by chance."""
     cosines = cosines_of(directions, lifted, queries)

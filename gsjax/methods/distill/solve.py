@@ -30,7 +30,7 @@ from jaxtyping import Array, Bool, Float, Int
 from gsjax.methods.distill.config import DistillConfig
 from gsjax.methods.distill.field import FeatureField
 from gsjax.methods.distill.teacher import Teacher
-from gsjax.methods.distill.views import Batch, stretched
+from gsjax.methods.distill.views import Batch, resized_rows
 from gsjax.optim.conjugate_gradients import Conjugate, advanced, turned
 from gsjax.optim.step import Step, all_finite
 from gsjax.rasterize.frozen import paint_shown, rows_within, strip_of
@@ -72,10 +72,10 @@ class SolveState(NamedTuple):
     """
 
     total: Float[Array, "n r"]
-    wanted: Float[Array, "n r"]
+    rhs: Float[Array, "n r"]
     mass: Float[Array, "n"]
     shown: Float[Array, "n"]
-    tie: Float[Array, ""]
+    lam: Float[Array, ""]
     conjugate: Conjugate | None
     target: Float[Array, ""]
     pixels: Float[Array, ""]
@@ -117,11 +117,11 @@ def solve_step(config: DistillConfig) -> Step:
     def update(field: FeatureField, state: SolveState, batch: SolveBatch, *, step: Any, key: Any):
         turn, rows = jnp.asarray(batch.turn), batch.view.view.rows
         if (known := state.conjugate) is None:
-            found = _targets_drawn_back(batch.view, config)
+            found = _right_hand_side(batch.view, config)
         else:
             found = jax.lax.cond(
                 turn == 0,
-                lambda: _targets_drawn_back(batch.view, config),
+                lambda: _right_hand_side(batch.view, config),
                 lambda: _product(jnp.where(turn == 1, field.encoding, known.direction), batch.view, config),
             )
         sound = all_finite(found)
@@ -148,7 +148,7 @@ def solve_step(config: DistillConfig) -> Step:
     return Step(init, update)
 
 
-def passes(config: DistillConfig) -> int:
+def num_passes(config: DistillConfig) -> int:
     """The number of passes over the views: one for the vote, one for its residual, one for each iteration.
 
     Args:
@@ -157,7 +157,7 @@ def passes(config: DistillConfig) -> int:
     return {"random": 0, "vote": 1, "solve": 2 + config.solve.iterations}[config.start]
 
 
-def unsolved(teacher: Teacher, means: Float[Array, "n 3"], config: DistillConfig) -> FeatureField:
+def zero_field(teacher: Teacher, means: Float[Array, "n 3"], config: DistillConfig) -> FeatureField:
     """The field before its first step: vectors of zeros, in a basis that retains `solve.energy` of the
     squared length of the teacher's features.
 
@@ -190,7 +190,7 @@ def basis_of(teacher: Teacher, config: DistillConfig) -> Float[np.ndarray, "d r"
     return np.ascontiguousarray(vectors[:, : min(rank, config.channels, teacher.dimension)])
 
 
-def _targets_drawn_back(batch: Batch, config: DistillConfig) -> _Sums:
+def _right_hand_side(batch: Batch, config: DistillConfig) -> _Sums:
     """W^T M alpha e, W^T M alpha and W^T alpha of a view."""
     features = batch.map if batch.codebook is None else batch.codebook
     assert features is not None
@@ -204,7 +204,7 @@ def _targets_drawn_back(batch: Batch, config: DistillConfig) -> _Sums:
         joined = jnp.concatenate([shown, jnp.stack([weights * alphas, every], axis=-1)], axis=-1)
         return joined, squares.sum(), weights.sum()
 
-    back, target, pixels = _drawn_back(empty, batch, config, cotangent)
+    back, target, pixels = _backprojected(empty, batch, config, cotangent)
     return _Sums(back[:, :-2], back[:, -2], back[:, -1], target, pixels)
 
 
@@ -216,12 +216,12 @@ def _product(values: Float[Array, "n r"], batch: Batch, config: DistillConfig) -
         weights = _weights(batch, first, inside, config.weights.map, image.dtype)
         return weights[..., None] * image, zero, zero
 
-    back, target, pixels = _drawn_back(values[batch.view.rows], batch, config, cotangent)
+    back, target, pixels = _backprojected(values[batch.view.rows], batch, config, cotangent)
     nothing = jnp.zeros(len(back), back.dtype)
     return _Sums(back, nothing, nothing, target, pixels)
 
 
-def _drawn_back(values: Float[Array, "seen c"], batch: Batch, config: DistillConfig, cotangent):
+def _backprojected(values: Float[Array, "seen c"], batch: Batch, config: DistillConfig, cotangent):
     """Renders the values strip by strip and pulls the first output of `cotangent(first_row, inside, image,
     alphas)` back to the Gaussians, summed over strips; its other two outputs, numbers, are summed as well."""
     plan = batch.plan
@@ -232,8 +232,8 @@ def _drawn_back(values: Float[Array, "seen c"], batch: Batch, config: DistillCon
         view, strip_plan = strip_of(batch.view, plan, number * rows, rows)
         (image, alphas), back = jax.vjp(lambda some: paint_shown(view, some, strip_plan), values)
         inside = number * high + jnp.arange(high) < plan.height
-        wanted, *numbers = cotangent(number * high, inside, image, alphas)
-        (found,) = back((wanted, jnp.zeros_like(alphas)))
+        rhs, *numbers = cotangent(number * high, inside, image, alphas)
+        (found,) = back((rhs, jnp.zeros_like(alphas)))
         return jax.tree.map(jnp.add, carry, (found, *numbers)), None
 
     zero = jnp.zeros((), values.dtype)
@@ -261,7 +261,7 @@ def _targets(batch: Batch, first, inside, map_weight: float, dtype):
         targets += jnp.where((ids >= 0)[..., None], batch.codebook[jnp.maximum(ids, 0)], 0.0)
     if batch.map is not None:
         weight = inside[:, None] * (1.0 if batch.codebook is None else map_weight)
-        targets += weight[..., None] * stretched(batch.map, first, len(inside), batch.plan)
+        targets += weight[..., None] * resized_rows(batch.map, first, len(inside), batch.plan)
     return targets.astype(dtype), _weights(batch, first, inside, map_weight, dtype)
 
 
@@ -273,64 +273,64 @@ def _ids(batch: Batch, first, high: int) -> Int[Array, "high width"]:
 
 def _after_pass(field: FeatureField, state: SolveState, batch: SolveBatch, config: DistillConfig):
     """The field and the state after the last view of a pass."""
-    branches = [partial(_voted, smoothness=config.solve.smoothness)]
-    branches += [] if state.conjugate is None else [_begun, _advanced]
+    branches = [partial(_after_vote, smoothness=config.solve.smoothness)]
+    branches += [] if state.conjugate is None else [_first_residual, _cg_step]
     turn = jnp.clip(jnp.asarray(batch.turn), 0, len(branches) - 1)
     given = field, state, batch.neighbors
     field, state = jax.lax.switch(turn, [lambda f=f: f(*given) for f in branches])
     return field, state._replace(total=jnp.zeros_like(state.total))
 
 
-def _voted(field: FeatureField, state: SolveState, neighbors, smoothness: float):
+def _after_vote(field: FeatureField, state: SolveState, neighbors, smoothness: float):
     """After the vote, which is the initial guess. Gaussians that no pixel shows get the mean of their
     neighbours; those shown by pixels without a teacher get zeros, as they lie beside objects but belong to
     none."""
     seen = state.mass > _LEAST
     votes = jnp.where(seen[:, None], state.total / jnp.maximum(state.mass, _LEAST)[:, None], 0.0)
-    tie = smoothness * state.mass.sum() / jnp.maximum(seen.sum(), 1)
-    found = _spread(votes, seen | _untaught(state), neighbors)
-    field = eqx.tree_at(lambda f: f.encoding, field, _without_untaught(found, state))
-    return field, state._replace(wanted=state.total, tie=tie)
+    lam = smoothness * state.mass.sum() / jnp.maximum(seen.sum(), 1)
+    found = _spread(votes, seen | _unlabelled(state), neighbors)
+    field = eqx.tree_at(lambda f: f.encoding, field, _zero_unlabelled(found, state))
+    return field, state._replace(rhs=state.total, lam=lam)
 
 
-def _begun(field: FeatureField, state: SolveState, neighbors):
+def _first_residual(field: FeatureField, state: SolveState, neighbors):
     """After the product with the initial guess: the residual, which gives the first search direction."""
     x = field.encoding
-    residual = state.wanted - state.total - state.tie * _laplacian(x, neighbors)
+    residual = state.rhs - state.total - state.lam * _laplacian(x, neighbors)
     assert state.conjugate is not None
     first = turned(state.conjugate, residual, _preconditioner(state, neighbors))
     return field, state._replace(conjugate=first, loss=_objective(x, residual, state))
 
 
-def _advanced(field: FeatureField, state: SolveState, neighbors):
+def _cg_step(field: FeatureField, state: SolveState, neighbors):
     """After the product with a search direction: an iteration of conjugate gradients."""
     assert state.conjugate is not None
-    product = state.total + state.tie * _laplacian(state.conjugate.direction, neighbors)
+    product = state.total + state.lam * _laplacian(state.conjugate.direction, neighbors)
     scale = _preconditioner(state, neighbors)
     x, after = advanced(field.encoding, state.conjugate, product, scale)
-    field = eqx.tree_at(lambda f: f.encoding, field, _without_untaught(x, state))
+    field = eqx.tree_at(lambda f: f.encoding, field, _zero_unlabelled(x, state))
     return field, state._replace(conjugate=after, loss=_objective(x, after.residual, state))
 
 
-def _untaught(state: SolveState) -> Bool[Array, "n"]:
+def _unlabelled(state: SolveState) -> Bool[Array, "n"]:
     """The Gaussians that pixels show, of which hardly any has a teacher."""
     return (state.shown > _LEAST) & (state.mass <= _TAUGHT * state.shown)
 
 
-def _without_untaught(x: Float[Array, "n r"], state: SolveState) -> Float[Array, "n r"]:
+def _zero_unlabelled(x: Float[Array, "n r"], state: SolveState) -> Float[Array, "n r"]:
     """The vectors, zero for untaught Gaussians."""
-    return jnp.where(_untaught(state)[:, None], 0.0, x)
+    return jnp.where(_unlabelled(state)[:, None], 0.0, x)
 
 
 def _preconditioner(state: SolveState, neighbors: Int[Array, "n k"]) -> Float[Array, "n"]:
     num, count = neighbors.shape
     pairs = count + jnp.zeros(num, state.mass.dtype).at[neighbors.ravel()].add(1.0)
-    return state.mass + state.tie * pairs + _LEAST
+    return state.mass + state.lam * pairs + _LEAST
 
 
 def _objective(x: Float[Array, "n r"], residual: Float[Array, "n r"], state: SolveState) -> Float[Array, ""]:
     """The objective per pixel: x.Ax - 2 b.x + target, with Ax = b - residual."""
-    return (state.target - jnp.sum(x * (state.wanted + residual))) / jnp.maximum(state.pixels, 1.0)
+    return (state.target - jnp.sum(x * (state.rhs + residual))) / jnp.maximum(state.pixels, 1.0)
 
 
 def _laplacian(x: Float[Array, "n r"], neighbors: Int[Array, "n k"]) -> Float[Array, "n r"]:

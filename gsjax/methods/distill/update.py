@@ -23,7 +23,7 @@ from gsjax.losses.features import (
 from gsjax.losses.regularization import total_variation
 from gsjax.methods.distill.config import DistillConfig
 from gsjax.methods.distill.field import FeatureField, RenderedFeatures, rendered_features
-from gsjax.methods.distill.views import Batch, stretched
+from gsjax.methods.distill.views import Batch, resized_rows
 from gsjax.optim.step import Step, gradient_step, per_field_adam
 from gsjax.rasterize.frozen import paint_shown, rows_within, strip_of
 
@@ -194,7 +194,7 @@ def _teacher_sums(
         cos += jnp.where(known, cosine_error(like), 0.0).sum()
         pixels += known.sum(dtype=zero.dtype)
     if batch.map is not None:
-        wanted = stretched(jnp.asarray(batch.map), first_row, len(inside), batch.plan)
+        wanted = resized_rows(jnp.asarray(batch.map), first_row, len(inside), batch.plan)
         like = likeness_to_map(rendered, lifted, wanted.reshape(len(alphas), -1))
         known = jnp.repeat(inside, batch.plan.width)
         weight = jnp.where(known, 1.0 if batch.codebook is None else map_weight, 0.0)

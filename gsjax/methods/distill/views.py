@@ -96,7 +96,7 @@ def in_basis(batch: Batch, basis: Float[Array, "d r"]) -> Batch:
     return batch._replace(located=None, codebook=codebook, map=pixels)
 
 
-def expect_alike(cameras: Sequence[Camera], teacher: Teacher) -> None:
+def check_views(cameras: Sequence[Camera], teacher: Teacher) -> None:
     """Raises ValueError if a teacher's views differ from the cameras in number or size."""
     if len(cameras) != len(teacher.ids):
         raise ValueError(f"teacher: expected ids of {len(cameras)} views, found {len(teacher.ids)}")
@@ -110,7 +110,7 @@ def expect_alike(cameras: Sequence[Camera], teacher: Teacher) -> None:
             )
 
 
-def stretched(
+def resized_rows(
     teacher: Float[Array, "h w d"], first: Int[Array, ""] | int, rows: int, plan: Plan
 ) -> Float[Array, "rows width d"]:
     """Rows of a teacher's map resized bilinearly to the view.

@@ -17,7 +17,7 @@ from gsjax.geometry.cameras import on_device
 from gsjax.geometry.extent import Extent, extent_of
 from gsjax.losses.extra import ExtraLosses, named_losses
 from gsjax.methods.fit.config import FitConfig
-from gsjax.methods.fit.model import Model, carried_over, model_of, refined, with_degree, with_slots
+from gsjax.methods.fit.model import Model, extend_state, model_of, refined, with_degree, with_slots
 from gsjax.methods.fit.padding import with_common_sizes
 from gsjax.methods.fit.start import initial_gaussians, start_points
 from gsjax.methods.fit.update import Batch, fit_step, grow, slots_wanted, split
@@ -130,7 +130,7 @@ class Fit:
         rendering of new sizes, whose losses are not comparable. Arguments as for `Method.between`."""
         run = self._densified(problem, run, run.step - 1, progress)
         run = self._enlarged(run, degree=min(self.config.sh_degree, run.step // self.config.sh_every))
-        name, frame = self._turn(problem, run.step, progress)
+        name, frame = self._frame_of_step(problem, run.step, progress)
         plan, gaussians = run.plans.get(name), run.params.gaussians
         if plan is None:
             mode = "antialiased" if self.config.antialiased else "classic"
@@ -140,7 +140,7 @@ class Fit:
 
     def batch(self, problem: Problem, run: Run, progress: float) -> tuple[Batch, tuple[str, ...]]:
         """The photograph of the step, and the plan for its size. Arguments as for `Method.batch`."""
-        name, frame = self._turn(problem, run.step, progress)
+        name, frame = self._frame_of_step(problem, run.step, progress)
         if problem.background is None:
             key = jax.random.fold_in(jax.random.key(self.config.seed), _BACKGROUND)
             background = jax.random.uniform(jax.random.fold_in(key, run.step), (1, 3))
@@ -160,7 +160,7 @@ class Fit:
     def _view(self, problem: Problem, step: int) -> int:
         return shuffled_index(self.config.seed, step, len(problem.frames))
 
-    def _turn(self, problem: Problem, step: int, progress: float) -> tuple[str, Frame]:
+    def _frame_of_step(self, problem: Problem, step: int, progress: float) -> tuple[str, Frame]:
         """The photograph of a step on the device, and the name of the plan for its size."""
         view, shrink = self._view(problem, step), problem.shrink(progress)
         if (view, shrink) not in problem.held:
@@ -176,7 +176,7 @@ class Fit:
         larger = with_slots(with_degree(run.params, degree), slots)
         if larger is run.params:
             return run
-        return run.having(params=larger, state=carried_over(run.state, jax.jit(self.step.init)(larger)))
+        return run.having(params=larger, state=extend_state(run.state, jax.jit(self.step.init)(larger)))
 
     def _densified(self, problem: Problem, run: Run, step: int, progress: float) -> Run:
         """The run after densification, if it is due after `step`."""

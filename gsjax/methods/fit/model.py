@@ -46,7 +46,7 @@ def model_of(gaussians: Gaussians, config: FitConfig, views: int) -> Model:
     return Model(gaussians, *jax.device_put((nudges, exposures, twists)))
 
 
-def exposed(
+def with_exposure(
     colors: Float[Array, "c h w 3"], exposures: Float[Array, "views 3 4"], view: Int[Array, ""]
 ) -> Float[Array, "c h w 3"]:
     """Colours at the exposure of a photograph: E [c; 1]. The mean of E over photographs is [I | 0], because
@@ -108,7 +108,7 @@ def in_slots(gaussians: Gaussians, count: int) -> Gaussians:
 State = TypeVar("State")
 
 
-def carried_over(old: State, fresh: State) -> State:
+def extend_state(old: State, fresh: State) -> State:
     """The optimizer state of an enlarged model, with the old state's values where it has them."""
     known = {jax.tree_util.keystr(path): leaf for path, leaf in jax.tree_util.tree_leaves_with_path(old)}
 

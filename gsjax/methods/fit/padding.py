@@ -8,8 +8,8 @@ from jaxtyping import Float, Int
 
 from gsjax.scene.frame import Frame
 
-_MOST = 2  # sizes: one for portrait and one for landscape photographs
-_WASTE = 0.25  # share of all pixels that a second size must save
+_MAX_SIZES = 2  # sizes: one for portrait and one for landscape photographs
+_MIN_SAVING = 0.25  # share of all pixels that a second size must save
 _CELLS = 8  # per axis of the grid on which similar sizes are merged first, if there are more sizes than cells
 
 
@@ -34,7 +34,9 @@ def common_sizes(sizes: Int[np.ndarray, "n 2"]) -> Int[np.ndarray, "n 2"]:
         joined = np.maximum(groups[:, None], groups[None])
         added = joined.prod(2) * (counts[:, None] + counts[None]) - pixels[:, None] - pixels[None]
         added = np.where(np.tri(len(groups), k=-1, dtype=bool), added, np.inf)
-        if len(groups) == 1 or (len(groups) <= _MOST and added.min() > _WASTE * sizes.prod(1).sum()):
+        if len(groups) == 1 or (
+            len(groups) <= _MAX_SIZES and added.min() > _MIN_SAVING * sizes.prod(1).sum()
+        ):
             return found
         one, other = np.unravel_index(added.argmin(), added.shape)
         belongs = (found == groups[one]).all(1) | (found == groups[other]).all(1)

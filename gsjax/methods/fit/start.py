@@ -15,7 +15,7 @@ from gsjax.scene.frame import Frame
 from gsjax.scene.gaussians import Gaussians
 from gsjax.scene.initialize import gaussians_from_points, points_from_rgbd
 
-_FEW = 0.1  # share of visible points below which something is wrong
+_MIN_VISIBLE = 0.1  # share of visible points below which something is wrong
 _FLAT_PX = 1.0  # disparity between cameras below which the points show no depth
 
 
@@ -65,7 +65,7 @@ def _is_seen(points: Float[np.ndarray, "m 3"], frames: list[Frame]) -> bool:
         shown = ((pixels >= 0) & (pixels < (width, height))).all(axis=1)
         seen |= shown
         disparities[shown] = camera.K[0, 0] * extent.radius / depths[shown]
-    if seen.mean() < _FEW:
+    if seen.mean() < _MIN_VISIBLE:
         warnings.warn(
             f"of the data's {len(points)} points the photographs show {seen.sum()}: are they in the axes and "
             "the unit of the poses?",

@@ -14,7 +14,7 @@ from gsjax.geometry.cameras import Camera
 from gsjax.losses.extra import ExtraLosses, extra_terms, named_losses
 from gsjax.losses.photometric import photometric_loss, weighted_mean
 from gsjax.methods.fit.config import FitConfig
-from gsjax.methods.fit.model import Model, exposed, refined
+from gsjax.methods.fit.model import Model, refined, with_exposure
 from gsjax.optim.densification import EMPTY_LOGIT, exploration, is_alive, relocate, reset_rows
 from gsjax.optim.splitting import Pull, divide, reset_opacities, strongly_pulled, watch_pull
 from gsjax.optim.step import Step, all_finite, gradient_step, keep_if, per_field_adam
@@ -104,7 +104,7 @@ def _photographed(model: Model, batch: Batch) -> tuple[Rendered, Camera]:
     behind = batch.background
     drawn = render(model.gaussians, camera, batch.plan, backgrounds=behind, means2d_offset=nudges)
     if model.exposures is not None:
-        drawn = drawn._replace(colors=exposed(drawn.colors, model.exposures, batch.view))
+        drawn = drawn._replace(colors=with_exposure(drawn.colors, model.exposures, batch.view))
     return drawn, camera
 
 

@@ -15,7 +15,7 @@ from gsjax.data import DataError, DataWarning, open_sequence, photographs_of
 from gsjax.data.ordered import open_as_sequence
 from gsjax.engine.deform.data import deform_data
 from gsjax.engine.deform.depth import with_depth
-from gsjax.engine.deform.file import read_beside
+from gsjax.engine.deform.file import read_metadata
 from gsjax.engine.messages import Notes
 from gsjax.engine.pictures import frame_rate
 from gsjax.engine.teaching.choice import TeacherChoice
@@ -161,7 +161,7 @@ def test_a_run_is_learned_and_scored_on_white(gsjax, folder, tmp_path):
         picture = cv2.imread(str(run / "test" / f"{row['frame']:06d}.png"))
         assert (picture[:4, :4] == 255).all()
         assert picture.std() > 20
-    assert read_beside(run / "deformation.npz").background == (1, 1, 1)
+    assert read_metadata(run / "deformation.npz").background == (1, 1, 1)
     scene, _ = open_viewable(run, Notes(Console(quiet=True)))
     assert scene.background == (1, 1, 1)
     assert scene.num_frames == 19

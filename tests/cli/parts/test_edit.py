@@ -240,7 +240,7 @@ def test_a_film_of_one_moment_has_a_camera(run, script):
     saved = open_parts_run(run)
     edits = replace(parse_script(script), edits=(parse_op("fade:parts=drawer,opacity=0"),))
     film, _ = films.edited(edits, saved)
-    assert films.telling_camera(film, saved, edits) in (0, 1, 2)
+    assert films.most_changed_camera(film, saved, edits) in (0, 1, 2)
 
 
 @pytest.mark.thorough
@@ -252,7 +252,9 @@ def test_an_edit_near_the_end_is_looked_at(run):
             parse_script(f"{{{text}, edits: [{{op: fade, parts: shut_door, opacity: 0, from: {begin}}}]}}")
             for begin in (0.0, 2.9)
         )
-        cameras = [films.telling_camera(films.edited(one, saved)[0], saved, one) for one in (early, late)]
+        cameras = [
+            films.most_changed_camera(films.edited(one, saved)[0], saved, one) for one in (early, late)
+        ]
         assert cameras[0] == cameras[1] != saved.camera(None)
 
 

@@ -16,7 +16,7 @@ import pytest
 from plyfile import PlyData, PlyElement
 
 import gsjax
-from gsjax.engine.distill.saved import Whereabouts
+from gsjax.engine.distill.saved import Locations
 from gsjax.engine.viewables import open_viewable
 from gsjax.io.ply import read_ply, write_ply
 from gsjax.methods.parts import gaussians_at, moment
@@ -56,7 +56,7 @@ def test_a_fit_whose_photographs_are_gone_is_shown_without(fitted, notes):
 def test_photographs_of_a_fit_that_moved(fitted, photographs, notes):
     config = fitted / "config.yml"
     config.write_text(config.read_text().replace(str(photographs), "/nowhere/at/all"))
-    scene, _ = open_viewable(fitted, notes, Whereabouts(images=str(photographs)))
+    scene, _ = open_viewable(fitted, notes, Locations(images=str(photographs)))
     assert len(scene.shots.names) == 9
 
 

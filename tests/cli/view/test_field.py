@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gsjax.engine.distill.saved import Whereabouts
+from gsjax.engine.distill.saved import Locations
 from gsjax.engine.teaching.source import Source
 from gsjax.engine.viewables import open_viewable
 from gsjax.io.ply import read_ply, write_ply
@@ -64,7 +64,7 @@ def test_a_field_alone_is_asked_of_the_scene_that_is_named(fitted, asked, tmp_pa
     code, said = view(mine, "--port", 0, "--scene", tmp_path / "moved.ply")
     assert code == 130, said
     assert "can be queried" in said
-    scene, folder = open_viewable(mine, notes, Whereabouts(tmp_path / "moved.ply"))
+    scene, folder = open_viewable(mine, notes, Locations(tmp_path / "moved.ply"))
     assert folder == mine
     np.testing.assert_array_equal(scene.labels, np.arange(30) % 3)
 
@@ -115,7 +115,7 @@ def test_what_can_be_asked_for_is_said(fitted, notes, source, hint):
     if source.kind == "files":
         with pytest.raises(ValueError, match="give its folder with --weights"):
             asking.ask("can", 0)
-        assert open_viewable(fitted, notes, Whereabouts(weights=Path("x")))[0].asking.hint == "Any words"
+        assert open_viewable(fitted, notes, Locations(weights=Path("x")))[0].asking.hint == "Any words"
 
 
 def test_a_field_of_another_scene_is_not_asked(fitted, asked, tmp_path, notes):

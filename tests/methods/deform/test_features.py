@@ -17,7 +17,7 @@ from gsjax.methods.deform import (
     prompt_probabilities,
     start_gaussians,
 )
-from gsjax.methods.deform.nodes import far_apart
+from gsjax.methods.deform.nodes import farthest_rows
 from gsjax.scene.deformation import DeformationConfig, init_deformation
 from gsjax.scene.initialize import gaussians_from_points
 from tests.methods.deform.tissue import CODES, CONFIG, tissue
@@ -73,7 +73,7 @@ class TestFeatureLoss:
 @pytest.fixture(scope="module")
 def graphs(frames, ids):
     gaussians = start_gaussians(frames[:1], 0, 1.0)
-    nodes = far_apart(gaussians.means, CONFIG.graph.nodes)
+    nodes = farthest_rows(gaussians.means, CONFIG.graph.nodes)
     places = np.stack([np.asarray(gaussians.means)[nodes]] * len(frames))
     return nodes, {
         kind: frame_graphs(places, nodes, frames, ids, CODES, replace(CONFIG.graph, kind=kind), 0.05)

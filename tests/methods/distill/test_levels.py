@@ -9,7 +9,7 @@ from gsjax.engine.drive import drive
 from gsjax.engine.teaching.source import Source
 from gsjax.methods.distill import PRESETS, Distill, frozen_views, teacher_of_objects
 from gsjax.methods.distill import levels as of_levels
-from gsjax.methods.distill.levels import completed
+from gsjax.methods.distill.levels import complete_teacher
 from tests.methods.distill.two_balls import cameras, two_balls
 
 NAMES = ("small", "large")
@@ -41,7 +41,7 @@ def embeddings_of(teacher, v):
 def test_other_views_tell_what_a_view_lacks(scene):
     gaussians, _, masks = scene
     given, true = lesson(masks, LACKING), lesson(masks, {})
-    found = completed(given, frozen_views(gaussians, cameras(8)), gaussians.num)
+    found = complete_teacher(given, frozen_views(gaussians, cameras(8)), gaussians.num)
     assert found.filled is None
     for v in range(8):
         same = np.isclose(embeddings_of(found, v), embeddings_of(true, v), atol=1e-5).all(axis=(-1, -2))
@@ -54,7 +54,7 @@ def test_other_views_tell_what_a_view_lacks(scene):
 def test_what_no_view_has_on_a_level_stays_that_of_the_next(scene):
     gaussians, _, masks = scene
     given = lesson(masks, {v: (1,) for v in range(8)})
-    found = completed(given, frozen_views(gaussians, cameras(8)), gaussians.num)
+    found = complete_teacher(given, frozen_views(gaussians, cameras(8)), gaussians.num)
     for v in range(8):
         same = np.isclose(embeddings_of(found, v), embeddings_of(given, v), atol=1e-5).all(axis=(-1, -2))
         assert same.mean() > 0.95  # but for outlines, where Gaussians of the ball show some background
@@ -70,7 +70,7 @@ def test_many_kinds_are_clustered_and_drawn_a_few_at_a_time(scene, monkeypatch):
     given = teacher_of_objects(given.ids, rows, given.filled)
     monkeypatch.setattr(of_levels, "_KINDS", 6)
     monkeypatch.setattr(of_levels, "_AT_ONCE", 4)
-    found = completed(given, frozen_views(gaussians, cameras(8)), gaussians.num)
+    found = complete_teacher(given, frozen_views(gaussians, cameras(8)), gaussians.num)
     for v, gone in LACKING.items():
         small = embeddings_of(found, v)[..., 0, :]
         nearest = (small @ CODES.T).argmax(axis=-1)

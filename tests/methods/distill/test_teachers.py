@@ -24,7 +24,7 @@ from gsjax.methods.distill import (
 )
 from gsjax.methods.distill.teacher import max_rows, view_codebook
 from gsjax.methods.distill.update import strip_rows
-from gsjax.methods.distill.views import stretched
+from gsjax.methods.distill.views import resized_rows
 from gsjax.rasterize.frozen import paint
 from gsjax.scene.feature_grid import FeatureGridConfig
 from gsjax.scene.gaussians import gaussians_from_activated
@@ -142,7 +142,7 @@ def test_maps_are_stretched_as_opencv_does(scene, size):
     plan = problem.views[0].plan
     features = np.random.default_rng(2).normal(size=(*size, 3)).astype(np.float32)
     want = cv2.resize(features, (WIDTH, HEIGHT), interpolation=cv2.INTER_LINEAR)
-    compiled = jax.jit(stretched, static_argnums=2)
+    compiled = jax.jit(resized_rows, static_argnums=2)
     np.testing.assert_allclose(compiled(features, 0, HEIGHT, plan), want, atol=1e-4)
     np.testing.assert_allclose(compiled(features, 8, 4, plan), want[8:12], atol=1e-4)
 

@@ -22,7 +22,7 @@ from gsjax.methods.fit import (
     fit_loss,
 )
 from gsjax.methods.fit.method import on_device_at
-from gsjax.methods.fit.model import exposed, refined
+from gsjax.methods.fit.model import refined, with_exposure
 from gsjax.methods.fit.start import start_points
 from gsjax.optim.densification import is_alive
 from gsjax.rasterize.plan import rung
@@ -155,7 +155,7 @@ def test_exposure_is_learned_where_photographs_differ_in_it(views):
 def seen_as(model: Model, view: Frame, number: int) -> np.ndarray:
     drawn = jnp.asarray(picture(model.gaussians, view))[None]
     return np.asarray(
-        drawn if model.exposures is None else exposed(drawn, model.exposures, jnp.int32(number))
+        drawn if model.exposures is None else with_exposure(drawn, model.exposures, jnp.int32(number))
     )[0]
 
 
