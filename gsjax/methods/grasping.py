@@ -5,7 +5,7 @@ object's points and take the one with the largest antipodal score. Two contacts 
 between them lies in both friction cones (Nguyen, Constructing force-closure grasps, IJRR 1988); on curved
 surfaces these are the antipodal points (Chen and Burdick, Finding antipodal point grasps on irregularly
 shaped objects, T-RA 1993). The score of a grasp is therefore the smaller of its two contacts' cosines between
-outward normal and closing axis. It has to be at least that of the friction cone, cos(arctan(friction)).
+outward normal and closing axis. It must be at least that of the friction cone, cos(arctan(friction)).
 
 Tool axes: z is the approach direction, from the palm to the fingertips; y is the closing axis, from one
 finger to the other; x = y cross z. The origin lies midway between the centres of the two pads.
@@ -16,7 +16,7 @@ contact gets the cosine of the other one, and the score is multiplied by `unseen
 grasp with two observed contacts is preferred. The width is then that of the observed part, a lower bound.
 
 The fingers close on everything of the object that lies between them, so no part is grasped through another: a
-mug's handle only from where the body is not in the way.
+mug's handle can only be grasped from where the body is not in the way.
 """
 
 from dataclasses import dataclass
@@ -142,7 +142,7 @@ def sample_poses(
     """Tool poses that close on a randomly drawn contact; NaN if there is nothing to draw.
 
     The draws are relative to the object: the direction across a normal points to another point of the object.
-    So the poses rotate with it; only `approach` is fixed in the world.
+    The poses therefore rotate with it; only `approach` is fixed in the world.
 
     Args:
         key: random key of the draws.

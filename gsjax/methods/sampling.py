@@ -4,7 +4,7 @@ import numpy as np
 
 
 def shuffled_index(seed: int, step: int, count: int) -> int:
-    """Index of the view of a step: epochs over all views, each in another random order.
+    """Index of the view of a step: epochs over all views, each in a new random order.
 
     Args:
         seed: seed of the orders.

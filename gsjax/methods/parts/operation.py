@@ -39,8 +39,8 @@ class Edit(Entry):
         return cls.__name__.lower()
 
     def affected(self, trajectory: Trajectory, parts: list[int], ends: list[float]) -> list[int]:
-        """The parts that change if `parts` are named; the motion of each part of the scene `ends` at a
-        time."""
+        """The parts that change if `parts` are named; `ends` has the time at which the motion of each part of
+        the scene ends."""
         return parts
 
     def end_after(self, end: float) -> float:
