@@ -31,7 +31,7 @@ class Prompt(NamedTuple):
     Attributes:
         vectors: the vector of the prompt, then those of its negatives, in the channels of the features.
         negatives: texts or names of the negatives.
-        name: its own or its nearest name; None for a text that an encoder reads.
+        name: the known name that it is, or is nearest to; None for a text that an encoder reads.
         min_score: the encoder's own threshold on cosines; None if it has none.
         rule: name of the rule by which the threshold is 1/2.
         level: level of the features that they are compared with; None where there are none.

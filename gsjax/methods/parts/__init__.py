@@ -13,7 +13,7 @@ for now in drive(method, problem, run): ...
 now.result.weights, now.result.poses(t), now.result.joints()
 
 config.py     settings                            method.py      the method, as `drive` runs it
-anchor.py     the canonical frame                 pictures.py    the images that steps use
+anchor.py     the canonical frame                 pictures.py    the pictures that steps use
 masks.py      masks in every view                 stream.py      the step of a frame
 lift.py       from masks to Gaussians             refine.py      the step over all frames, and both as one
 weights.py    the field of skinning weights       discovery.py   from frame to frame; joins and divides parts
@@ -21,7 +21,7 @@ discover.py   the start, from all of these        finish.py      removal of unne
 unify.py      which parts join or divide          result.py      scene, trajectory and joints
 motion.py     which Gaussians move and connect    exposure.py    colour correction of cameras
 search.py     parts that jump                     absence.py     parts that leave, or appear later
-sizes.py      sizes of images, and of a pixel
+sizes.py      sizes of pictures, and of a pixel
 states/       parts from two states, with no frames in between
 trajectory.py poses of parts over time            screws.py      poses as rigid motions
 edits.py      edits of trajectories               film.py        layers rendered together

@@ -50,7 +50,7 @@ def choose_anchor(load: Load, frames: int, cameras: int, anchor: int | None = No
 
     Args:
         load: loads a picture.
-        frames, cameras: their numbers.
+        frames, cameras: number of frames, and of cameras.
         anchor: the frame to use; default: the one that differs most.
 
     Raises:
@@ -74,7 +74,7 @@ def choose_anchor(load: Load, frames: int, cameras: int, anchor: int | None = No
 
 
 def check_anchor(anchor: int | None, frames: int) -> None:
-    """Raises ValueError for an anchor that is none of the frames."""
+    """Raises ValueError for an anchor that is not one of the frames."""
     if anchor is not None and not 0 <= anchor < frames:
         raise ValueError(f"anchor: expected a frame from 0 to {frames - 1}, found {anchor}")
 

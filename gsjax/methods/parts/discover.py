@@ -79,7 +79,8 @@ def begin(
         masks: labels of the candidate parts in every view, if known.
 
     Raises:
-        ValueError: there is only one camera, there are too few Gaussians, or nothing may move.
+        ValueError: there is only one camera, there are too few Gaussians, neither masks nor a segmenter are
+            given, or nothing may move.
     """
     if sequence.num_cameras < 2:
         raise ValueError(

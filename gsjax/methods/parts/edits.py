@@ -250,7 +250,7 @@ def amplify(
     at: Scalar | None = None,
     share: Share = 1.0,
 ) -> Trajectory:
-    """Moves parts `factor` times as far along the screw to each moment, so that hinges stay hinges.
+    """Moves parts `factor` times as far along the screw to each moment; on a hinge they stay on it.
 
     Args:
         factor: above 1 it makes subtle motion visible, below 1 damps it, 0 stops it, negative reverses it.

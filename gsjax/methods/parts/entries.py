@@ -49,7 +49,7 @@ def read(kind: type[Kind], found: Any) -> Kind:
     """The entry that a mapping describes.
 
     Raises:
-        ValueError: it is no mapping, a key is unknown or missing, or a value is not as expected.
+        ValueError: it is not a mapping, a key is unknown or missing, or a value is not as expected.
     """
     keys = {key_of(f): f for f in fields(kind)}
     if not isinstance(found, dict):

@@ -33,7 +33,7 @@ def moving_segments(
 
 
 def view_order(viewmats: Float[np.ndarray, "C 4 4"], first: int, focus: Float[np.ndarray, "3"]) -> list[int]:
-    """Views in an order in which each next one is nearest to any of those before it, by the angle at `focus`.
+    """Orders the views: next comes the one that is nearest to any before it, by the angle at `focus`.
 
     Args:
         viewmats: world to camera.

@@ -49,8 +49,8 @@ _SHARE_OF_SMALLER = 0.5  # of the refinement, which uses pictures no larger than
 
 @dataclass(frozen=True)
 class Parts:
-    """Parts of a moving scene (`gsjax.optim.method.Method`): frame after frame, away from the anchor, and
-    then all frames together.
+    """The parts method (`gsjax.optim.method.Method`): tracks parts frame by frame, away from the anchor, and
+    then refines all frames together.
 
     Attributes:
         config: settings.

@@ -226,7 +226,7 @@ def _pulled_by_color(pairs: _Pairs, part: Surface, surface: Surface, near: float
 
 
 def _pulled_by_edges(motion: Float[np.ndarray, "4 4"], edges: Surface, target: Target, near: float) -> _Pull:
-    """Residuals from edges, along the surface, to its edges."""
+    """Residuals from the edges of a part, along the surface, to edges of the surface."""
     at, rows, counts = _pairs(motion, edges, target, near)
     outward = target.surface.outward[rows]
     counts &= (turned(motion, edges.outward) * outward).sum(-1) > SAME_WAY

@@ -277,8 +277,8 @@ def _labelled(
 
 
 def _needed(costs: Float[np.ndarray, "n k"]) -> list[int]:
-    """The indices of the motions without which points would fit clearly worse; always with 0, no motion. Not
-    needed are one of two equal motions, and one that also flips a plate that looks alike from both sides.
+    """The indices of the motions without which points would fit clearly worse; 0, no motion, is always among
+    them. Of two equal motions one is dropped, and so is one that also flips a plate whose sides look alike.
 
     Args:
         costs: cost of each point after each motion.

@@ -68,7 +68,7 @@ class Evidence(NamedTuple):
 
     @property
     def share(self) -> Float[np.ndarray, "n"]:
-        """Share that sees through, of the cameras that see the place of a point; 0 if none does."""
+        """Of the cameras that see the place of a point, the share that sees through it; 0 if none sees it."""
         return self.through / np.maximum(self.there + self.through, 1)
 
     @property
