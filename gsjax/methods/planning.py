@@ -23,7 +23,7 @@ class Path(NamedTuple):
 
 
 class MotionPlanner(Protocol):
-    """Plans a path from the present pose of the tool. It is called again whenever the grasp changes."""
+    """Plans a path from the current pose of the tool. It is called again whenever the grasp changes."""
 
     def __call__(self, start: Float[Array, "4 4"], grasp: Grasp) -> Path:
         """A path from `start` to the grasp and beyond, with the gripper closing at the grasp."""
@@ -42,12 +42,12 @@ def straight_line(
 ) -> Path:
     """A path of straight lines: to a pre-grasp pose, along the tool's z to the grasp, close, and lift.
 
-    The standoff of the pre-grasp pose depends on the tool's distance from the approach line. So replanning
-    from any point of a plan gives the rest of that plan, and a moving object does not send the tool back.
+    The standoff of the pre-grasp pose depends on the tool's distance from the approach line. Replanning from
+    any point of a plan thus gives the rest of that plan, and a moving object does not send the tool back.
     Obstacles are avoided only at the grasp itself, where `best_grasp` has checked them.
 
     Args:
-        start: present pose of the tool, tool to world.
+        start: current pose of the tool, tool to world.
         grasp: the grasp to reach.
         standoff: largest distance of the pre-grasp pose from the grasp, metres.
         funnel: half-angle of the cone around the approach line in which the tool may advance, radians.

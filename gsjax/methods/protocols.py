@@ -46,7 +46,7 @@ class SequenceLike(Protocol):
 
 @runtime_checkable
 class Segmenter(Protocol):
-    """Labels of an image."""
+    """Segmentation of an image into labelled objects."""
 
     def __call__(
         self,

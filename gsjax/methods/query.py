@@ -31,8 +31,8 @@ class Prompt(NamedTuple):
     Attributes:
         vectors: the vector of the prompt, then those of its negatives, in the channels of the features.
         negatives: texts or names of the negatives.
-        name: its own or its nearest name; None for a text that an encoder reads.
-        min_score: the encoder's own threshold of a cosine; None if it has none.
+        name: the known name that it is, or is nearest to; None for a text that an encoder reads.
+        min_score: the encoder's own threshold on cosines; None if it has none.
         rule: name of the rule by which the threshold is 1/2.
         level: level of the features that they are compared with; None without levels.
     """
@@ -111,7 +111,7 @@ def encoded_prompt(
 def relevancy(cosines: Float[Array, "*n q"], temperature: float = TEMPERATURE) -> Float[Array, "*n"]:
     """The score of the first query: its cosine without negatives, else its smallest share in a softmax with
     one negative (Kerr et al. 2023, "LERF", section 3.4), 1/2 where both match equally. A softmax over all
-    would be small for negatives that resemble each other.
+    would be small if negatives resemble each other.
 
     Args:
         cosines: cosines of the query, then those of negatives.

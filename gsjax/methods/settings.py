@@ -17,7 +17,7 @@ def expect(config: Any, where: str = "", **ranges: tuple[float, float]) -> None:
         ranges: smallest and largest value of each field.
 
     Raises:
-        ValueError: a field is outside its range, or no number.
+        ValueError: a field is outside its range, or not a number.
     """
     for name, (low, high) in ranges.items():
         value = getattr(config, name)

@@ -1,4 +1,8 @@
-"""Parts of a moving scene, found by their motion without annotation, and edited (MotionSplicer).
+"""Parts of a moving scene, discovered from their motion without annotation, and edited (MotionSplicer).
+
+Masks of what moves are lifted to the Gaussians of one frame, the anchor, as candidate parts. The parts are
+tracked from frame to frame, and joined or divided on the way; then the scene and the poses are refined over
+all frames. The result is a scene with the trajectories of its parts, which edits transform.
 
 anchor = choose_anchor(sequence.image, sequence.num_frames, sequence.num_cameras)
 moved = moved_pixels(sequence.image, anchor, sequence.num_cameras)
@@ -8,22 +12,22 @@ problem, run = method.start(sequence, start)
 for now in drive(method, problem, run): ...
 now.result.weights, now.result.poses(t), now.result.joints()
 
-config.py     settings                            method.py      the method, for the loop
+config.py     settings                            method.py      the method, as `drive` runs it
 anchor.py     the canonical frame                 pictures.py    the pictures that steps use
 masks.py      masks in every view                 stream.py      the step of a frame
 lift.py       from masks to Gaussians             refine.py      the step over all frames, and both as one
-weights.py    the field of skinning weights       discovery.py   from frame to frame; parts join and divide
+weights.py    the field of skinning weights       discovery.py   from frame to frame; joins and divides parts
 discover.py   the start, from all of these        finish.py      removal of unneeded parts
 unify.py      which parts join or divide          result.py      scene, trajectory and joints
-motion.py     what moves, and hangs together      exposure.py    colours of cameras against the scene
-search.py     parts that jump                     absence.py     parts that leave, or are yet to come
+motion.py     which Gaussians move and connect    exposure.py    colour correction of cameras
+search.py     parts that jump                     absence.py     parts that leave, or appear later
 sizes.py      sizes of pictures, and of a pixel
-states/       parts from two states, of which no motion is seen
-trajectory.py parts over time                     screws.py      poses as rigid motions
+states/       parts from two states, with no frames in between
+trajectory.py poses of parts over time            screws.py      poses as rigid motions
 edits.py      edits of trajectories               film.py        layers rendered together
-entries.py    checked entries of scripts          operation.py   base classes of operations
+entries.py    validated entries of scripts        operation.py   base classes of operations
 operations.py the operations of scripts           timeline.py    scripts, and the films that they make
-limits.py     how far edits leave the observed    residual.py    the loss as residuals
+limits.py     how far edits exceed what was seen  residual.py    the loss as residuals
 """
 
 from gsjax.methods.parts.anchor import Anchor, choose_anchor, moved_pixels

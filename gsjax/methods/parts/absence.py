@@ -1,5 +1,5 @@
-"""Parts that are not there in some frames: they have left, or are yet to come. There, the pictures show other
-colours in their places, and are explained better without them."""
+"""Parts that are absent from some frames: they have left, or have yet to appear. In these frames, pictures
+show other colours in their places, and are explained better without them."""
 
 from functools import partial
 
@@ -19,19 +19,19 @@ from gsjax.scene.frame import Frame, one_camera
 from gsjax.scene.handles import skin
 from gsjax.scene.render import plan_render, render
 
-_ASTRAY = 1.5, 0.05  # difference of colours, relative to the anchor's, from which a part may not be there
-_CAMERAS = 4  # of a frame, in which it is drawn with and without the part
-_LESS = 0.98  # share of the larger of both losses that the smaller one may have to tell anything
-_FRAMES = 2  # in succession, at least, in which a part is not there
+_ASTRAY = 1.5, 0.05  # factor on the anchor's colour difference, and offset, above which a part may be absent
+_CAMERAS = 4  # of a frame, for which it is rendered with and without the part
+_LESS = 0.98  # share of the larger loss below which the smaller one is conclusive
+_FRAMES = 2  # in succession from which a part is absent, at least
 
 
 def absences(problem: Problem, discovery: Discovery, config: PartsConfig) -> Bool[np.ndarray, "T P"] | None:
-    """The frames in which each part is not there; None if all parts are there in all frames.
+    """The frames from which each part is absent; None if no part ever is.
 
-    Two tests are made of each part in each frame. By the colours at the projections of its Gaussians, as in
-    the search for parts that jump, it is not where it is believed to be; only then pictures are drawn, with
-    the part and without. Where they tell nothing, as of a part that is hidden, it is there if it was in the
-    frame before, seen from the anchor frame, in which all parts are.
+    Each part is tested twice in each frame. The first test compares the colours at the projections of its
+    Gaussians, as in the search for parts that jump. Only if these differ, the frame is rendered with the part
+    and without it. If that is inconclusive, as for an occluded part, the part is present if it was in the
+    neighbouring frame towards the anchor, in which all parts are.
 
     Args:
         problem: the recording.
@@ -62,10 +62,10 @@ def absences(problem: Problem, discovery: Discovery, config: PartsConfig) -> Boo
 
 
 def lasting(absent: Bool[np.ndarray, "T P"], done: Bool[np.ndarray, "T"]) -> Bool[np.ndarray, "T P"]:
-    """The absences without those of a frame alone, between frames in which the part is there.
+    """The absences without those of a single frame, between frames in which the part is present.
 
     Args:
-        absent: the frames in which each part is not there.
+        absent: the frames from which each part is absent.
         done: the frames that were found.
     """
     kept = absent.copy()
@@ -80,8 +80,7 @@ def lasting(absent: Bool[np.ndarray, "T P"], done: Bool[np.ndarray, "T"]) -> Boo
 
 
 def with_absences(discovery: Discovery, absent: Bool[np.ndarray, "T P"]) -> Discovery:
-    """The discovery with parts that rest where they were seen last, or will be seen first, while they are not
-    there.
+    """The discovery in which absent parts rest where they were last seen, or will first be seen.
 
     Args:
         discovery: the discovery of all frames.
@@ -105,7 +104,7 @@ class _Explained:
         self._cameras = problem.sequence.num_cameras
 
     def without(self, frame: Frame, t: int, part: int) -> bool | None:
-        """Whether those of some cameras of a frame are; None if there is little difference.
+        """Whether the pictures of some cameras in a frame are; None if the losses hardly differ.
 
         Args:
             frame: all cameras, at the coarse size.
@@ -138,7 +137,7 @@ class _Explained:
         return float(loss)
 
     def _chosen(self, t: int) -> list[int]:
-        """Cameras of a frame, others in each."""
+        """The cameras to use in frame t, which change from frame to frame."""
         count = min(_CAMERAS, self._cameras)
         return sorted({(t + k * self._cameras // count) % self._cameras for k in range(count)})
 
@@ -147,14 +146,14 @@ class _Explained:
 def loss_of_picture(
     canonical: Canonical, weights, pose, frame: Frame, plan: Plan, config: StreamConfig, opacities=None
 ):
-    """The loss of a picture of one camera, and what drawing it needed.
+    """The loss of a picture of one camera, and what rendering it needed.
 
     Args:
         canonical, weights, pose: the scene; see `posed`.
         frame: the camera and its picture.
-        plan: capacities of the picture.
+        plan: the render plan of the picture.
         config: settings.
-        opacities: factors of the parts' opacities, or None.
+        opacities: factors on the parts' opacities, or None.
     """
     scene = posed(canonical, weights, pose, config.blend, opacities=opacities)
     drawn = render(scene, frame.cameras, plan, roi=frame.masks)

@@ -1,4 +1,5 @@
-"""The canonical frame, and what differs from it: the difference image I_d (MotionSplicer, section 3.2)."""
+"""The canonical frame, and the pixels that differ from it by the difference image I_d (MotionSplicer,
+section 3.2)."""
 
 import warnings
 from collections.abc import Callable
@@ -17,11 +18,11 @@ _WIDTH = 96  # pixels of the thumbnails by which frames are compared
 _BLUR = 1.0  # pixels; suppresses camera noise and the aliasing of hard edges
 _NOISE_FACTOR = 4.0  # differences above this many times the noise level are motion
 _MOST_FRAMES = 16  # compared with the anchor at full size
-_NEARER = 0.02  # share of its depth by which what comes before something is nearer
-_AS_FAR = 0.01  # share of its depth by which the same surface may be nearer or farther
-_PATTERNED = 0.01  # contrast of a pattern, relative to the brightness around
-_SAME_PATTERN, _OF_CONTRAST = 0.03, 0.7  # differences of one pattern: always, and of its contrast
-_SAME_HUE = 0.03  # differences of the shares of a colour
+_NEARER = 0.02  # by which an occluder is nearer, at least, relative to the depth behind it
+_AS_FAR = 0.01  # by which the depth of the same surface may differ, relative to it
+_PATTERNED = 0.01  # least contrast of a pattern, relative to the brightness around it
+_SAME_PATTERN, _OF_CONTRAST = 0.03, 0.7  # by which a pattern may differ: always, and per its contrast
+_SAME_HUE = 0.03  # by which the shares of red, green and blue may differ
 _WINDOW, _AROUND = 7, 5  # pixels over which brightness, and differences, are averaged
 _DARK = 0.02  # brightness below which neither pattern nor hue is known
 _LEAST_MOVED = 1e-3  # share of the pixels that must change for anything to have moved
@@ -49,7 +50,7 @@ def choose_anchor(load: Load, frames: int, cameras: int, anchor: int | None = No
 
     Args:
         load: loads a picture.
-        frames, cameras: their numbers.
+        frames, cameras: number of frames, and of cameras.
         anchor: the frame to use; default: the one that differs most.
 
     Raises:
@@ -73,7 +74,7 @@ def choose_anchor(load: Load, frames: int, cameras: int, anchor: int | None = No
 
 
 def check_anchor(anchor: int | None, frames: int) -> None:
-    """Raises ValueError for an anchor that is none of the frames."""
+    """Raises ValueError for an anchor that is not one of the frames."""
     if anchor is not None and not 0 <= anchor < frames:
         raise ValueError(f"anchor: expected a frame from 0 to {frames - 1}, found {anchor}")
 
@@ -98,8 +99,8 @@ def moved_pixels(
             paper, only the frame that differs most is compared, so objects that return to their places are
             missed.
         threshold: least difference of colours, which range from 0 to 1.
-        depth: loads depths, if cameras measure them: where something nearer is seen, it covers what is there,
-            which has not moved; where the same surface is lighter or darker, only the light has changed.
+        depth: loads depths, if cameras measure them: where something nearer is seen, it occludes what is
+            there, which has not moved; where the same surface is lighter or darker, only the light changed.
 
     Raises:
         ValueError: nothing moves.
@@ -137,7 +138,7 @@ def moved_pixels(
 
 
 class _Surface(NamedTuple):
-    """What a camera sees, apart from how it is lit.
+    """What a camera sees, irrespective of the lighting.
 
     Attributes:
         depth: metres, 0 where unknown.
@@ -153,7 +154,7 @@ class _Surface(NamedTuple):
 
     @classmethod
     def of(cls, picture: Float[np.ndarray, "H W 3"], depth: Float[np.ndarray, "H W"]) -> "_Surface":
-        """What a picture and its depth show."""
+        """The surface that a picture and its depth show."""
         level = cv2.blur(picture, (_WINDOW, _WINDOW)).mean(-1, keepdims=True)
         pattern = cv2.blur(picture, (3, 3)) / np.maximum(level, _DARK)
         mean = cv2.blur(picture, (_AROUND, _AROUND))
@@ -169,8 +170,8 @@ def _is_covered(before: Float[np.ndarray, "H W"], now: Float[np.ndarray, "H W"])
 
 
 def _is_lit_otherwise(here: _Surface, now: _Surface) -> Bool[np.ndarray, "H W"]:
-    """Where the same surface is seen in other light: as far away, of the same hue, and with the same pattern,
-    if there is one: two plain surfaces cannot be told apart."""
+    """Where the same surface is seen in other light: as far away, of the same hue, and with the same pattern.
+    Surfaces without a pattern are left out, because two of them cannot be told apart."""
     same = (here.depth > 0) & (now.depth > 0) & (np.abs(now.depth - here.depth) < _AS_FAR * here.depth)
     unlike = cv2.blur(np.abs(here.pattern - now.pattern).mean(-1), (_AROUND, _AROUND))
     contrast = np.minimum(here.contrast, now.contrast)

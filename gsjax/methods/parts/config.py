@@ -18,15 +18,15 @@ class DiscoverConfig:
     threshold: float = 0.06
     """Smallest difference of colours, from 0 to 1, that counts as a change."""
     frames: int = 16
-    """Number of frames to compare with the anchor; 1, as in the paper: the one that differs most."""
+    """Number of frames to compare with the anchor; with 1, as in the paper, the one that differs most."""
     moving: float = 0.5
-    """Share of what a Gaussian shows, over all cameras, that must change in half of the frames for it to join
-    the part that it touches, if no mask shows it."""
+    """Share of a Gaussian's pixels, over all cameras, that must change in half of the frames for the Gaussian
+    to join the part that it touches, if no mask covers it."""
     difference: bool = True
     """Restrict parts to segments that changed (I_d); otherwise every segment may move."""
     depth: bool = True
-    """Where cameras measure depth, do not take for motion what something passes in front of, or what is only
-    lit otherwise, as in a shadow."""
+    """Where cameras measure depth, do not take for motion what is only occluded by something that passes in
+    front, or only lit differently, as in a shadow."""
     lift_iterations: int = 32
     """Optimisation steps that lift the masks to logits of Gaussians."""
 
@@ -68,7 +68,7 @@ class StreamConfig:
     field_rate: float = 1e-3
     """Learning rate of the skinning-weight field; 0.01 suits tables."""
     search: bool = True
-    """Look for parts that jump, by farther than they are wide, before a frame's first step."""
+    """Search for parts that jump farther than they are wide, before a frame's first step."""
     past: int = 1
     """Images of past frames in each step, from which only the weights learn (temporal consistency)."""
     blend: Literal["quaternion", "polar", "dual"] = "quaternion"
@@ -138,9 +138,9 @@ class PartsConfig:
     )
     """Hash grid of the skinning weights."""
     exposures: bool = True
-    """Give the pictures of each camera the exposure and white balance of the scene."""
+    """Correct the pictures of each camera to the exposure and white balance of the scene."""
     absences: bool = True
-    """Hide parts in frames in which they are not there: they have left, or are yet to come."""
+    """Hide parts in frames from which they are absent: they have left, or have yet to appear."""
     headroom: float = 1.6
     """Capacity of a render plan, relative to what is needed."""
     seed: int = 0

@@ -42,7 +42,7 @@ class Start(NamedTuple):
         exposures: maps of each camera's colours to those of the scene.
         masks: candidate parts in every view of the anchor frame, [C,H,W].
         losses: losses of lifting the masks (`lifting`) and of fitting the field (`warming`).
-        motions: of each part, in the world, to the other of two states; None if it is followed.
+        motions: motion of each part, in the world, to the other of two states; None if parts are tracked.
     """
 
     anchor: Anchor
@@ -65,8 +65,8 @@ def begin(
     key: PRNGKeyArray,
     masks: Int[np.ndarray, "C H W"] | None = None,
 ) -> Start:
-    """Candidate parts: Gaussians that show what changes in other frames, divided as segments of the anchor's
-    pictures are.
+    """Candidate parts: the Gaussians seen in pixels that change in other frames, divided by the segments of
+    the anchor's pictures.
 
     Args:
         sequence: the recording of synchronised cameras.
@@ -79,7 +79,8 @@ def begin(
         masks: labels of the candidate parts in every view, if known.
 
     Raises:
-        ValueError: there is only one camera, there are too few Gaussians, or nothing may move.
+        ValueError: there is only one camera, there are too few Gaussians, neither masks nor a segmenter are
+            given, or nothing may move.
     """
     if sequence.num_cameras < 2:
         raise ValueError(
@@ -131,22 +132,22 @@ def start_from(
     lifting: Float[np.ndarray, "steps"],
     motions: Float[np.ndarray, "P 4 4"] | None = None,
 ) -> Start:
-    """The start, from the weights that each Gaussian has of each part.
+    """The start of a discovery, given each Gaussian's weights for the parts.
 
     Args:
         anchor: the canonical frame.
         gaussians: the scene at the anchor frame.
-        weights: of the parts; rows sum to 1.
+        weights: each Gaussian's weights for the parts; rows sum to 1.
         cameras: all cameras at the anchor frame.
         exposures: from `exposures_of`.
         masks: candidate parts in every view of the anchor frame.
         config: settings.
         key: random key for the initial values of the field.
         lifting: losses of lifting the masks; empty if they were not lifted.
-        motions: of each part to the other of two states; None if it is followed.
+        motions: motion of each part to the other of two states; None if parts are tracked.
 
     Raises:
-        ValueError: no Gaussian is of a part.
+        ValueError: no Gaussian belongs to a part.
     """
     means, slots = np.asarray(gaussians.means), weights.shape[1]
     order, count = _movable_first(means, weights)

@@ -1,5 +1,5 @@
-"""The state of a discovery: the scene, its parts, and their poses in all frames found so far. From time to
-time parts are joined or divided (MotionSplicer, section 3.2)."""
+"""The state of a discovery: the scene, its parts, and their poses in all frames found so far. Every few
+frames, parts are joined or divided (MotionSplicer, section 3.2)."""
 
 from typing import NamedTuple
 
@@ -24,7 +24,7 @@ Pairs = tuple[tuple[int, int], ...]
 """Joined parts, as (part, the part that it was joined to), or divided ones, as (new part, the part that it
 was split from)."""
 _REWARM = 100  # steps that fit a grid after parts were joined or divided
-_LEAST_CONTACT = 0.05  # share of a part's neighbours that another part must have to touch it
+_LEAST_CONTACT = 0.05  # share of a part's neighbours that must belong to another part for them to touch
 _REST = 4  # rounds of divisions for which a newly divided part is left alone
 
 
@@ -46,7 +46,7 @@ class Discovery(NamedTuple):
         predicted: poses of the handles before the first step of `frame`.
         joined: joined parts.
         divided: divided parts.
-        absent: frames in which each part is not there; None if all always are, or before that is known.
+        absent: frames from which each part is absent; None if none ever is, or before that is known.
     """
 
     canonical: Canonical
@@ -98,7 +98,7 @@ def order_of_frames(frames: int, anchor: int) -> list[int]:
 
 
 def initial_run(start: Start, frames: int, config: PartsConfig) -> Run:
-    """The run before the first frame: all parts are at rest. Of two states, the run after the second.
+    """The run before the first frame, with all parts at rest; for two states, the run after the second.
 
     Args:
         start: from `begin`.
@@ -152,7 +152,7 @@ def open_frame(run: Run, t: int) -> Run:
 
 
 def with_prediction(run: Run, pose: HandlePose) -> Run:
-    """The run before the first step of its frame, which begins at a pose."""
+    """The run before the first step of its frame, starting from a pose."""
     kept = run.kept._replace(predicted=copied(pose))
     return run.having(params=run.params._replace(pose=pose), kept=kept)
 
@@ -165,8 +165,8 @@ def _extrapolated(first: HandlePose, second: HandlePose) -> HandlePose:
 
 
 def close_frame(run: Run, config: PartsConfig) -> Run:
-    """The run after the last step of its frame: the pose is stored, and if it is time, parts are joined and
-    divided."""
+    """The run after the last step of its frame: the pose is stored, and every few frames, parts are
+    joined and divided."""
     discovery: Discovery = run.kept
     t, quats, translations = discovery.frame, discovery.quats.copy(), discovery.translations.copy()
     found, count = discovery.found.copy(), discovery.count + 1
@@ -187,7 +187,7 @@ def weights_of_run(run: Run) -> Float[Array, "M P"]:
 
 
 def _unify(run: Run, config: PartsConfig) -> Run:
-    """The run with parts that have moved alike joined, which take the motion of the larger one."""
+    """The run after joining parts that have moved alike; the smaller takes the motion of the larger."""
     discovery: Discovery = run.kept
     weights = np.asarray(weights_of_run(run))
     into = unified(
@@ -224,7 +224,7 @@ def join_parts(
 
 
 def touched_parts(discovery: Discovery, weights: Float[np.ndarray, "M P"], part: int) -> list[int]:
-    """The parts that a part touches, to which at least 5 % of its neighbours belong, and the background.
+    """The background, and the parts that a part touches: at least 5 % of its neighbours belong to them.
 
     Args:
         discovery: the neighbours of each Gaussian.
@@ -240,7 +240,7 @@ def touched_parts(discovery: Discovery, weights: Float[np.ndarray, "M P"], part:
 
 
 def _split(run: Run, config: PartsConfig) -> Run:
-    """The run with the part divided whose sides are pulled apart most, if a slot is free and the score is
+    """The run after dividing the part whose sides are pulled apart most, if a slot is free and the score is
     significant. Both sides inherit its motion, and are joined again if they keep moving alike."""
     discovery: Discovery = run.kept
     canonical = discovery.canonical

@@ -1,6 +1,6 @@
 """Edits of part motions: pure functions from trajectories to trajectories, which compose.
 
-Each edits the given parts and leaves all others unchanged, to the bit. There are two kinds.
+Each edits the given parts and leaves all others unchanged, bit for bit. There are two kinds.
 
 - Edits of time (`speed`, `loop`, `freeze`, `isolate`) show parts as they were at other times. Motion after
   the interval from `begin` to `end` follows the edited interval, earlier or later than it did.
@@ -37,7 +37,7 @@ def at_times(trajectory: Trajectory, times: Float[Array, "S"]) -> Trajectory:
 
     Between two moments a part moves along the screw from one to the other, so that a part on a hinge stays on
     it; opacities and scales are interpolated linearly. Before the first moment and after the last, everything
-    is constant. Times of the trajectory itself are reproduced to the bit.
+    is constant. Times of the trajectory itself are reproduced bit for bit.
 
     Args:
         times: seconds, in any order.
@@ -250,7 +250,7 @@ def amplify(
     at: Scalar | None = None,
     share: Share = 1.0,
 ) -> Trajectory:
-    """Moves parts `factor` times as far along the screw to each moment, and so about their hinges.
+    """Moves parts `factor` times as far along the screw to each moment; on a hinge they stay on it.
 
     Args:
         factor: above 1 it makes subtle motion visible, below 1 damps it, 0 stops it, negative reverses it.
@@ -341,7 +341,7 @@ def _interval(trajectory: Trajectory, begin: Scalar | None, end: Scalar | None) 
 
 
 def _is_known(*numbers: Scalar) -> bool:
-    """Whether numbers have values that can be checked, as they have not while a function is traced."""
+    """Whether all numbers have concrete values that can be checked, which traced ones do not."""
     return not any(isinstance(number, jax.core.Tracer) for number in numbers)
 
 
@@ -356,7 +356,7 @@ def _only(trajectory: Trajectory, parts: Sequence[int]) -> Trajectory:
 
 
 def _with(trajectory: Trajectory, parts: Sequence[int], seen: Trajectory) -> Trajectory:
-    """The trajectory with that of some parts replaced."""
+    """The trajectory with some parts replaced by those of `seen`."""
     chosen = _checked(trajectory, parts)
     return Trajectory(trajectory.times, *_with_columns(_state(trajectory), chosen, _state(seen)))
 
@@ -378,7 +378,7 @@ def _over_time(trajectory: Trajectory, share: Share) -> Float[Array, "T 1"]:
 def _moved(
     trajectory: Trajectory, parts: Sequence[int], motions: jaxlie.SE3, where: Bool[Array, "T 1"]
 ) -> Trajectory:
-    """The trajectory with other motions of some parts at some moments; otherwise unchanged, to the bit."""
+    """The trajectory with other motions of some parts at some moments; otherwise unchanged, bit for bit."""
     old = _only(trajectory, parts)
     poses = jax.tree.map(lambda new, a: jnp.where(where[..., None], new, a), pose_of(motions), old.poses)
     return _with(trajectory, parts, eqx.tree_at(lambda t: t.poses, old, poses))

@@ -19,8 +19,8 @@ ALL = "all"
 Vector = tuple[float, ...]
 Checked = dict[str, Any]
 """Metadata of a field."""
-_LONG = 200  # most characters of a value that a message shows
-_FAR = 1e6  # more metres, degrees or seconds than are ever meant
+_LONG = 200  # characters of a value that a message shows at most
+_FAR = 1e6  # more metres, degrees or seconds than anybody means
 _EARTH = 1e8  # farther than any coordinates of places on earth reach, metres
 
 
@@ -49,7 +49,7 @@ def read(kind: type[Kind], found: Any) -> Kind:
     """The entry that a mapping describes.
 
     Raises:
-        ValueError: it is no mapping, a key is unknown or missing, or a value is not as expected.
+        ValueError: it is not a mapping, a key is unknown or missing, or a value is not as expected.
     """
     keys = {key_of(f): f for f in fields(kind)}
     if not isinstance(found, dict):
@@ -73,13 +73,13 @@ def _checked(f: Field, value: Any) -> Any:
 
 
 def shown(found: Any) -> str:
-    """A value, as messages show it."""
+    """A value as messages show it."""
     text = "nothing" if found is None else repr(found)
     return text if len(text) <= _LONG else f"{text[:_LONG]} ..."
 
 
 def did_you_mean(found: Any, known: Collection[str]) -> str:
-    """A value, as messages show it, with the most similar known name."""
+    """A value as messages show it, with the most similar known name."""
     meant = get_close_matches(str(found), known, 1)
     return f"{found!r}" + (f"; did you mean {meant[0]!r}?" if meant else "")
 
@@ -90,7 +90,7 @@ def number(wanted: str, low: float = -_FAR, high: float = _FAR, of: Callable = f
     Args:
         wanted: description for messages.
         low, high: the range.
-        of: function of the number that must be in the range, `abs` say; default: the number itself.
+        of: function of the number that must be in the range, such as `abs`; default: the number itself.
     """
 
     def check(value: Any) -> float:
@@ -145,7 +145,7 @@ def point(wanted: str) -> Checked:
 
 
 def relative(entry: Kind, origin: Float[np.ndarray, "3"] | None) -> Kind:
-    """An entry, and those in it, with its points relative to an origin; as it is if that is None."""
+    """An entry, with its points and those of nested entries relative to an origin; unchanged without one."""
     if origin is None:
         return entry
     changed = {}

@@ -1,5 +1,5 @@
-"""Exposure and white balance of each camera, against the canonical scene. Where cameras differ, a scene can
-only agree with all of them if their pictures are corrected first."""
+"""Exposure and white balance of each camera, relative to the canonical scene. Where cameras differ, a scene
+can only agree with all of them if their pictures are corrected first."""
 
 from collections.abc import Sequence
 
@@ -15,17 +15,17 @@ from gsjax.scene.render import Rendered
 AS_GIVEN = np.eye(3, 4, dtype=np.float32)
 """The map that leaves colours as they are."""
 _LEAST_ALPHA = 0.5  # pixels with a lower rendered alpha are ignored
-_TRUSTED = 0.2  # difference of colours, 0 to 1, above which something else is seen
-_ROUNDS = 3  # fits, each without what the one before explains badly
-_PRIOR = 1e-3  # weight of no correction at all, relative to the pixels
+_TRUSTED = 0.2  # difference of colours, 0 to 1, above which a pixel shows something else
+_ROUNDS = 3  # fits, each without the outliers of the one before
+_PRIOR = 1e-3  # weight of the prior, which is no correction, relative to the pixels
 
 
 def exposures_of(drawn: Sequence[Rendered], frame: Frame) -> Float[np.ndarray, "C 3 4"]:
-    """The affine map of each camera's colours to those of the scene, [colour; 1] -> colour. Their mean is
-    [I | 0]: an exposure that all cameras share belongs to the scene.
+    """The affine map from each camera's colours to those of the scene, [colour; 1] -> colour. The mean of the
+    maps is [I | 0]: an exposure that all cameras share belongs to the scene.
 
     Args:
-        drawn: the scene at the anchor frame, as each camera sees it.
+        drawn: renderings of the scene at the anchor frame, one for each camera.
         frame: all cameras in that frame; its masks select the pixels that count.
     """
     same, maps = np.eye(3, 4), []
@@ -45,7 +45,7 @@ def exposures_of(drawn: Sequence[Rendered], frame: Frame) -> Float[np.ndarray, "
 
 @jax.jit
 def corrected(frame: Frame, exposures: Float[Array, "C 3 4"] | Float[np.ndarray, "C 3 4"]) -> Frame:
-    """All cameras of a frame with the colours of the scene.
+    """All cameras of a frame, corrected to the scene's colours.
 
     Args:
         frame: all cameras.

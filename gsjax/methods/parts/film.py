@@ -1,5 +1,5 @@
-"""A film: one or several layers, each a scene with its trajectory: copies of parts, or parts of other
-scenes."""
+"""Films: one or more layers that are rendered together, each a scene with its trajectory. Further layers
+hold copies of parts, or parts of other scenes."""
 
 from collections.abc import Sequence
 
@@ -54,7 +54,7 @@ def trimmed(film: Film) -> Film:
     layers = []
     for layer in film:
         scene = layer.scene
-        # Only whether a part is visible counts, so that another opacity does not change array shapes.
+        # Only whether a part is visible matters, so that a different opacity does not change array shapes.
         shown = (np.asarray(layer.trajectory.opacities) > 0).any(axis=0).astype(scene.weights.dtype)
         rows = np.flatnonzero(scene.gaussians.opacities * (scene.weights @ shown) >= _FAINTEST)
         if len(rows) or not layers:
@@ -64,7 +64,7 @@ def trimmed(film: Film) -> Film:
 
 
 def composite(film: Film, layer: Layer, parts: Sequence[int]) -> Film:
-    """The film with parts of another scene added, at their own places; `placed` moves them."""
+    """The film with parts of another scene added, at their original positions; `placed` moves them."""
     trajectory = at_times(layer.trajectory, film[0].trajectory.times)
     return (*film, Layer(layer.scene, ghost(trajectory, parts)))
 

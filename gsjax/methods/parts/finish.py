@@ -25,7 +25,7 @@ from gsjax.scene.frame import Frame, one_camera
 from gsjax.scene.handles import HandlePose
 from gsjax.scene.render import plan_render
 
-_PICTURES, _CAMERAS = 12, 2  # by which parts are evaluated, and those of a frame at least
+_PICTURES, _CAMERAS = 12, 2  # pictures by which parts are evaluated, and fewest cameras per frame
 _LEAST_WEIGHT = 0.02
 
 
@@ -50,8 +50,8 @@ def begin_refinement(problem: Problem, run: Run, config: PartsConfig) -> Run:
 def prune_parts(
     problem: Problem, discovery: Discovery, weights: Float[np.ndarray, "M P"], config: PartsConfig
 ) -> Discovery:
-    """Removes the parts that no picture needs: from the smallest on, each part joins a part that it touches,
-    or the background, whichever raises the loss least, if it rises by less than `unify.least_gain`.
+    """Removes the parts that no picture needs: starting with the smallest, each part joins a part that it
+    touches, or the background, whichever raises the loss least, if it rises by at most `unify.least_gain`.
 
     The criterion is the loss rather than a comparison of motions: the motion of a thin part is poorly
     known, and matters little for the same reason.

@@ -17,16 +17,16 @@ from gsjax.scene.gaussians import Gaussians
 from gsjax.scene.render import render
 
 _OPTIMIZER = optax.adam(0.5)
-_CHANNELS = 32  # drawn, or voted for, at once, so that one program serves all
+_CHANNELS = 32  # rendered, or voted for, at once, so that one program serves any number
 _LEAST_ALPHA = 0.5  # pixels with a lower rendered alpha are ignored
-_SURE = 10.0  # initial logit of a label that all pixels agree on, above the others
+_SURE = 10.0  # initial logit of a label that all pixels agree on, relative to the others
 
 
 def label_votes(
     gaussians: Gaussians, cameras: Camera, plan: Plan, masks: Int[np.ndarray, "C H W"], count: int
 ) -> Float[np.ndarray, "N K"]:
-    """Votes of the masks' pixels for labels 0 to `count` - 1 of each Gaussian: the sum over the pixels of a
-    label of the Gaussian's compositing weight, w_i = alpha_i T_i; the transpose of rendering features."""
+    """The votes of each Gaussian for labels 0 to `count` - 1: the sum of its compositing weight,
+    w_i = alpha_i T_i, over the masks' pixels of each label; the transpose of rendering features."""
     total = np.zeros((gaussians.num, count), np.float32)
     for c, mask in enumerate(masks):
         present = np.intersect1d(mask, np.arange(count))
@@ -38,8 +38,8 @@ def label_votes(
 def pixel_votes(
     gaussians: Gaussians, camera: Camera, plan: Plan, values: Float[np.ndarray, "1 H W K"]
 ) -> Float[np.ndarray, "N K"]:
-    """The sum over the pixels of one camera of their values, weighted by what each Gaussian contributes to
-    them, w_i = alpha_i T_i."""
+    """For each Gaussian, the sum of the values of one camera's pixels, weighted by the Gaussian's compositing
+    weight in each, w_i = alpha_i T_i."""
     zeros = jax.device_put(np.zeros((gaussians.num, _CHANNELS), gaussians.means.dtype))
     groups = _groups_of_channels(values.astype(zeros.dtype))
     votes = [_votes(zeros, gaussians, camera, plan, group) for group in groups]
@@ -49,13 +49,13 @@ def pixel_votes(
 def drawn_features(
     gaussians: Gaussians, camera: Camera, plan: Plan, features: Float[np.ndarray, "N K"]
 ) -> Float[np.ndarray, "1 H W K"]:
-    """What one camera sees of the features of Gaussians, sum_i w_i f_i; the transpose of `pixel_votes`."""
+    """Features of Gaussians rendered for one camera, sum_i w_i f_i; the transpose of `pixel_votes`."""
     drawn = [_drawn(group, gaussians, camera, plan) for group in _groups_of_channels(features)]
     return np.concatenate(drawn, axis=-1)[..., : features.shape[-1]]
 
 
 def _groups_of_channels(values: Float[np.ndarray, "... K"]) -> list[Float[np.ndarray, "... channels"]]:
-    """The channels, as many at once as one program takes."""
+    """The channels in groups of the size that one program takes, padded with zeros."""
     count = max(1, -(-values.shape[-1] // _CHANNELS))
     padded = np.zeros((*values.shape[:-1], count * _CHANNELS), values.dtype)
     padded[..., : values.shape[-1]] = values
@@ -69,7 +69,7 @@ def _drawn(features, gaussians: Gaussians, cameras: Camera, plan: Plan):
 
 @partial(host_jit, static_argnames="plan")
 def _votes(zeros, gaussians: Gaussians, cameras: Camera, plan: Plan, values):
-    # Zeros made in here would be constant-folded through the whole render, which takes many seconds.
+    # Zeros created here would be constant-folded through the whole render, which takes many seconds.
     _, transpose = jax.vjp(lambda f: render(gaussians, cameras, plan, features=f).features, zeros)
     return transpose(values)[0]
 
@@ -84,8 +84,8 @@ def lift_masks(
 ) -> tuple[Float[Array, "N K"], Float[np.ndarray, "iterations"]]:
     """Logits whose rendering agrees with the masks, by cross-entropy, and the loss of each iteration.
 
-    The logits start from the votes of all pixels, which is the answer if each Gaussian shows in pixels of one
-    label only; rendering then resolves occlusion. Gaussians that show nowhere are background.
+    The logits start from the votes of all pixels, which are the answer if each Gaussian shows in pixels of
+    one label only; rendering then resolves occlusion. Gaussians that are visible nowhere are background.
 
     Args:
         gaussians: the canonical scene.

@@ -1,7 +1,7 @@
 """Learned limits: the observed motion of parts, and where an edited trajectory leaves it.
 
-The observed motion of a part is the path of its handle: the captured poses and the screws between them.
-Beyond it, the weights have never been compared with an image, and surfaces that no camera saw are revealed.
+The observed motion of a part is the path of its handle: the captured poses and the screw motions between
+them. Beyond it, the weights were never compared with an image, and surfaces that no camera saw are revealed.
 """
 
 from collections.abc import Mapping
@@ -56,7 +56,7 @@ def beyond_captured(captured: Layer, edited: Trajectory) -> Beyond:
     def nearest(pose: Float[Array, "P 7"]) -> Beyond:
         away = (start.inverse() @ jaxlie.SE3(pose)).log()
         share = jnp.sum(metric * away * along, axis=-1) / jnp.where(length > 0, length, 1.0)
-        # The ends too, so that a distant position is not explained by a spurious rotation.
+        # Try both ends too, so that a distant position is not explained by a spurious rotation.
         share = jnp.stack([jnp.zeros_like(share), jnp.clip(share, 0.0, 1.0), jnp.ones_like(share)])
         seen = start @ jaxlie.SE3.exp(share[..., None] * along)
         metres = jnp.linalg.norm(pose[:, 4:] - seen.translation(), axis=-1)

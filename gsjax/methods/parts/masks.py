@@ -20,9 +20,10 @@ _LEAST_KNOWN = 0.5  # share of a segment's pixels that must show one part for it
 def moving_segments(
     segments: Int[np.ndarray, "H W"], moved: Bool[np.ndarray, "H W"], least: float = _LEAST_CHANGED
 ) -> Int[np.ndarray, "H W"]:
-    """The segments of which at least the share `least` of the pixels changed; the others become 0.
+    """The segments in which at least the share `least` of the pixels changed; the others become 0.
 
-    Segments rather than pixels, because the interior of a uniform surface looks the same after it has moved.
+    Segments are selected rather than pixels, because the interior of a uniform surface looks the same after
+    it has moved.
     """
     count = segments.max() + 1
     sizes = np.bincount(segments.ravel(), minlength=count)
@@ -32,7 +33,7 @@ def moving_segments(
 
 
 def view_order(viewmats: Float[np.ndarray, "C 4 4"], first: int, focus: Float[np.ndarray, "3"]) -> list[int]:
-    """Views in an order in which each is the nearest to those before it, by the angle at `focus`.
+    """Orders the views: next comes the one that is nearest to any before it, by the angle at `focus`.
 
     Args:
         viewmats: world to camera.
@@ -72,7 +73,7 @@ def propagate_masks(
         known: (view, previous view, its mask) -> labels of the view that earlier views imply, [H, W]; -1
             where unknown.
         most: largest number of labels in the result; those with the fewest pixels are dropped.
-        room: largest number of labels before that.
+        room: largest number of labels before any are dropped.
     """
     masks: dict[int, np.ndarray] = {}
     count, last = 0, None
@@ -96,8 +97,8 @@ def propagate_masks(
 def masks_from_labels(
     labels: Int[np.ndarray, "C H W"], moved: Bool[np.ndarray, "C H W"], most: int
 ) -> Int[np.ndarray, "C H W"]:
-    """Masks from labels that agree between views: those of which enough pixels changed over all views,
-    numbered from the largest to the smallest.
+    """Masks from labels that agree between views: the labels of which enough pixels changed over all views,
+    renumbered from the largest to the smallest.
 
     Args:
         labels: 0 and below is background.

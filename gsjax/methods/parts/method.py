@@ -1,4 +1,4 @@
-"""The method of parts: the order of frames, when parts are joined or divided, and the final refinement."""
+"""The parts method: the order of frames, when parts are joined or divided, and the final refinement."""
 
 from dataclasses import dataclass, field
 
@@ -44,13 +44,13 @@ from gsjax.scene.gaussians import Gaussians
 from gsjax.scene.render import plan_render
 
 _LEAST_STEPS, _PASSES = 400, 2  # of the refinement, by default; passes over all pictures
-_SHARE_OF_SMALLER = 0.5  # of the refinement, with pictures no larger than those by which frames were followed
+_SHARE_OF_SMALLER = 0.5  # of the refinement, which uses pictures no larger than those of tracking
 
 
 @dataclass(frozen=True)
 class Parts:
-    """Parts of a moving scene (`gsjax.optim.method.Method`): frame after frame, away from the anchor, and
-    then all frames together.
+    """The parts method (`gsjax.optim.method.Method`): tracks parts frame by frame, away from the anchor, and
+    then refines all frames together.
 
     Attributes:
         config: settings.
@@ -109,7 +109,7 @@ class Parts:
             order = order_of_frames(problem.sequence.num_frames, discovery.anchor)
             run = self._opened(problem, run, order[discovery.count])
         elif self._size(problem, run) != self._size(problem, run.having(step=run.step - 1)):
-            run = run.having(guard=None)  # losses of larger pictures are others
+            run = run.having(guard=None)  # losses at another size are not comparable
         return run.having(plans=run.plans | self._missing_plans(problem, run))
 
     def brought_up_to_date(self, problem: Problem, run: Run) -> Run:
@@ -201,7 +201,7 @@ class Parts:
             jnp.asarray(discovery.anchor),
             i / self.steps_of_refinement(problem),
             run.plans[plan],
-            problem.at_once,  # surfaces in space tell poses better than pictures do
+            problem.at_once,  # measured surfaces determine poses better than pictures do
             None if discovery.absent is None else jnp.asarray(~discovery.absent[t], jnp.float32),
         )
         return batch, (plan,)

@@ -1,6 +1,6 @@
-"""Which Gaussians move: those of which what they show changes in most cameras at once. A pixel also changes
-where something else passes in front, but only for the few cameras that look along that line; what something
-comes to rest on changes for all of them, but only for a while."""
+"""Detection of the Gaussians that move. A Gaussian moves if the pixels that show it change in most cameras at
+once. Pixels also change where another object passes in front, but only in the few cameras on that line of
+sight; a surface on which something comes to rest changes in all cameras, but only for a while."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -19,21 +19,21 @@ from gsjax.scene.frame import one_camera
 from gsjax.scene.gaussians import Gaussians
 from gsjax.scene.render import Rendered
 
-_SMOOTH = 8  # Gaussians next to each other that are judged together
-_OFTEN = 8  # one in so many frames shows the change of what may move
-_SEEN = 1e-3  # pixels of which a Gaussian shows less are no evidence
+_SMOOTH = 8  # neighbouring Gaussians that are judged together
+_OFTEN = 8  # what may move changes in at least one of so many frames
+_SEEN = 1e-3  # pixels that a Gaussian must cover to provide evidence
 _TOUCHING = 16  # neighbours that may touch a Gaussian
-_LEAST_WEIGHT = 0.1  # of all parts, below which the masks do not tell the part
-_LEAST_APART, _LEAST_SHARE = 16, 0.05  # Gaussians of a part of its own, and relative to what it comes from
-_LEAST_CHANGE = 0.35  # share below which what a Gaussian shows hardly changes in any frame
+_LEAST_WEIGHT = 0.1  # of all parts together, below which the masks do not determine the part
+_LEAST_APART, _LEAST_SHARE = 16, 0.05  # Gaussians to split off, at least; relative to the largest
+_LEAST_CHANGE = 0.35  # share of change below which a Gaussian hardly changes in any frame
 
 
 class Changes(NamedTuple):
-    """The share of what each Gaussian shows, in all cameras, that has changed, 0 to 1.
+    """The share of each Gaussian's pixels, over all cameras, that change, 0 to 1.
 
     Attributes:
-        most: in an eighth of the frames, or more.
-        usual: in half of the frames, or more.
+        most: the share that is reached in an eighth of the frames, or more.
+        usual: the share that is reached in half of the frames, or more.
     """
 
     most: Float[np.ndarray, "N"]
@@ -43,7 +43,7 @@ class Changes(NamedTuple):
 def changes_of(
     gaussians: Gaussians, cameras: Camera, plan: Plan, moved: Bool[np.ndarray, "C F H W"]
 ) -> Changes:
-    """What changes in the places of Gaussians, averaged over neighbours.
+    """How much of each Gaussian's pixels changes, averaged over neighbours.
 
     Args:
         gaussians: the scene at the anchor frame.
@@ -67,7 +67,7 @@ def changes_of(
 def changing_views(
     gaussians: Gaussians, cameras: Camera, plan: Plan, changes: Changes, drawn: Sequence[Rendered]
 ) -> Bool[np.ndarray, "C H W"]:
-    """The pixels of the anchor's pictures that show Gaussians in whose places much changes in some frames, or
+    """The pixels of the anchor's pictures that show Gaussians that change much in some frames, or that show
     none at all.
 
     Args:
@@ -87,8 +87,8 @@ def changing_views(
 def with_what_moves(
     weights: Float[np.ndarray, "N P"], gaussians: Gaussians, moves: Bool[np.ndarray, "N"]
 ) -> Float[np.ndarray, "N P"]:
-    """The weights of parts, after what moves but shows in no mask has joined the nearest part that it is
-    connected to; it would stay behind as a ghost.
+    """The weights of parts, after moving Gaussians that no mask shows have joined the nearest part that they
+    are connected to. Otherwise they would stay behind as a ghost.
 
     Args:
         weights: from the lifted masks; rows sum to 1.
@@ -107,9 +107,9 @@ def with_what_moves(
 
 
 def divided_where_apart(weights: Float[np.ndarray, "N P"], gaussians: Gaussians) -> Float[np.ndarray, "N P"]:
-    """The weights of parts, after what does not hang together has become parts of its own, the largest first,
-    as far as there are slots. Masks that views share by chance tie a ball to somebody else's head; no rigid
-    motion fits both.
+    """The weights of parts, after splitting parts that are not connected: each further connected component
+    becomes a part of its own, the largest first, while slots are free. Masks that agree between views by
+    chance may tie a ball to somebody's head; no rigid motion fits both.
 
     Args:
         weights: of the parts; rows sum to 1.

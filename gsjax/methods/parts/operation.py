@@ -1,4 +1,4 @@
-"""Base classes of the operations of an edit script: `Edit`, an operation on some parts during some time;
+"""Base classes of the operations of an edit script: `Edit`, an operation on some parts over an interval;
 `TimeEdit`, which changes time; and `LookEdit`, which changes the pose or appearance of parts."""
 
 from dataclasses import dataclass, field
@@ -15,7 +15,7 @@ SECONDS = number("seconds from the film's start, 0 or more", 0.0)
 
 @dataclass(frozen=True, kw_only=True)
 class Edit(Entry):
-    """An operation on some parts of the film's first layer, during some time.
+    """An operation on some parts of the film's first layer, over an interval of time.
 
     Attributes:
         parts: names or numbers; 0 is the background, "all" every part.
@@ -39,8 +39,8 @@ class Edit(Entry):
         return cls.__name__.lower()
 
     def affected(self, trajectory: Trajectory, parts: list[int], ends: list[float]) -> list[int]:
-        """The parts that change if `parts` are named; the motion of each part of the scene `ends` at a
-        time."""
+        """The parts that change if `parts` are named; `ends` has the time at which the motion of each part of
+        the scene ends."""
         return parts
 
     def end_after(self, end: float) -> float:
@@ -64,7 +64,7 @@ class Edit(Entry):
 
 @dataclass(frozen=True, kw_only=True)
 class TimeEdit(Edit):
-    """An edit of time. The motion after `to` follows it; default of `to`: the end of the part's motion."""
+    """An edit of time. The motion after `to` follows it; `to` defaults to the end of the part's motion."""
 
     def affected(self, trajectory: Trajectory, parts: list[int], ends: list[float]) -> list[int]:
         """The parts that still move at `from`; the others stay still."""

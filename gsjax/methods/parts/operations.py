@@ -1,7 +1,8 @@
 """The operations of edit scripts: a frozen dataclass for each, checked at construction.
 
-A field's name is its key in scripts; only `from` and `to` are `begin` and `end`, as `from` is reserved in
-Python. Times are seconds of the film after the preceding edits, from 0; angles are degrees, lengths metres.
+A field's name is its key in scripts, except that the keys `from` and `to` are the fields `begin` and `end`,
+as `from` is reserved in Python. Times are seconds of the film after the preceding edits, from 0; angles are
+degrees, lengths metres.
 """
 
 import json
@@ -75,7 +76,7 @@ class Loop(TimeEdit):
 
 @dataclass(frozen=True, kw_only=True)
 class Freeze(TimeEdit):
-    """Parts stay still as they were `at` a time, and continue from there after `to`, if that is given."""
+    """Parts stay still as they were at time `at`, and continue from there after `to`, if that is given."""
 
     at: float | None = field(default=None, metadata=SECONDS)
 
@@ -174,7 +175,7 @@ class Redirect(LookEdit):
 
 @dataclass(frozen=True, kw_only=True)
 class Amplify(LookEdit):
-    """Parts move `factor` times as far from where they were `at` a time, by default the film's start."""
+    """Parts move `factor` times as far from where they were at time `at`, by default the film's start."""
 
     factor: float = field(metadata=number("a factor from -100 to 100", -100.0, 100.0) | {"example": 1.5})
     at: float | None = field(default=None, metadata=SECONDS)
@@ -277,7 +278,7 @@ def read_edits(found: Any, first: int = 1) -> tuple[Edit, ...]:
 
 
 def label(number: int, operation: str) -> str:
-    """How messages refer to an edit."""
+    """The name of an edit in messages."""
     return f"edit {number} ({operation})"
 
 
@@ -297,7 +298,7 @@ def describe_operation(operation: str) -> list[str]:
     """A sentence that describes an operation, and lines for its keys; keys that take the same values share a
     line."""
     kind, keys = OPERATIONS[operation], {}
-    for f in sorted(fields(kind), key=lambda f: f.name in _COMMON):  # else as they are declared
+    for f in sorted(fields(kind), key=lambda f: f.name in _COMMON):  # otherwise in the order of declaration
         keys.setdefault(f.metadata["wanted"], []).append(key_of(f))
     sentence = " ".join((kind.__doc__ or operation).split())
     return [sentence, *(f"{', '.join(alike)}: {wanted}" for wanted, alike in keys.items())]

@@ -1,5 +1,5 @@
-"""The pictures that steps use: of the current frame, of the past, and in the end of all frames. They are
-loaded on demand, and cached on the host or on the device while they are needed."""
+"""The pictures that steps use: those of the current frame and of past frames, and in the refinement those of
+all frames. They are loaded on demand, and cached on the host or on the device while they are needed."""
 
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache, partial
@@ -31,10 +31,10 @@ class Problem:
 
     Attributes:
         sequence: the recording of synchronised cameras.
-        past: past frames at the coarse size, on the host, with colours in bytes.
+        past: past frames at the coarse size, on the host, with uint8 colours.
         now: the current frame by size, with the weights by which its pixels were selected.
-        whole: the newest full frame, with the colours of the scene, by its index.
-        stored: full frames as in the data, on the host, with colours in bytes.
+        whole: the newest frame at full size, corrected to the scene's colours, by its index.
+        stored: full-size frames as in the data, on the host, with uint8 colours.
         at_once: whether the poses of all frames are known at the start.
     """
 
@@ -89,8 +89,8 @@ def draws_of(seed: int, t: int, cameras: int, past: tuple[int, ...], count: int,
 
 @lru_cache(maxsize=8)
 def order_of_pictures(seed: int, frames: tuple[int, ...], cameras: int, steps: int) -> list[tuple[int, int]]:
-    """(frame, camera) for each step of the refinement, with several cameras of a frame in a row. Each picture
-    comes as often as the others.
+    """(frame, camera) for each step of the refinement, with several cameras of a frame in a row. All pictures
+    are used equally often.
 
     Args:
         seed: random seed of the discovery.
@@ -151,13 +151,13 @@ def past_picture(
 
 
 def coarse_frame(problem: Problem, discovery: Discovery, t: int) -> Frame:
-    """All cameras of frame t at the coarse size, on the host, with the colours of the scene."""
+    """All cameras of frame t at the coarse size, on the host, corrected to the scene's colours."""
     return _in_floats(_coarse_in_bytes(problem, discovery, t))
 
 
 def stored_frame(problem: Problem, t: int) -> Frame:
-    """All cameras of frame t as in the data, on the host, with colours in bytes. If there is no room for all
-    frames, those that came first stay, and the newest.
+    """All cameras of frame t as in the data, on the host, with uint8 colours. If there is no room for all
+    frames, those loaded first and the newest are kept.
 
     Args:
         problem: caches the frames.
@@ -197,7 +197,7 @@ def with_part_masks(
     *,
     blend: Blend,
 ) -> Frame:
-    """The frame, masked to the pixels around the parts, at their poses and at their canonical places.
+    """The frame, masked to the pixels around the parts, both at their poses and at their canonical positions.
 
     Args:
         frame: the pictures.
@@ -219,7 +219,7 @@ def with_part_masks(
 
 
 def _whole(problem: Problem, discovery: Discovery, t: int) -> Frame:
-    """All cameras of frame t, with the colours of the scene."""
+    """All cameras of frame t, corrected to the scene's colours."""
     if t not in problem.whole:
         problem.whole.clear()
         problem.whole[t] = corrected(_in_floats(stored_frame(problem, t)), discovery.exposures)

@@ -1,9 +1,9 @@
-"""Refinement over all frames: the scene, so far fitted to the canonical frame alone, and the poses, each
-found from the previous one, descend the gradient of the loss in any picture of any frame. Only then can the
-scene learn surfaces that were revealed later, and the shadows that parts carry along.
+"""Refinement over all frames: gradient descent on the scene, so far fitted to the canonical frame alone, and
+on all poses, so far each found from the previous one. Each step draws a picture from any frame. Only here can
+the scene learn surfaces that are revealed later, and the shadows that move with parts.
 
 The paper leaves the canonical scene fixed. So do we while parts are still being discovered: a scene that may
-change would explain away the motion of an undiscovered part. `parts_step` joins both stages in one step.
+change would explain away the motion of an undiscovered part. `parts_step` combines both stages in one step.
 """
 
 from typing import Any, NamedTuple
@@ -60,7 +60,7 @@ class RefineBatch(NamedTuple):
         t, camera: their positions in the recording.
         anchor: index of the canonical frame, at which all handles are at rest.
         held: whether all poses stay as they are.
-        shown: 1 for each part that is there in the frame, else 0; None if all are.
+        shown: 1 for each part that is present in the frame, else 0; None if all are.
         progress: share of the refinement that is done, 0 to 1, over which learning rates fall.
         plan: the render plan.
     """
@@ -145,7 +145,7 @@ def refine_step(config: PartsConfig, extra_losses: ExtraLosses = ()) -> Step:
 
 
 def parts_step(config: PartsConfig, extra_losses: ExtraLosses = ()) -> Step:
-    """`stream_step` of `StreamParams`, `refine_step` of `RefineParams`; neither uses `step` or `key`.
+    """`stream_step` for `StreamParams`, and `refine_step` for `RefineParams`; neither uses `step` or `key`.
 
     Args:
         config: settings of the parts.

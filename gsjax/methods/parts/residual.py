@@ -15,7 +15,7 @@ from gsjax.optim.residuals import block_residual
 from gsjax.scene.handles import HandlePose
 from gsjax.scene.render import render
 
-_LIMIT = 1.0  # of differences of colour: none saturates, as in the loss
+_LIMIT = 1.0  # of colour differences, so that none saturates, as in the loss
 
 
 def pose_residual(
@@ -29,7 +29,8 @@ def pose_residual(
     softness: float = 0.1,
 ) -> tuple[dict[str, Float[Array, "..."]], dict[str, Any]]:
     """The residuals of `stream_loss` as a function of the pose alone, without SSIM. Half the sum of their
-    squares is the loss per pixel that counts, up to the rounding of small differences by `block_residual`.
+    squares is that loss times the number of pixels that count, but for small differences, which
+    `block_residual` rounds off.
 
     Args:
         motions: motions of all P handles, from `screws.motions_of`; the background's stays.
@@ -63,7 +64,7 @@ def pose_residual(
 
 
 def _torn(batch: StreamBatch, pose: HandlePose, config: StreamConfig) -> Float[Array, "M k 3"]:
-    """Residuals, half the sum of whose squares is `tearing`, weighted as in a frame's first step."""
+    """Residuals whose halved sum of squares is `tearing`, weighted as in a frame's first step."""
     gaps = gaps_between(batch.canonical, batch.weights, pose)
     scale = config.tear_scale * batch.canonical.pixel
     far = jnp.sqrt(jnp.sum(gaps**2, axis=-1, keepdims=True) + scale**2)

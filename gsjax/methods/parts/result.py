@@ -27,7 +27,7 @@ class PartsResult(NamedTuple):
         trajectory: poses of the parts at T frames; at rest in frames that were not found yet.
         done: the frames that were found.
         anchor: the canonical frame.
-        pixel: width of a pixel of the pictures by which parts were followed, at the moving parts, metres; the
+        pixel: width of a pixel of the pictures used for tracking, at the moving parts, metres; taken as the
             error of the poses.
         blend: how rotations are blended for a Gaussian that follows several parts.
     """
@@ -50,8 +50,8 @@ class PartsResult(NamedTuple):
 
     @property
     def layer(self) -> Layer:
-        """The scene and its trajectory over the frames that were found, as `timeline.apply` and edits take
-        them."""
+        """The scene and its trajectory over the frames that were found, the input of `timeline.apply` and
+        edits."""
         poses = jax.tree.map(lambda leaf: leaf[np.flatnonzero(self.done)], self.trajectory)
         return Layer(self.scene, poses)
 
@@ -65,7 +65,7 @@ class PartsResult(NamedTuple):
 
     def joints(self) -> dict[int, FittedJoint]:
         """The joint that explains the motion of each part best, by part, over the frames that were found and
-        in which it is there."""
+        in which it is present."""
         motions, there = motions_in_world(self.scene, self.trajectory), np.asarray(self.trajectory.opacities)
         labels, means = np.asarray(self.scene.labels), np.asarray(self.scene.gaussians.means, np.float64)
         joints = {}

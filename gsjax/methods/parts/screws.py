@@ -39,8 +39,8 @@ def turned_about(
 
 @partial(jax.jit, inline=True)
 def unwound(since: jaxlie.SE3) -> Float[Array, "T P 6"]:
-    """Twists of consecutive motions, one of which is close to the identity. A rotation of more than half a
-    turn from there, up to a full one, is not replaced by the shorter one in the opposite direction."""
+    """Logarithms of consecutive motions, one of which is close to the identity, unwound over time: a rotation
+    of more than half a turn from there, up to a full one, does not become the shorter one the other way."""
     quats = since.rotation().wxyz
     flips = jnp.where(jnp.sum(quats[1:] * quats[:-1], axis=-1) < 0, -1.0, 1.0)
     real = quats[..., 0] * jnp.concatenate([jnp.ones_like(flips[:1]), jnp.cumprod(flips, axis=0)])

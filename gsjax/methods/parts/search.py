@@ -1,6 +1,6 @@
-"""Search for parts that jump: a ball that is thrown goes farther between two frames than it is wide, so that
-no gradient leads to it. Before a frame's first step, what does not look as it should at its predicted place
-is looked for around it, by the colours at the projections of its Gaussians in all cameras."""
+"""Search for parts that jump: a thrown ball moves farther between two frames than it is wide, so that no
+gradient leads to it. Before a frame's first step, parts whose colours do not match at their predicted place
+are searched for around it, by the colours at the projections of their Gaussians in all cameras."""
 
 from typing import NamedTuple
 
@@ -21,13 +21,13 @@ from gsjax.scene.gaussians import Gaussians
 from gsjax.scene.handles import Blend, HandlePose, skin
 
 POINTS = 64
-"""Gaussians by which a part, or a group of them, is recognised."""
+"""Number of Gaussians by which a part, or a group of parts, is recognised."""
 _MOST = 0.3  # difference of colours, 0 to 1, that counts as entirely wrong
-_ASTRAY = 1.25, 0.02  # a group is looked for if its difference is so much larger than at the anchor
-_LEFT = 0.3  # share of the excess over the anchor's difference that a better place may leave
-_GRIDS = (6.0, 1.0), (1.0, 0.5), (0.5, 0.25)  # reach and spacing of the places, in radii of the group
+_ASTRAY = 1.25, 0.02  # factor on the anchor's difference, and offset, above which a group is searched for
+_LEFT = 0.3  # share of the excess over the anchor's difference that may remain at a better place
+_GRIDS = (6.0, 1.0), (1.0, 0.5), (0.5, 0.25)  # reach and spacing of the search grids, in radii of the group
 _NOWHERE = np.zeros((1, 3), np.float32)
-_INSIDE = 0.5  # share of the points that a place must keep in the pictures
+_INSIDE = 0.5  # share of the visible points that must stay inside the pictures
 
 
 class Group(NamedTuple):
@@ -36,7 +36,7 @@ class Group(NamedTuple):
     Attributes:
         parts: indices of the parts.
         rows: rows of the movable Gaussians, the most visible ones.
-        radius: distance from its middle that nearly all of its Gaussians keep, metres.
+        radius: distance from its middle within which 95 % of its Gaussians lie, metres.
     """
 
     parts: Int[np.ndarray, "p"]
@@ -45,7 +45,7 @@ class Group(NamedTuple):
 
 
 def groups_of(discovery: Discovery) -> list[Group]:
-    """The parts in groups of those that touch at the anchor frame.
+    """The parts, in groups of parts that touch at the anchor frame.
 
     Args:
         discovery: the scene at rest, with neighbours, and the weights.
@@ -68,7 +68,7 @@ def groups_of(discovery: Discovery) -> list[Group]:
 
 
 def most_visible(gaussians: Gaussians, mine: Bool[np.ndarray, "M"]) -> Int[np.ndarray, "n"]:
-    """The rows of those of some Gaussians that show most, `POINTS` of them or fewer.
+    """The rows of the most visible of some Gaussians, at most `POINTS` of them.
 
     Args:
         gaussians: M Gaussians.
@@ -80,7 +80,7 @@ def most_visible(gaussians: Gaussians, mine: Bool[np.ndarray, "M"]) -> Int[np.nd
 
 
 def colors_of(gaussians: Gaussians) -> Float[np.ndarray, "M 3"]:
-    """Their colours, the same from all sides."""
+    """The view-independent colours of Gaussians."""
     return 0.5 + SH_C0 * np.asarray(gaussians.sh0)[:, 0]
 
 
@@ -90,20 +90,19 @@ def color_differences(
     colors: Float[np.ndarray, "n 3"],
     shifts: Float[np.ndarray, "K 3"] = _NOWHERE,
 ) -> Float[np.ndarray, "K"]:
-    """The mean difference between the colours of points and of the pixels that show their places; see
-    `_costs`.
+    """The mean difference between the colours of points and of the pixels that they project to; see `_costs`.
 
     Args:
         frame: all cameras.
-        points: their places, metres.
+        points: their positions, metres.
         colors: their colours.
-        shifts: places to try, relative to theirs, metres (default: theirs alone).
+        shifts: shifts of all points to try, metres (default: none).
     """
     return np.asarray(_costs(frame.images, frame.cameras, points, colors, shifts))
 
 
 def searched(discovery: Discovery, now: Frame, anchor: Frame, blend: Blend) -> HandlePose:
-    """The predicted pose of a frame, with groups of parts shifted that look wrong there and right elsewhere.
+    """The predicted pose of a frame, with groups of parts shifted that match badly there but well elsewhere.
 
     Args:
         discovery: the scene, its weights and the predicted pose.
@@ -126,7 +125,7 @@ def searched(discovery: Discovery, now: Frame, anchor: Frame, blend: Blend) -> H
             places = best + np.float32(group.radius) * _grid(reach, spacing)
             at = color_differences(now, moved[rows], colors[rows], places)
             best, there = places[at.argmin()][None], at.min()
-        if there <= usual + _LEFT * (here - usual):  # what hides some of it is part of what is usual
+        if there <= usual + _LEFT * (here - usual):  # `usual` includes what occludes it
             shifts |= dict.fromkeys(group.parts.tolist(), best[0])
     if not shifts:
         return predicted
@@ -136,7 +135,7 @@ def searched(discovery: Discovery, now: Frame, anchor: Frame, blend: Blend) -> H
 
 
 def _grid(reach: float, spacing: float) -> Float[np.ndarray, "K 3"]:
-    """Places within a reach of the origin, which is the first of them."""
+    """Grid points within a reach of the origin, which comes first."""
     steps = spacing * np.arange(-int(reach / spacing), int(reach / spacing) + 1)
     grid = np.stack(np.meshgrid(steps, steps, steps), -1).reshape(-1, 3)
     distances = np.linalg.norm(grid, axis=-1)
@@ -153,8 +152,8 @@ def _costs(
     shifts: Float[Array, "K 3"],
 ) -> Float[Array, "K"]:
     """The mean difference between the colours of points and of the pixels that they project to, for each
-    shift of the points. Points outside a picture do not count, but a shift that keeps only half as many
-    inside as the first one is entirely wrong."""
+    shift of the points. Points outside a picture do not count, but a shift that keeps at most half as
+    many inside as the first one counts as entirely wrong."""
     height, width = images.shape[1:3]
 
     def of_camera(image, viewmat, K):

@@ -1,5 +1,5 @@
-"""Sizes: of the pictures by which a frame is followed, and of a pixel, in which distances are measured. A
-recording with larger pictures is followed by the same steps; only the refinement sees them whole."""
+"""Sizes of the pictures used for tracking, and the width of a pixel, the unit of distances. Recordings with
+larger pictures are tracked at the same sizes; only the refinement uses their full resolution."""
 
 import math
 
@@ -9,8 +9,8 @@ from jaxtyping import Float
 from gsjax.geometry.cameras import Camera
 
 COARSE, FINE = "coarse", "fine"
-"""Sizes of the pictures by which a frame is followed: smaller than in the data by `coarse_factor`, and twice
-as large as that. Their plans have the same names."""
+"""Sizes of the pictures used for tracking: smaller than in the data by `coarse_factor`, and twice as large as
+that. Their render plans have the same names."""
 COARSE_TILE = 8
 """Edge of the square blocks that make up the masks around parts, in pixels of coarse pictures."""
 _COARSE_PIXELS = 160 * 120

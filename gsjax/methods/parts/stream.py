@@ -1,6 +1,6 @@
-"""One step of the streaming optimisation (MotionSplicer, sections 3.3 and 3.4): the handles' pose at this
-frame, and the skinning weights, which all frames share, descend the gradient of the loss in the current
-picture of one camera and in past pictures, whose poses are frozen.
+"""One step of the streaming optimisation (MotionSplicer, sections 3.3 and 3.4): gradient descent on the pose
+of the handles at this frame, and on the skinning weights, which all frames share. The loss is that of the
+current picture of one camera and of past pictures, whose poses are frozen.
 """
 
 from collections.abc import Callable
@@ -180,16 +180,16 @@ def picture_loss(drawn: Rendered, frame: Frame, config: StreamConfig) -> Float[A
 def tearing(
     canonical: Canonical, weights: Float[Array, "M P"], pose: HandlePose, scale: Float[Array, ""]
 ) -> Float[Array, ""]:
-    """How much of the scene is torn: the share of pairs of neighbours whose motions pull the same point
-    apart, each counted by r^2 / (r^2 + scale^2) for a gap r. A hinge tears nothing along its axis, and parts
-    that came apart pay no more the farther they go, but a surface that no picture shows follows its
+    """How much of the scene is torn: the share of pairs of neighbours whose motions move the same point
+    apart, each counted as r^2 / (r^2 + scale^2) for a gap r. A hinge tears nothing along its axis, and parts
+    that have come apart pay hardly more for moving farther, but a surface that no picture shows follows its
     neighbours.
 
     Args:
         canonical: the scene at rest, with neighbours.
         weights: weights of its movable Gaussians.
         pose: poses of the handles.
-        scale: gap that counts by half, metres.
+        scale: gap that counts as half, metres.
     """
     squared = jnp.sum(gaps_between(canonical, weights, pose) ** 2, axis=-1)
     return jnp.mean(squared / (squared + scale**2))
@@ -325,7 +325,7 @@ def stream_step(config: StreamConfig, extra_losses: ExtraLosses = ()) -> Step:
         return StreamState(poses.init(params.pose), field, jnp.zeros_like(params.nudges))
 
     def update(params: StreamParams, state: StreamState, batch: StreamBatch, *, step, key):
-        at = params._replace(nudges=jnp.zeros_like(params.nudges))  # constants are free
+        at = params._replace(nudges=jnp.zeros_like(params.nudges))  # always 0, and a constant costs nothing
         (value, info), slope = jax.value_and_grad(loss, has_aux=True)(at, batch, step=step, key=key)
         moves, pose_state = poses.update(slope.pose, state.pose)
         unit = batch.canonical.pixel * config.final_rate**batch.progress

@@ -6,7 +6,7 @@
       - {op: speed, parts: [drawer], factor: 2}
       - {op: echo, parts: [3], copies: 3, every: 0.2, fade: 0.5}
 
-`gsjax.methods.parts.operations` has the operations and their keys.
+`gsjax.methods.parts.operations` defines the operations and their keys.
 """
 
 import re
@@ -34,11 +34,11 @@ Names = Mapping[str, int]
 LoadScene = Callable[[str], tuple[Layer, Names]]
 """Loads another run from its path: the discovered scene, and the names of its parts."""
 MOST_MOMENTS = 100_000
-"""Longest film, also while it is edited; a longer one is taken for a mistake."""
+"""Length of the longest film, also while it is edited; a longer one is taken for a mistake."""
 LENGTHS = 0.01, 86400.0
 """Shortest and longest film, seconds."""
 ROUND = 256
-"""Films are edited in multiples of this number of moments, so that a new length seldom compiles anything."""
+"""Films are edited in multiples of this number of moments, so that a new length rarely causes compilation."""
 _INSTANT = 1e-6  # seconds; so that rounding does not add a moment
 
 
@@ -179,7 +179,7 @@ def _added_by(edit: Composite, load_scene: LoadScene | None) -> tuple[list[int],
 
 
 def _edited(plan: _Plan, times: Float[np.ndarray, "T"], step: float) -> Film:
-    """The film at `times`; in between it is as long as any edit requires."""
+    """The film at `times`; while it is edited, it is as long as any edit requires."""
     layer = plan.layer
     longest = max(end for ends in (*(at.ends for at in plan.steps), plan.ends) for end in ends)
     dtype = layer.trajectory.times.dtype
@@ -240,7 +240,7 @@ def _extended(times: Float[np.ndarray, "T"], step: float, until: float) -> Float
 
 
 def _plain(entry: Entry) -> dict[str, Any]:
-    """The entry as YAML writes it, without defaults."""
+    """The entry as plain values for YAML, without defaults."""
 
     def plain(value: Any) -> Any:
         if isinstance(value, Entry):

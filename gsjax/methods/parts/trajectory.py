@@ -102,7 +102,7 @@ def gaussians_at(scene: PartScene, now: Moment, blend: Blend = "quaternion") -> 
     """The scene at a moment: parts are scaled about their handles, moved, and faded.
 
     A Gaussian between parts takes the weighted mean of their positions, as in skinning, and of their scales
-    and opacities. With scale and opacity 1 a Gaussian is unchanged, to the bit.
+    and opacities. With scale and opacity 1 a Gaussian is unchanged, bit for bit.
 
     Args:
         scene: the parts.

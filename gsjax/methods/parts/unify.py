@@ -141,7 +141,7 @@ class Cut(NamedTuple):
 
 
 def best_cut(points: Float[np.ndarray, "n 3"], pulls: Float[np.ndarray, "n 3"]) -> Cut:
-    """The plane across one of a part's principal axes whose two sides the pictures pull apart the most.
+    """The plane perpendicular to a principal axis of a part whose two sides the pictures pull apart the most.
 
     In a part that moves as one, the pulls that remain at the end of a frame are noise; in one that moves as
     two, they agree on each side. Strong pulls count little more than typical ones, because noise is strong at

@@ -1,12 +1,12 @@
-"""Parts from two states: pictures of a scene before and after its parts moved, each state seen by cameras of
-its own, with depth (the setting of PARIS). No motion is seen in between, so it is searched for.
+"""Parts from two states: pictures of a scene before and after its parts moved, each state seen by its own
+cameras, with depth (the setting of PARIS). The motion in between is not observed, so it is searched for.
 
 found = states_of(before, after)  # frames of all cameras
 found.labels, found.motions
 
-surfaces.py      points with normals and colours, and what cameras say of points
-registration.py  motions that may be, and the one that fits best near each
-search.py        the motions that together explain what is gone
+surfaces.py      points with normals and colours, and what cameras tell about points
+registration.py  initial guesses of motions, and the one that fits best near each
+search.py        the motions that together explain what has disappeared
 labels.py        which motion each point follows
 start.py         the start of a discovery from all of these
 """

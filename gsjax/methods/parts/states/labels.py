@@ -1,5 +1,5 @@
-"""Which motion each point of a surface follows: what the cameras of the other state say of it, spread over
-the surface where they say nothing (random walks, Grady 2006)."""
+"""Which motion each point of a surface follows, by the evidence of the other state's cameras. Where there is
+none, it spreads from other points along the surface (random walks, Grady 2006)."""
 
 from itertools import permutations
 
@@ -17,22 +17,22 @@ _NEIGHBORS = 10
 _COLOR = 0.05  # difference of colours at which neighbours are hardly connected
 _BEND = 0.1  # strength of the connection of neighbours with perpendicular normals
 _SAME_WAY, _SAME_COLOR = 0.7, 0.15
-_UNKNOWN = 0.4  # cost of a point of which nothing is known; of one that agrees it is 0, of others up to 1
-_MOVES = 0.1  # what it costs a point to follow a motion, unless nothing is known of it
+_UNKNOWN = 0.4  # cost of a point about which nothing is known; 0 for one that agrees, up to 1 for others
+_MOVES = 0.1  # cost of following a motion, unless nothing is known about the point
 _THERE = 0.3  # cost of a point where cameras see something, but no surface that agrees
-_SHARPNESS = 0.1  # differences of costs that count
-_PULL = 0.5  # of the cameras, relative to a connection
+_SHARPNESS = 0.1  # difference of costs that changes odds by a factor of e
+_PULL = 0.5  # weight of the cameras' evidence, relative to a connection
 _ITERATIONS = 300
 _APART = 0.5  # spacings by which the two sides of a thin plate are kept apart
-_TURNS = 3  # of labels, and of which points take the places
+_TURNS = 3  # alternations between the labels and which points take places
 
 
 def connections(surface: Surface, spacing: float) -> csr_array:
-    """How strongly neighbouring points of a surface are connected, 0 to 1: symmetric.
+    """How strongly neighbouring points of a surface are connected, 0 to 1; symmetric.
 
     Args:
         surface: the points.
-        spacing: between them, metres.
+        spacing: distance between them, metres.
     """
     count = min(_NEIGHBORS + 1, len(surface.points))
     far, near = (a[:, 1:] for a in cKDTree(surface.points).query(surface.points, k=count))
@@ -51,10 +51,10 @@ def costs_of(
 
     Args:
         motion: the motion.
-        surface: before it.
+        surface: the surface before it.
         target: the surface of the other state.
         frame: all cameras of the other state.
-        spacing: between the points, metres.
+        spacing: distance between the points, metres.
     """
     found = evidence(moved(motion, surface.points), turned(motion, surface.normals), frame, 4 / 3 * spacing)
     match = matched(motion, surface, target, spacing)
@@ -74,16 +74,16 @@ def labels_of(
 ) -> Int[np.ndarray, "n"]:
     """The motion of each point, as an index.
 
-    A point gains nothing by a place that another takes, by another motion: a wall along which a drawer slides
-    fits, where the drawer hides it, as if it had slid too, but only onto what else of the wall is seen to
-    stay. Which point takes a place is told by the labels, so both are found in turn.
+    A point gains nothing from a place that another point takes by another motion. Otherwise, the part of a
+    wall that a sliding drawer comes to hide would fit as if it had slid too, onto a part of the wall that is
+    seen to stay. Which point takes a place depends on the labels, so both are found in turn.
 
     Args:
         costs: from `costs_of`, for each motion.
         links: from `connections`.
-        surface: before the motions.
-        motions: all of them; the first is none.
-        spacing: between the points, metres.
+        surface: the surface before the motions.
+        motions: all of them; the first is the identity.
+        spacing: distance between the points, metres.
     """
     claims = _claims(costs, surface, motions, spacing)
     costs = costs + np.clip(_UNKNOWN - costs, 0, [0, *[_MOVES] * (len(motions) - 1)])
@@ -93,7 +93,7 @@ def labels_of(
         taken = np.zeros(costs.shape)
         for k, j, rows, others in claims:
             taken[rows, k] = np.maximum(taken[rows, k], shares[others, j])
-        likely = np.clip(2 * taken, 0, 1)  # wholly, from even chances on
+        likely = np.clip(2 * taken, 0, 1)  # certain, from a share of one half on
         shares = _spread(costs + worth * likely, links)
     return shares.argmax(-1)
 
@@ -104,8 +104,8 @@ def _claims(
     motions: list[Float[np.ndarray, "4 4"]],
     spacing: float,
 ) -> list[tuple[int, int, Int[np.ndarray, "m"], Int[np.ndarray, "m"]]]:
-    """Which points two motions bring to the same place: the motions, the points of the first, and those of
-    the second. Arguments as for `labels_of`."""
+    """The points that two motions bring to the same place, for each pair: the motions, the points of the
+    first, and those of the second. Arguments as for `labels_of`."""
     ways = [turned(motion, surface.normals) for motion in motions]
     places = [
         moved(motion, surface.points) + _APART * spacing * way
@@ -122,7 +122,7 @@ def _claims(
 
 
 def _spread(costs: Float[np.ndarray, "n k"], links: csr_array) -> Float[np.ndarray, "n k"]:
-    """How likely each point follows each motion: where the costs do not tell, as its neighbours do."""
+    """How likely each point follows each motion; where the costs do not tell, as likely as its neighbours."""
     likely = np.exp(-(costs - costs.min(1, keepdims=True)) / _SHARPNESS)
     likely /= likely.sum(1, keepdims=True)
     pull = _PULL * (likely.max(1) - 1 / costs.shape[1]) + 1e-4

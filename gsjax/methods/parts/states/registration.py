@@ -1,5 +1,5 @@
-"""Rigid motions between two surfaces: guesses of all that joints allow, and the motion that fits best near
-one (point to plane, Chen and Medioni 1992)."""
+"""Registration of two surfaces by rigid motions: initial guesses of the motions that joints allow, and the
+motion that fits best near a guess (point to plane, Chen and Medioni 1992)."""
 
 from functools import cached_property
 from typing import NamedTuple
@@ -13,20 +13,20 @@ from gsjax.methods.parts.states.surfaces import Surface, unlike
 
 _MOST_CELLS = 4e6  # of the grid that finds nearest points
 _BORDER = 4  # cells around it
-_ALIKE = np.cos(np.radians(8)), np.cos(np.radians(25))  # normals of one direction, and of two
-_FEWEST = 0.02  # share of the normals that makes a direction
-_SLIDES = np.arange(0.04, 0.75, 0.03)  # of the size of the scene
+_ALIKE = np.cos(np.radians(8)), np.cos(np.radians(25))  # of normals of one direction (least), of two (most)
+_FEWEST = 0.02  # share of the normals that a direction needs
+_SLIDES = np.arange(0.04, 0.75, 0.03)  # in sizes of the scene
 _TURNS = np.radians(np.arange(8, 180, 8))
 SAME_WAY = 0.6
-"""Least cosine between normals that may belong together."""
-_CLOSER = 0.75  # by which the reach falls from round to round
-_PURE = 0.01  # weight of not sliding along the axis of a turn, relative to the points ...
-_PULLED = 0.3  # ... and the longest slide that it counts, in reaches
-_TURNS_AT_ALL = 0.05  # radians: a motion that turns by less counts as a slide
-_DARK, _LIT = 0.02, np.log(2.5)  # brightness that tells nothing; by how much light may change
-_CONTRAST = 0.1  # difference in brightness that pulls as much as the reach
-_LESS = 0.4  # pull of edges and colours, relative to that of planes, which are measured better
-_TELLING = 8  # points that tell how a side is lit
+"""Least cosine between normals of points that may correspond."""
+_CLOSER = 0.75  # factor on the reach from round to round
+_PURE = 0.01  # weight of the penalty on sliding along the rotation axis, relative to the points ...
+_PULLED = 0.3  # ... and the slide beyond which it pulls no harder, in reaches
+_TURNS_AT_ALL = 0.05  # radians; a motion that rotates by less counts as a translation
+_DARK, _LIT = 0.02, np.log(2.5)  # brightness that is not informative; largest log change of the lighting
+_CONTRAST = 0.1  # difference in brightness that counts as much as the reach
+_LESS = 0.4  # weight of edges and colours, relative to that of planes, which are measured better
+_TELLING = 8  # fewest points from which the lighting of a side is estimated
 
 
 class Target:
@@ -71,19 +71,19 @@ class Target:
 def moved(
     motion: Float[np.ndarray, "*k 4 4"], points: Float[np.ndarray, "n 3"]
 ) -> Float[np.ndarray, "*k n 3"]:
-    """Points after motions."""
+    """Points moved by rigid motions."""
     return points @ np.swapaxes(motion[..., :3, :3], -1, -2) + motion[..., None, :3, 3]
 
 
 def turned(
     motion: Float[np.ndarray, "*k 4 4"], normals: Float[np.ndarray, "n 3"]
 ) -> Float[np.ndarray, "*k n 3"]:
-    """Normals after motions."""
+    """Normals rotated by rigid motions."""
     return normals @ np.swapaxes(motion[..., :3, :3], -1, -2)
 
 
 def axes_of(normals: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "3 3"]:
-    """Three perpendicular directions that most of the normals have, as rows.
+    """Three perpendicular directions, the most frequent ones among the normals, as rows.
 
     Args:
         normals: of a surface.
@@ -112,12 +112,13 @@ def axes_of(normals: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "3 3"]:
 def guesses(
     points: Float[np.ndarray, "n 3"], axes: Float[np.ndarray, "3 3"], size: float
 ) -> Float[np.ndarray, "k 4 4"]:
-    """Slides along axes, and turns about lines along them through edges and the middle of the points' box.
+    """Initial guesses: translations along axes, and rotations about lines parallel to them, through edges and
+    the middle of the points' bounding box.
 
     Args:
-        points: of a part, metres.
+        points: points of a part, metres.
         axes: three perpendicular directions.
-        size: of the scene, metres.
+        size: size of the scene, metres.
     """
     shifts = size * np.concatenate([-_SLIDES, _SLIDES])[:, None]
     slides = np.tile(np.eye(4), (3 * len(shifts), 1, 1))
@@ -145,15 +146,15 @@ def registered(
     least: float,
     rounds: int = 10,
 ) -> Float[np.ndarray, "4 4"]:
-    """The motion near a guess that brings a part onto a surface. Where the surface does not tell, it turns
-    without sliding along its axis.
+    """The motion near a guess that registers a part with a surface. Where the surface leaves this open, it
+    rotates without sliding along its axis.
 
     Args:
         motion: the guess.
-        part: before the motion.
+        part: the part before the motion.
         target: the surface after it.
-        reach: distance that counts in the first round, metres.
-        least: the same in the last ones.
+        reach: distance within which points are matched in the first round, metres.
+        least: the same in the last rounds.
         rounds: number of rounds.
     """
     edges = part.of(part.outward.any(-1))
@@ -186,7 +187,7 @@ def registered(
 
 
 class _Pull(NamedTuple):
-    """Where points are pulled, in which direction, and how far: metres, or as much as metres."""
+    """Residuals at points, each along a direction: gaps in metres, or weighted to be comparable."""
 
     at: Float[np.ndarray, "m 3"]
     along: Float[np.ndarray, "m 3"]
@@ -194,7 +195,7 @@ class _Pull(NamedTuple):
 
 
 class _Pairs(NamedTuple):
-    """Points after a motion, the rows of the surface nearest to them, and whether the two may be one."""
+    """Points after a motion, the rows of the nearest surface points, and whether the two may correspond."""
 
     at: Float[np.ndarray, "n 3"]
     rows: Int[np.ndarray, "n"]
@@ -209,14 +210,14 @@ def _pairs(motion: Float[np.ndarray, "4 4"], part: Surface, target: Target, near
 
 
 def _pulled_flat(pairs: _Pairs, surface: Surface) -> _Pull:
-    """Points to the plane of the surface."""
+    """Residuals from points to the tangent planes of the surface."""
     at, rows, counts = pairs
     normals = surface.normals[rows]
     return _Pull(at[counts], normals[counts], ((surface.points[rows] - at) * normals).sum(-1)[counts])
 
 
 def _pulled_by_color(pairs: _Pairs, part: Surface, surface: Surface, near: float) -> _Pull:
-    """Points, along the surface, to where it is as bright as they are (Park et al. 2017)."""
+    """Residuals from points, along the surface, to where it is as bright as they are (Park et al. 2017)."""
     at, rows, counts = pairs
     scale, slope = _LESS * near / _CONTRAST, surface.slope[rows]
     bright = part.brightness * _relit(part, surface.brightness[rows], counts)
@@ -225,7 +226,7 @@ def _pulled_by_color(pairs: _Pairs, part: Surface, surface: Surface, near: float
 
 
 def _pulled_by_edges(motion: Float[np.ndarray, "4 4"], edges: Surface, target: Target, near: float) -> _Pull:
-    """Edges, along the surface, to edges."""
+    """Residuals from the edges of a part, along the surface, to edges of the surface."""
     at, rows, counts = _pairs(motion, edges, target, near)
     outward = target.surface.outward[rows]
     counts &= (turned(motion, edges.outward) * outward).sum(-1) > SAME_WAY
@@ -238,8 +239,8 @@ class Match(NamedTuple):
 
     Attributes:
         far: distances to the nearest points of the surface, metres.
-        off: distances to the planes of these, metres.
-        cosines: between the normals of the two.
+        off: distances to their tangent planes, metres.
+        cosines: cosines between both normals.
         unlike: how unlike their colours are, 0 to 1.
     """
 
@@ -250,14 +251,14 @@ class Match(NamedTuple):
 
 
 def matched(motion: Float[np.ndarray, "*k 4 4"], part: Surface, target: Target, near: float) -> Match:
-    """How the points of a part match a surface, after one motion or each of many. What turns is lit
-    otherwise: colours are compared after each side of the part is made as bright as what it matches.
+    """How the points of a part match a surface, after one motion or each of many. A part that rotates is lit
+    differently, so colours are compared after making each of its sides as bright as what it matches.
 
     Args:
         motion: the motions.
-        part: before them.
+        part: the part before them.
         target: the surface after them.
-        near: distance of the points that tell how a side is lit, metres.
+        near: distance within which points are used to estimate how a side is lit, metres.
     """
     at, surface = moved(motion, part.points), target.surface
     far, rows = target.nearest(at)
@@ -271,12 +272,12 @@ def matched(motion: Float[np.ndarray, "*k 4 4"], part: Surface, target: Target, 
 def _relit(
     part: Surface, brightness: Float[np.ndarray, "*k n"], tells: Bool[np.ndarray, "*k n"]
 ) -> Float[np.ndarray, "*k n"]:
-    """How many times as bright each point of a part is to be, by what the points of its side match.
+    """The factor on the brightness of each point of a part, estimated from what the points of its side match.
 
     Args:
         part: the points.
-        brightness: of what each matches.
-        tells: whether it does.
+        brightness: brightness of the surface point that each matches.
+        tells: whether to use each match.
     """
     brighter = np.log((brightness + _DARK) / (part.brightness + _DARK))
     side, times = _side(part.normals), np.ones(brighter.shape)
@@ -298,15 +299,15 @@ def _side(normals: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, "n"]:
 def likeness(
     motion: Float[np.ndarray, "4 4"], part: Surface, target: Target, near: float, color: float
 ) -> Float[np.ndarray, "n"]:
-    """How well the points of a part agree with the surface that a motion brings them onto, 0 to 1: in place,
-    normal and colour.
+    """How well the points of a part agree with the surface that a motion brings them onto, 0 to 1: in
+    position, normal and colour.
 
     Args:
         motion: the motion.
-        part: before it.
+        part: the part before it.
         target: the surface after it.
-        near: distance that counts, metres.
-        color: how unlike colours may be, 0 to 1.
+        near: largest distance, metres.
+        color: largest difference of colours, 0 to 1.
     """
     match = matched(motion, part, target, near)
     fits = (match.far < near) & (match.cosines > SAME_WAY)

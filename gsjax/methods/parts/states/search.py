@@ -1,4 +1,5 @@
-"""The motions that together explain what is gone from where it was: guessed by pieces, judged by all."""
+"""Search for the motions that together explain the points that have disappeared from where they were. Motions
+are guessed from pieces of the surface, and judged by all of it."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -26,26 +27,26 @@ from gsjax.scene.frame import Frame
 
 _SPACING = 1.5  # pixels between the points of a surface
 _TOLERANCE = 2.0  # pixels by which depth may be off
-_REACH = 8.0  # pixels from which a motion is found
-_LEAST_THROUGH = 2, 1 / 3  # cameras, and their share, that see through what is gone
-_SMOOTH = 9  # points next to each other that are judged together
-_MOST_PIECES, _LEAST_PIECE = 40, 30  # pieces, and the points of one
-_BENDS = np.cos(np.radians(25))  # between normals of neighbours in one piece
-_FEW, _MANY = 120, 6000  # points by which a guess of a piece, and one of all, are judged
-_BEST, _SOME = 30, 1000  # guesses of a piece that are followed, by at most so many points
-_COLOR = 0.15  # how unlike colours may be
-_BLOCKED = 0.3  # share of the cameras that may see through where a point is to be
-_EXPLAINS = 0.02  # least share of what is gone that a motion must explain
-_FRESH = 0.25  # least share of what a motion explains that those before it do not, or it repeats them
-_HIDDEN = 0.3  # what explaining a point is worth that another motion brings where no camera sees
-_ALONGSIDE = 10.0  # pixels from the points that a motion explains within which it hides its own
-_FAR_COSTS = 0.6  # share of its gain that a motion as far as the scene is large loses
+_REACH = 8.0  # pixels within which registration finds a motion
+_LEAST_THROUGH = 2, 1 / 3  # cameras, and their share, that must see through a point that is gone
+_SMOOTH = 9  # neighbouring points that are judged together
+_MOST_PIECES, _LEAST_PIECE = 40, 30  # most pieces, and fewest points of a piece
+_BENDS = np.cos(np.radians(25))  # between normals of neighbours in one piece, at least
+_FEW, _MANY = 120, 6000  # points by which a guess is judged: of its piece, and of all that is gone
+_BEST, _SOME = 30, 1000  # guesses of a piece that are refined, and by how many points at most
+_COLOR = 0.15  # largest difference of colours that match
+_BLOCKED = 0.3  # share of the cameras that may see through the place to which a point moves
+_EXPLAINS = 0.02  # share of what is gone that a motion must explain, at least
+_FRESH = 0.25  # share of what a motion explains that must be new, or it repeats those before it
+_HIDDEN = 0.3  # value of explaining a point that an earlier motion may have moved out of sight
+_ALONGSIDE = 10.0  # pixels from the points that a motion explains within which it may hide others
+_FAR_COSTS = 0.6  # share of its gain that a motion loses if it is as long as the scene is large
 _MOST_MOTIONS = 30
 _RIVALS, _RIVAL = 3, 0.5  # motions among which the best is chosen, and their least gain, relative to it
-_BESIDE = -8, -4, 4, 8  # pixels beside a motion from which a better one is looked for ...
-_TIMES_BESIDE = 3  # ... and from that again
-_ROUNDS = 2  # of labels and motions in turn
-_NEEDED, _LEAST_PART = 0.15, 100  # by how much worse, and how many, points would fit without a motion
+_BESIDE = -8, -4, 4, 8  # offsets, pixels, from which a motion better than the present one is sought ...
+_TIMES_BESIDE = 3  # ... and how many times
+_ROUNDS = 2  # alternations between labels and motions
+_NEEDED, _LEAST_PART = 0.15, 100  # how much worse, and how many, points must fit without a motion
 
 
 class States(NamedTuple):
@@ -54,7 +55,7 @@ class States(NamedTuple):
     Attributes:
         surface: points of the first state.
         labels: the motion of each point, 0 for none.
-        motions: from the first state to the second; the first of them is none.
+        motions: from the first state to the second; the first is the identity.
     """
 
     surface: Surface
@@ -63,15 +64,15 @@ class States(NamedTuple):
 
 
 def states_of(before: Frame, after: Frame, seed: int = 0) -> States:
-    """The parts that move rigidly from one state to another, and their motions: along an axis or about one
+    """The parts that move rigidly from one state to another, and their motions: along an axis or about one,
     unless the cameras tell otherwise.
 
     Args:
         before, after: all cameras of a state, with depth, 0 where unknown.
-        seed: of the points that judge guesses.
+        seed: random seed of the points by which guesses are judged.
 
     Raises:
-        ValueError: nothing has moved, or by no motion that is found.
+        ValueError: a state has no depth, nothing has moved, or no motion is found that explains it.
     """
     if not all((np.asarray(frame.depths) > 0).any() for frame in (before, after)):
         raise ValueError("frames: expected depth in both states, found none that is known")
@@ -105,7 +106,7 @@ def states_of(before: Frame, after: Frame, seed: int = 0) -> States:
 
 
 def _seen_through(surface: Surface, other: Frame, pixel: float) -> Bool[np.ndarray, "n"]:
-    """The points of a state that are not there in the other."""
+    """The points of one state that are gone in the other: its cameras see through them."""
     seen = evidence(surface.points, None, other, _TOLERANCE * pixel)
     away = (seen.through >= _LEAST_THROUGH[0]) & (seen.share > _LEAST_THROUGH[1])
     near = cKDTree(surface.points).query(surface.points, k=min(_SMOOTH, len(away)))[1]
@@ -132,7 +133,7 @@ def _candidates(
     pixel: float,
     random: np.random.Generator,
 ) -> list[Float[np.ndarray, "4 4"]]:
-    """The motions that bring a piece of what is gone onto what has come."""
+    """Motions that bring a piece of what is gone onto what is new in the other state."""
     common, found = axes_of(np.concatenate([lost.normals, new.surface.normals])), []
     for rows in _pieces(lost, 2.5 * pixel):
         piece = lost.of(rows)
@@ -153,12 +154,12 @@ def _candidates(
 
 
 def _best_apart(costs: Float[np.ndarray, "k"], places: Float[np.ndarray, "k n 3"], apart: float) -> list[int]:
-    """Guesses of the least costs that bring points to places that are apart.
+    """The guesses of least cost, without those that bring points close to where a better guess brings them.
 
     Args:
-        costs: of each guess.
+        costs: cost of each guess.
         places: where each brings the points, metres.
-        apart: mean distance, metres.
+        apart: mean distance that counts as close, metres.
     """
     chosen: list[int] = []
     for k in np.argsort(costs, kind="stable").tolist():
@@ -178,9 +179,9 @@ def _explaining(
     size: float,
     pixel: float,
 ) -> list[Float[np.ndarray, "4 4"]]:
-    """The motions that explain most of what is gone, one after the other, each by points and by places that
-    those before have not used; of motions that explain as much, the shorter. What goes where no camera sees
-    is explained in part."""
+    """The motions that explain most of what is gone, chosen greedily: each is judged by points and places
+    that those before it have not used, and of motions that explain as much, the shorter wins. Points that
+    move out of sight count as explained in part."""
 
     def evidence_for(motion: Float[np.ndarray, "4 4"]) -> Evidence:
         return evidence(moved(motion, some.points), turned(motion, some.normals), after, _TOLERANCE * pixel)
@@ -241,8 +242,8 @@ def _beside(
     score: Callable[[Float[np.ndarray, "4 4"]], float],
     pixel: float,
 ) -> tuple[float, Float[np.ndarray, "4 4"]]:
-    """The best score, and its motion: of one, and of those that are found from there, and from places beside
-    it along the axes of the part: a plate whose edges are hidden may lie off within its plane."""
+    """The best score and its motion, among the given one and those that registration finds from it and from
+    offsets along the axes of the part: a plate whose edges are hidden may be off within its plane."""
     axes = axes_of(part.normals)
     steps = pixel * np.concatenate([np.zeros((1, 3)), *(way * axes for way in _BESIDE)])
     best, highest = motion, score(motion)
@@ -260,7 +261,7 @@ def _beside(
 def _labelled(
     surface: Surface, motions: list[Float[np.ndarray, "4 4"]], target: Target, after: Frame, pixel: float
 ) -> tuple[Int[np.ndarray, "n"], Float[np.ndarray, "k 4 4"]]:
-    """The points of each motion, and the motions by all of their points, in turn."""
+    """The label of each point, and each motion registered by all of its points, found in turn."""
     spacing = _SPACING * pixel
     links, every = connections(surface, spacing), [np.eye(4), *motions]
     for _ in range(_ROUNDS):
@@ -276,11 +277,11 @@ def _labelled(
 
 
 def _needed(costs: Float[np.ndarray, "n k"]) -> list[int]:
-    """The motions without which points would fit clearly worse; 0, none, is one of them. One that also turns
-    over a plate that looks alike from both sides is not, nor is one of two that are the same.
+    """The indices of the motions without which points would fit clearly worse; 0, no motion, is always among
+    them. Of two equal motions one is dropped, and so is one that also flips a plate whose sides look alike.
 
     Args:
-        costs: of each point after each motion.
+        costs: cost of each point after each motion.
     """
     kept = list(range(costs.shape[1]))
     while len(kept) > 1:

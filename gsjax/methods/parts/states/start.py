@@ -30,7 +30,7 @@ def begin_with_states(
         key: random key for the initial values of the field.
 
     Raises:
-        ValueError: nothing has moved, or no Gaussian is where something has.
+        ValueError: nothing has moved, or no Gaussian lies where something has.
     """
     frame = sequence.frame(anchor.frame)
     states = states_of(frame, sequence.frame(1 - anchor.frame), config.seed)
@@ -52,7 +52,7 @@ def begin_with_states(
 
 
 def _of_the_largest(states: States, slots: int) -> States:
-    """The states with their parts from the largest to the smallest, and as many as there are slots for."""
+    """The states with their parts ordered from the largest to the smallest, as many as there are slots."""
     sizes = np.bincount(states.labels, minlength=len(states.motions))
     order = [0, *(1 + np.argsort(-sizes[1:], kind="stable"))][:slots]
     renamed = np.zeros(len(sizes), int)
@@ -61,7 +61,7 @@ def _of_the_largest(states: States, slots: int) -> States:
 
 
 def _weights(states: States, means: Float[np.ndarray, "N 3"], slots: int) -> Float[np.ndarray, "N P"]:
-    """The weights of Gaussians, as most of the points around each are labelled."""
+    """One-hot weights of Gaussians, by the most frequent label of the points around each."""
     points = states.surface.points
     tree = cKDTree(points)
     spacing = np.median(tree.query(points[:: len(points) // 1000 + 1], k=2)[0][:, 1])
@@ -76,7 +76,7 @@ def _weights(states: States, means: Float[np.ndarray, "N 3"], slots: int) -> Flo
 
 
 def _masks(states: States, cameras: Camera, count: int) -> Int[np.ndarray, "C H W"]:
-    """The labels at the pixels that points project to, 0 elsewhere; what is in front is not considered."""
+    """The labels at the pixels that points project to, 0 elsewhere; occlusion is ignored."""
     masks = np.zeros((count, cameras.height, cameras.width), np.int32)
     moving = states.labels > 0
     points, labels = states.surface.points[moving], states.labels[moving]

@@ -1,5 +1,5 @@
-"""The surfaces that depth cameras measure, as points, and what cameras say of points: there is a surface, or
-they see through."""
+"""Surfaces that depth cameras measure, as points, and what cameras tell about a point: they see a surface
+there, or see through it."""
 
 from typing import NamedTuple
 
@@ -16,19 +16,19 @@ from gsjax.geometry.neighbors import voxel_thin
 from gsjax.optim.compiler import host_jit
 from gsjax.scene.frame import Frame
 
-_BEND_OF_NOISE = 1.65  # median size of the second difference of three numbers, in standard deviations
-_LEAST_NOISE, _MOST_NOISE = 5e-4, 4.0  # of depth, relative; differences that are noise, in its deviations
-_WIDTH = 3.0  # pixels of the average
-_FAR_AWAY = 20.0  # how far unknown depth is beyond all other, in differences that are noise
-_LEAST_FACING = 0.25  # cosine of the angle of sight below which depth says little of a normal
-_STEEPEST = 6.0  # pixels between the points of neighbouring pixels, above which there is an edge
-_FACES = 0.2  # cosine of the angle of sight below which a point is not judged
+_BEND_OF_NOISE = 1.65  # median of absolute second differences of white noise, in standard deviations
+_LEAST_NOISE, _MOST_NOISE = 5e-4, 4.0  # of depth, relative; largest noise, in standard deviations
+_WIDTH = 3.0  # of the filter, pixels
+_FAR_AWAY = 20.0  # how far unknown depth is put behind all other, in differences that are noise
+_LEAST_FACING = 0.25  # cosine between line of sight and normal below which a normal is poorly known
+_STEEPEST = 6.0  # pixels between the points of neighbouring pixels above which there is an edge
+_FACES = 0.2  # cosine between line of sight and normal below which a camera does not judge a point
 _APART = 0.5  # spacings by which the two sides of a thin plate are kept apart
-_AROUND, _WITHIN = 24, 3.0  # points around one, and spacings within which they are
+_AROUND, _WITHIN = 24, 3.0  # neighbours of a point, and their largest distance, in spacings
 _FLAT = 0.8  # cosine between the normals of points on one side of an edge
-_STIFF = 0.01  # of the slope of brightness, relative to points a spacing away
-_ONE_SIDED = 0.3  # how far off the points around one are in the mean, at an edge; on a straight one 0.42
-_ROOM = 4096  # points are judged in multiples of it, so that few shapes are compiled
+_STIFF = 0.01  # regularisation of the slope of brightness, relative to points a spacing away
+_ONE_SIDED = 0.3  # mean offset of neighbours at an edge, relative to the farthest; 0.42 at a straight edge
+_ROOM = 4096  # points are padded to multiples of it, so that few shapes are compiled
 
 
 class Surface(NamedTuple):
@@ -51,12 +51,12 @@ class Surface(NamedTuple):
     slope: Float[np.ndarray, "n 3"]
 
     def of(self, rows: Int[np.ndarray, "m"] | Bool[np.ndarray, "n"]) -> "Surface":
-        """Some of the points."""
+        """The surface with some of its points."""
         return Surface(*(values[rows] for values in self))
 
 
 class Evidence(NamedTuple):
-    """What cameras say of each of n points.
+    """What cameras tell about each of n points.
 
     Attributes:
         there: number of cameras that see a surface there.
@@ -68,7 +68,7 @@ class Evidence(NamedTuple):
 
     @property
     def share(self) -> Float[np.ndarray, "n"]:
-        """Share of the cameras that see the place of a point, which see through it; 0 if none does."""
+        """Of the cameras that see the place of a point, the share that sees through it; 0 if none sees it."""
         return self.through / np.maximum(self.there + self.through, 1)
 
     @property
@@ -78,12 +78,12 @@ class Evidence(NamedTuple):
 
 
 def unlike(one: Float[np.ndarray, "*n 3"], other: Float[np.ndarray, "*m 3"]) -> Float[np.ndarray, "*m"]:
-    """How unlike colours are, 0 to 1."""
+    """Mean absolute difference of colours, 0 to 1."""
     return np.abs(one - other).mean(-1)
 
 
 def pixel_width(frame: Frame) -> float:
-    """Width of a pixel at the depth of what is seen, metres: the median over the cameras.
+    """Width of a pixel at the depth of the visible surfaces, metres; the median over the cameras.
 
     Args:
         frame: all cameras, with depth.
@@ -94,8 +94,8 @@ def pixel_width(frame: Frame) -> float:
 
 
 def steadied(frame: Frame) -> Frame:
-    """A frame whose depth has less noise: where it is measurable, depth is averaged with the depth around it
-    that differs by no more (a bilateral filter).
+    """The frame with less noise in its depth: if noise is measurable, depth is averaged with the depth around
+    it that differs by no more than noise does (a bilateral filter).
 
     Args:
         frame: all cameras, with depth, 0 where unknown.
@@ -149,11 +149,11 @@ def around(
     colors: Float[np.ndarray, "n 3"],
     spacing: float,
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n"], Float[np.ndarray, "n 3"]]:
-    """What the points around each tell: `Surface.outward`, `brightness` and `slope`.
+    """What the neighbours of each point tell: `Surface.outward`, `brightness` and `slope`.
 
     Args:
-        points, normals, colors: of the surface.
-        spacing: between the points, metres.
+        points, normals, colors: those of the surface.
+        spacing: distance between the points, metres.
     """
     if not len(points):
         return points, np.zeros(0), points
@@ -187,11 +187,11 @@ def evidence(
     frame: Frame,
     tolerance: float,
 ) -> Evidence:
-    """What the cameras of a frame say of points. Any of the 3 x 3 pixels around a point's may show it.
+    """What the cameras of a frame tell about points. Any of the 3 x 3 pixels around a projection may show it.
 
     Args:
         points: metres, world.
-        normals: of the points, of which only those that face a camera are judged by it; None: all are.
+        normals: normals of the points; a camera judges only points that face it. None: it judges all.
         frame: all cameras, with depth, 0 where unknown.
         tolerance: difference in depth that counts as the same, metres.
     """
