@@ -5,7 +5,7 @@ images     IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME    and a line of (X Y PO
 points3D   POINT3D_ID X Y Z R G B ERROR TRACK...
 
 Each is a .txt or .bin file (little endian; lengths as uint64) in sparse/0, sparse or the folder itself; the
-photographs are in images. Where sparse holds several reconstructions, one has to be chosen. Some exporters
+photographs are in images. If sparse holds several reconstructions, one has to be chosen. Some exporters
 leave out the lines of points in images.txt. The layouts are described at colmap.github.io/format.html.
 """
 
@@ -41,7 +41,7 @@ class Model(NamedTuple):
 
     Attributes:
         folder: where they lie.
-        cameras, images: the two files without which there is none.
+        cameras, images: the two files that every reconstruction has.
         points: the file of its points; None if there is none.
     """
 
@@ -58,7 +58,7 @@ def read_colmap(
     """The registered photographs of a reconstruction, sorted by name, and its points.
 
     Photographs whose file is missing or whose pose is not finite are left out, with a DataWarning that counts
-    them. Distorted photographs are undistorted (see `gsjax.data.lens`); transparent ones are shown before
+    them. Distorted photographs are undistorted (see `gsjax.data.lens`); transparent ones are composited on
     white.
 
     Args:
@@ -66,7 +66,7 @@ def read_colmap(
         images: name of the photographs' folder in it; masks/NAME.png beside it mark the pixels that count.
         model: folder of the reconstruction, such as "sparse/1"; None: the one with the most photographs, and
             a DataWarning that names the others.
-        fisheye: whether photographs by fisheyes are undistorted or kept.
+        fisheye: whether fisheye photographs are undistorted or kept.
 
     Raises:
         DataError: a file is missing, truncated or malformed, no photograph is left, a camera has a model
@@ -133,7 +133,7 @@ def find_missing_file(root: Path) -> Path | None:
 
 
 def _folders(root: Path) -> list[list[Path]]:
-    """Folders in which a reconstruction may lie: those inside each place, 2 before 10, and the place."""
+    """Folders that may hold a reconstruction: those inside each place, 2 before 10, and the place itself."""
     groups = []
     for place in PLACES:
         inside = [] if place == "." or not (root / place).is_dir() else (root / place).iterdir()
@@ -242,7 +242,7 @@ def _photographs(
 
 
 def _mask_of(folder: Path, name: str) -> Path | None:
-    """COLMAP names the mask of a.jpg a.jpg.png; other tools name it a.png."""
+    """The mask of a photograph, if any: COLMAP names that of a.jpg a.jpg.png, other tools a.png."""
     if not folder.is_dir():
         return None
     return find_file(folder, f"{name}.png") or find_file(
