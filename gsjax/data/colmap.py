@@ -30,8 +30,7 @@ from gsjax.data.through_lenses import Fisheye, through_lenses
 from gsjax.io.brief import shortened
 
 PLACES = ("sparse", "colmap/sparse", ".")
-"""Subfolders in which the three files or numbered folders of them may lie, in the order in which they are
-searched."""
+"""Subfolders that may hold the three files, or numbered folders of them, in search order."""
 
 _FILES = ("cameras", "images")  # without which there is no reconstruction
 
@@ -147,7 +146,7 @@ def _number_first(folder: Path) -> tuple[float, str]:
 
 
 def _model_in(folder: Path) -> Model | None:
-    """The files of a folder: all binary, or else all text, or else whichever there are."""
+    """The files of a folder: all binary, else all text, else whichever exist."""
 
     def present(name: str, suffix: str) -> bool:
         return (folder / f"{name}{suffix}").is_file()

@@ -154,7 +154,7 @@ def background_behind(paths: list[Path], background: Color = WHITE) -> Color | N
         background: RGB, 0 to 1.
 
     Raises:
-        DataError: one that is decoded is unreadable.
+        DataError: one of those decoded is unreadable.
     """
     able = [path for path in paths if _has_transparency(path)]
     some = able[:: max(1, len(able) // _LOOKED_AT)]

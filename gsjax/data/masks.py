@@ -11,7 +11,7 @@ from gsjax.data.files import check_size, decode, read_complete
 from gsjax.io.pictures import PictureError, pillow_errors
 
 _KIND, _EXPECTED = "a mask", "one label per pixel"
-_HALF = 128  # of alpha
+_HALF = 128  # alpha, of 255, from which a pixel counts as opaque
 _WHITE = 255
 _ADVICE = "Save one label per pixel, as a single-channel PNG."
 

@@ -181,7 +181,7 @@ def _read(
 
 
 def _flag(name: str) -> str:
-    """An option as the command line spells it."""
+    """The name of an option on the command line."""
     return f"--read.{name.replace('_', '-')}"
 
 

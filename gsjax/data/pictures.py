@@ -1,4 +1,4 @@
-"""Formats of pictures: which are read, which are known but not read, and whether a file is complete."""
+"""Picture formats: which are read, which are known but not read, and whether a file is complete."""
 
 import re
 import warnings
@@ -43,7 +43,7 @@ _JPEG, _PNG = b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n"
 _ENDS = {_JPEG: b"\xff\xd9", _PNG: b"IEND"}
 _LARGE, _TAIL = 2**20, 2**16  # bytes; a thumbnail never lies at the end of a large file
 _MARKER = re.compile(rb"\xff[^\x00\xff]")
-_AFTER_SCAN = re.compile(rb"\xff[^\x00\xd0-\xd7\xff]")  # neither a stuffed 0xff nor a restart mark
+_AFTER_SCAN = re.compile(rb"\xff[^\x00\xd0-\xd7\xff]")  # neither a stuffed 0xff nor a restart marker
 _START_OF_SCAN, _END_OF_IMAGE = 0xDA, 0xD9
 
 

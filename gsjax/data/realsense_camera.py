@@ -71,7 +71,7 @@ def open_realsense(index: int, viewmat: Float[np.ndarray, "4 4"] | None = None) 
     """Open a RealSense camera, with depth registered to colour.
 
     Args:
-        index: its number among those that are connected, from 0.
+        index: its number among the connected cameras, from 0.
         viewmat: world to camera, [4,4]; default: the world frame is the camera's own.
 
     Raises:

@@ -1,7 +1,7 @@
 """Exports of the app Record3D ("EXR + RGB sequence"): one moving phone with depth and ARKit's poses.
 
 rgb/NUMBER.jpg          or .png, from 0
-depth/NUMBER.exr        metres in floats, registered to colour, of fewer pixels (256x192 by LiDAR)
+depth/NUMBER.exr        metres in floats, registered to colour, at lower resolution (256x192 from LiDAR)
 metadata.json           or metadata: w, h, fps; K, 9 numbers in column-major order, for w x h pixels;
                         poses, a row [qx qy qz qw tx ty tz] per frame, camera to world, OpenGL axes, metres;
                         in newer versions perFrameIntrinsicCoeffs, [fx fy cx cy] per frame, and
@@ -178,7 +178,7 @@ class _Metadata:
 
 
 def _of_length(rows: Float[np.ndarray, "n k"], frames: int) -> Float[np.ndarray, "frames k"]:
-    """Rows for as many frames as there are poses; NaN where there are fewer."""
+    """The rows, truncated or padded with NaN to the number of frames."""
     padded = np.full((frames, rows.shape[1]), np.nan)
     padded[: len(rows)] = rows[:frames]
     return padded

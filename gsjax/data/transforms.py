@@ -10,7 +10,7 @@ integer_depth_scale            instant-ngp's length of a depth step; depth_unit_
                                enable_depth_loading false leaves depth out
 train_filenames, ...           nerfstudio's splits: files in none of the lists are left out, as nerfstudio
                                does; Blender has a file per split: transforms_train.json, ...
-ply_file_path                  nerfstudio's sparse points; default: sparse_pc.ply, if it lies there
+ply_file_path                  nerfstudio's sparse points; default: sparse_pc.ply or points3D.ply, if there
 
 Poses and points share one frame, so nerfstudio's applied_transform, which records how that frame was chosen,
 and instant-ngp's scale, offset and aabb_scale, which place its grid, have no effect here.
@@ -165,7 +165,7 @@ def _files(path: Path) -> tuple[Path, dict[Path, str | None]]:
 
 
 def _listed(name: Any) -> Path:
-    """A name in a form in which different spellings are equal."""
+    """A normalised form of a name, the same for its different spellings."""
     return Path(portable(str(name)))
 
 

@@ -31,8 +31,8 @@ class VideoFile(NamedTuple):
     Attributes:
         width: pixels, as players show it: with the file's rotation applied.
         height: pixels.
-        times: of the frames that can be decoded, seconds after the first, [T].
-        stamped: whether the file has those times; otherwise they are counted from its rate.
+        times: time of each frame that can be decoded, seconds after the first, [T].
+        stamped: whether the file stores these times; otherwise they follow from its frame rate.
     """
 
     width: int
