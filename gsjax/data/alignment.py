@@ -10,8 +10,8 @@ class Alignment(NamedTuple):
     """A similarity transform between two sets of cameras, and the residuals after it.
 
     Attributes:
-        scale, rotation, translation: a point of the first world is scale * rotation @ point + translation in
-            the second.
+        scale, rotation, translation: map a point of the first world to scale * rotation @ point + translation
+            in the second.
         turned_deg: residual rotation of each camera, degrees, [N].
         moved: residual distance of each camera's centre, in the second world's unit, [N].
         extent: the largest distance between two cameras of the second set, in its unit.

@@ -6,12 +6,12 @@ scene_gt.json              optional; by frame, for each instance: obj_id, cam_R_
                            camera)
 rgb/FRAME.png              or .jpg; or gray/
 depth/FRAME.png            uint16, 0 = invalid, optional
-mask_visib/FRAME_I.png     what is visible of instance I of the frame's list in scene_gt.json, optional
+mask_visib/FRAME_I.png     the visible part of instance I of the frame's list in scene_gt.json, optional
 ../../models_eval/         models of the objects, optional; see `gsjax.data.bop_files`
 
-Only instances of a frame have numbers, so each is followed from frame to frame: that of an object of which
-there is one by the object's number, those of an object of which there are several by their places in the
-world, with the least sum of squared distances.
+Instances are numbered within a frame only, so each is tracked from frame to frame: the only instance of an
+object by the object's number, several instances of an object by their positions in the world, assigned with
+the least sum of squared distances.
 """
 
 import os
@@ -65,12 +65,12 @@ def read_bop(path: str | Path, *, world: str | None = None, depth_unit_m: float 
 
     Args:
         path: the folder.
-        world: what stands still, where the data have no poses of the camera: "camera", or the number of an
-            object of which there is one, whose frame is then the world. It takes precedence over the data.
+        world: what is static if the data have no camera poses: "camera", or the number of an object with one
+            instance, whose frame is then the world. It takes precedence over poses in the data.
         depth_unit_m: metres per depth step; None: by depth_scale of each frame.
 
     Raises:
-        DataError: the folder holds several scenes or is of several cameras, a file is missing or malformed,
+        DataError: the folder holds several scenes or one of several cameras, a file is missing or malformed,
             no frame is complete, or the camera has no poses and `world` is not given.
         ValueError: `world` is neither "camera" nor an object, or a pose is not a rigid motion.
     """
@@ -205,7 +205,7 @@ def _viewmats(
 
 
 def _complete_frames(root: Path, frames: list[int], parts: dict[str, dict | None]) -> list[int]:
-    """Numbers of the frames that have all parts, of those that the data has at all."""
+    """Numbers of the frames that have every part; None stands for a part that the data lacks altogether."""
     numbers, left_out = frames, []
     for what, known in parts.items():
         lacking = [] if known is None else [n for n in numbers if n not in known]
@@ -223,7 +223,7 @@ def _complete_frames(root: Path, frames: list[int], parts: dict[str, dict | None
 
 
 def _masks(root: Path, counts: list[tuple[int, int]]) -> list[list[Path | None]]:
-    """The mask of each instance of each frame, None if it does not exist; empty if there is none at all."""
+    """The mask of each instance of each frame, None if it does not exist; empty if no mask exists."""
     folder = root / "mask_visib"
     known = set(os.listdir(folder)) if folder.is_dir() else set()
     names = [[f"{number:06d}_{i:06d}.png" for i in range(count)] for number, count in counts]
@@ -242,7 +242,7 @@ def _masks(root: Path, counts: list[tuple[int, int]]) -> list[list[Path | None]]
 
 
 class _Followed(NamedTuple):
-    """Instances with labels that they keep over frames.
+    """Instances tracked over frames, with labels that they keep.
 
     Attributes:
         labels: the label of each instance of each frame.
@@ -260,7 +260,7 @@ class _Followed(NamedTuple):
 
     @classmethod
     def over(cls, frames: list[list[_Instance]], viewmats: list[np.ndarray]) -> "_Followed":
-        """Follow the instances of each object over frames."""
+        """Track the instances of each object over frames."""
         tracks: dict[int, list[dict[int, int]]] = {}  # by object: position of the frame -> place in its list
         worlds = [
             [np.linalg.solve(viewmat, instance.pose) for instance in some]
@@ -282,7 +282,7 @@ class _Followed(NamedTuple):
         return cls(labels, names, numbers, poses, len(frames))
 
     def truth(self, root: Path) -> Truth | None:
-        """The poses of those that are in all frames, and their models; None if there is none."""
+        """The poses of the instances that are in all frames, and their models; None if there is none."""
         always = [label for label, poses in self.poses.items() if len(poses) == self.frames]
         if left_out := [self.names[label] for label in self.names if label not in always]:
             some = (
@@ -303,8 +303,8 @@ class _Followed(NamedTuple):
 
 
 def _extend(tracks: list[dict[int, int]], t: int, places: list[int], worlds: list[list[np.ndarray]]) -> None:
-    """Give the instances of an object in frame `t` to its tracks, by the least squared distances from where
-    those were last; new tracks take the rest."""
+    """Assign the instances of an object in frame `t` to its tracks, by the least squared distances from where
+    those were last; the rest start new tracks."""
     from scipy.optimize import linear_sum_assignment  # slow to import
 
     last = np.array([worlds[u := max(track)][track[u]][:3, 3] for track in tracks]).reshape(-1, 3)

@@ -1,4 +1,4 @@
-"""Files of BOP datasets that are not of one frame: entries by number, and the models of objects.
+"""Files of BOP datasets other than those of single frames: entries by number, and the models of objects.
 
 models_eval/models_info.json   by obj_id: diameter (mm), optionally symmetries_discrete (4x4, row by row, mm)
                                and symmetries_continuous (axis, offset in mm)
@@ -21,16 +21,16 @@ from gsjax.data.validation import check_poses
 
 MM = 0.001
 MODELS, INFO = "models_eval", "models_info.json"
-_TURNS = 315  # of a continuous symmetry: BOP's ceil(pi / 0.01), about 1 % of the diameter apart
+_TURNS = 315  # rotations of a continuous symmetry: BOP's ceil(pi / 0.01), about 1 % of the diameter apart
 
 
 def by_number(path: Path, parse: Callable[[Any], Any], what: str = "frame") -> dict[int, Any]:
-    """What a file says of each frame, or each thing that has a number.
+    """The entries of a file, by the number of the frame or object that they describe.
 
     Args:
         path: a JSON file whose keys are numbers.
-        parse: of the value of a key.
-        what: that which has the numbers.
+        parse: parses the value of a key.
+        what: what the numbers stand for, for messages.
 
     Raises:
         DataError: the file is missing, malformed, or an entry cannot be parsed.
@@ -51,7 +51,7 @@ def by_number(path: Path, parse: Callable[[Any], Any], what: str = "frame") -> d
 
 
 def read_models(dataset: Path, numbers: Collection[int]) -> dict[int, ObjectModel]:
-    """The models of these objects, by number; without those that the dataset's models_eval lacks.
+    """The models of these objects, by number; objects that the dataset's models_eval lacks are left out.
 
     Args:
         dataset: folder of the dataset, above that of the split.
@@ -84,7 +84,7 @@ def _described(entry: dict[str, Any]) -> tuple[float, Float[np.ndarray, "symmetr
 
 
 def _symmetries(entry: dict[str, Any]) -> Float[np.ndarray, "symmetries 4 4"]:
-    """All symmetries, metres: each discrete one, the identity first, alone or followed by each turn about a
+    """All symmetries, metres: each discrete one, the identity first, alone or followed by each rotation of a
     continuous one."""
     discrete = [np.eye(4)]
     for values in entry.get("symmetries_discrete", []):
@@ -99,7 +99,7 @@ def _symmetries(entry: dict[str, Any]) -> Float[np.ndarray, "symmetries 4 4"]:
 
 
 def _turns(symmetry: dict[str, Any]) -> Float[np.ndarray, "turns 4 4"]:
-    """A full turn about an axis in equal steps, beginning with none."""
+    """Rotations about an axis in equal steps of a full turn, the identity first."""
     axis = np.array(symmetry["axis"], np.float64).reshape(3)
     offset = MM * np.array(symmetry.get("offset", [0, 0, 0]), np.float64).reshape(3)
     length = np.linalg.norm(axis)

@@ -44,8 +44,8 @@ def read_clip(
     masks: str | None = None,
     tool: Tool = "white",
 ) -> Sequence:
-    """The frames of one static camera, 0, at the origin. Times are those that the video states for each
-    frame, or 30 Hz for a folder.
+    """The frames of one static camera, 0, at the origin. Times are those stored in the video for each frame;
+    frames of a folder are 1/30 s apart.
 
     Without `K`, a horizontal field of view of 60 degrees and a centred principal point are assumed.
 
@@ -59,7 +59,7 @@ def read_clip(
 
     Raises:
         DataError: there are no frames, or they differ in size; the file is not a video; the numbers of masks
-            and frames differ; the tool covers everything in all of them; there is depth, which needs poses.
+            and frames differ; the tool covers everything in all masks; there is depth, which needs poses.
         ValueError: an option is invalid.
 
     Warns with DataWarning if frames of the video cannot be decoded, `K` is not given, masks look inverted, or

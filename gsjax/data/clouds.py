@@ -1,8 +1,9 @@
-"""Coloured points in files of many tools: PLY, PCD, lines of text, and arrays.
+"""Coloured point clouds in the file formats of many tools: PLY, PCD, lines of text, and arrays.
 
 x y z, and colours as red green blue (PLY of most tools), r g b, diffuse_red ... (Agisoft), f_dc_0 ... (3DGS),
-or one intensity (laser scanners). Integers are relative to the largest value of their type, floats to 1 or,
-where some are larger, to 255; alpha and all else is ignored.
+or one intensity (laser scanners). Integers are relative to 255 or, if some are larger, to 65535 or the
+largest value of their type; floats to 1 or, if some are larger, to 255 or 65535. Alpha and everything else is
+ignored.
 """
 
 import re
@@ -51,7 +52,7 @@ def read_cloud(path: Path) -> Cloud:
     Points that are not finite are left out, with a DataWarning.
 
     Raises:
-        DataError: the file is missing, truncated, or not one of points with x, y and z.
+        DataError: the file is missing, truncated, or does not hold points with x, y and z.
     """
     suffix = path.suffix.lower()
     read = _READERS.get(suffix, _read_text if suffix in _TEXT else _read_ply)
@@ -86,7 +87,7 @@ def _colors(columns: Columns, count: int) -> Float[np.ndarray, "points 3"]:
     colors = np.stack([columns[name] for name in names], axis=-1)
     if names[0] == "f_dc_0":
         return 0.5 + SH_C0 * colors.astype(np.float64)
-    if colors.dtype == np.int8:  # bytes, by an exporter without unsigned ones
+    if colors.dtype == np.int8:  # bytes from an exporter without unsigned types
         colors = colors.view(np.uint8)
     return colors.astype(np.float64) / _largest(colors)
 
@@ -95,7 +96,7 @@ def _largest(colors: Shaped[np.ndarray, "points 3"]) -> float:
     """The value of full brightness."""
     highest = np.max(colors, initial=0, where=np.isfinite(colors))
     if np.issubdtype(colors.dtype, np.integer):
-        # Exporters also write bytes as wider integers: as such they would all be black.
+        # Exporters also write bytes as wider integers: scaled by their type, all would be black.
         sizes = (255, 65535, np.iinfo(colors.dtype).max)
         return next((size for size in sizes if highest <= size), sizes[-1])
     if highest <= _OVERSHOOT:
@@ -116,8 +117,8 @@ def _read_npy(path: Path) -> Columns:
 
 
 def _read_text(path: Path) -> Columns:
-    """Columns of numbers, by the names in the line above them if it names x, y and z, else by their order.
-    Other lines that do not begin with a number, and one that counts the points, are skipped."""
+    """Columns of numbers, named by the line above them if it has x, y and z, else by their order. Other lines
+    that do not begin with a number, and a line with only the number of points, are skipped."""
     lines = decoded(path.read_bytes()).split("\n")
     first = next((i for i, line in enumerate(lines) if _is_row(fields(line))), len(lines))
     header = next((line for line in reversed(lines[:first]) if line.strip()), "")
@@ -132,12 +133,12 @@ def _read_text(path: Path) -> Columns:
 
 
 def _names(header: str) -> list[str]:
-    """The columns' names in lower case, without the mark of a comment and without units in brackets."""
+    """The columns' names in lower case, without comment characters and without units in brackets."""
     return fields(_UNITS.sub("", header).lstrip("#/% \t").lower())
 
 
 def _numbers(lines: list[str]) -> Float[np.ndarray, "points columns"]:
-    """Raises ValueError if there is no row, or rows have words or are of several lengths."""
+    """The rows of numbers. Raises ValueError if there is none, or rows contain words or differ in length."""
     top = next((line for line in lines if line.strip()), "")
     if top:
         with suppress(ValueError):  # plain rows, as `fields` would read them, but much faster
@@ -161,8 +162,8 @@ def _is_row(words: list[str]) -> bool:
 
 
 def _of_table(table: Shaped[np.ndarray, "points columns"]) -> Columns:
-    """Columns without names: x y z, then an intensity if one or four follow, then r g b; normals, which have
-    negative values, are no colours."""
+    """Columns without names: x y z, then an intensity if one or four follow, then r g b; normals are not
+    taken for colours, since they have negative values."""
     if table.ndim != 2 or table.shape[1] < 3 or table.dtype.kind not in "fiu":
         raise ValueError(f"an array of shape {table.shape} and type {table.dtype}")
     columns = dict(zip("xyz", table.T, strict=False))
@@ -175,7 +176,7 @@ def _of_table(table: Shaped[np.ndarray, "points columns"]) -> Columns:
 
 
 def _read_pcd(path: Path) -> Columns:
-    """PCL's format: lines of a header, and points as lines of text or bytes; rgb packs three bytes."""
+    """PCL's format: a header of text lines, then points as text or binary; rgb packs three bytes."""
     content = path.read_bytes()
     start = content.find(b"\nDATA ")
     end = content.find(b"\n", start + 1)

@@ -5,7 +5,7 @@ images     IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME    and a line of (X Y PO
 points3D   POINT3D_ID X Y Z R G B ERROR TRACK...
 
 Each is a .txt or .bin file (little endian; lengths as uint64) in sparse/0, sparse or the folder itself; the
-photographs are in images. Where sparse holds several reconstructions, one has to be chosen. Some exporters
+photographs are in images. If sparse holds several reconstructions, one has to be chosen. Some exporters
 leave out the lines of points in images.txt. The layouts are described at colmap.github.io/format.html.
 """
 
@@ -30,8 +30,7 @@ from gsjax.data.through_lenses import Fisheye, through_lenses
 from gsjax.io.brief import shortened
 
 PLACES = ("sparse", "colmap/sparse", ".")
-"""Subfolders in which the three files or numbered folders of them may lie, in the order in which they are
-searched."""
+"""Subfolders that may hold the three files, or numbered folders of them, in search order."""
 
 _FILES = ("cameras", "images")  # without which there is no reconstruction
 
@@ -41,7 +40,7 @@ class Model(NamedTuple):
 
     Attributes:
         folder: where they lie.
-        cameras, images: the two files without which there is none.
+        cameras, images: the two files that every reconstruction has.
         points: the file of its points; None if there is none.
     """
 
@@ -58,7 +57,7 @@ def read_colmap(
     """The registered photographs of a reconstruction, sorted by name, and its points.
 
     Photographs whose file is missing or whose pose is not finite are left out, with a DataWarning that counts
-    them. Distorted photographs are undistorted (see `gsjax.data.lens`); transparent ones are shown before
+    them. Distorted photographs are undistorted (see `gsjax.data.lens`); transparent ones are composited on
     white.
 
     Args:
@@ -66,7 +65,7 @@ def read_colmap(
         images: name of the photographs' folder in it; masks/NAME.png beside it mark the pixels that count.
         model: folder of the reconstruction, such as "sparse/1"; None: the one with the most photographs, and
             a DataWarning that names the others.
-        fisheye: whether photographs by fisheyes are undistorted or kept.
+        fisheye: whether fisheye photographs are undistorted or kept.
 
     Raises:
         DataError: a file is missing, truncated or malformed, no photograph is left, a camera has a model
@@ -133,7 +132,7 @@ def find_missing_file(root: Path) -> Path | None:
 
 
 def _folders(root: Path) -> list[list[Path]]:
-    """Folders in which a reconstruction may lie: those inside each place, 2 before 10, and the place."""
+    """Folders that may hold a reconstruction: those inside each place, 2 before 10, and the place itself."""
     groups = []
     for place in PLACES:
         inside = [] if place == "." or not (root / place).is_dir() else (root / place).iterdir()
@@ -147,7 +146,7 @@ def _number_first(folder: Path) -> tuple[float, str]:
 
 
 def _model_in(folder: Path) -> Model | None:
-    """The files of a folder: all binary, or else all text, or else whichever there are."""
+    """The files of a folder: all binary, else all text, else whichever exist."""
 
     def present(name: str, suffix: str) -> bool:
         return (folder / f"{name}{suffix}").is_file()
@@ -242,7 +241,7 @@ def _photographs(
 
 
 def _mask_of(folder: Path, name: str) -> Path | None:
-    """COLMAP names the mask of a.jpg a.jpg.png; other tools name it a.png."""
+    """The mask of a photograph, if any: COLMAP names that of a.jpg a.jpg.png, other tools a.png."""
     if not folder.is_dir():
         return None
     return find_file(folder, f"{name}.png") or find_file(

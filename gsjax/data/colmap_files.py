@@ -245,7 +245,7 @@ def _cameras_txt(path: Path) -> dict[int, CameraEntry]:
 
 
 def _images_txt(path: Path) -> list[ImageEntry]:
-    """A line per image, and mostly one of its points, which may be empty or missing."""
+    """A line per image, each usually followed by one of its points, which may be empty or missing."""
 
     def parse(words: list[str]) -> tuple[str, int, tuple[float, ...], tuple[float, ...]]:
         quat, translation = tuple(map(float, words[1:5])), tuple(map(float, words[5:8]))
@@ -266,7 +266,7 @@ def _images_txt(path: Path) -> list[ImageEntry]:
 
 
 def _is_line_of_points(line: str) -> bool:
-    """Whether a line is of (X Y POINT3D_ID), judged by its first words."""
+    """Whether a line consists of (X Y POINT3D_ID), judged by its first words."""
     words = line.split(None, _JUDGED_WORDS)
     complete = len(words) <= _JUDGED_WORDS
     try:

@@ -1,9 +1,10 @@
-"""Checks of data against themselves, for mistakes that are plausible by themselves: a unit of depth that does
-not fit the poses, cameras that look away from each other or stand at one place, a clock that jumps.
+"""Consistency checks of a dataset, for mistakes that no part of it reveals by itself: a depth unit that does
+not fit the poses, cameras that look away from each other or share one position, a clock that jumps.
 
-Depths of two views are in the right unit if the surface that one measures is where the other measures it.
-Depth that is f times too large fits cameras that are f times as far apart, so the factor is found by moving
-them. Against points that come with poses, depth is checked directly. A few views, subsampled, are enough.
+Depth is in the right unit if two views measure a surface at the same place. Depth that is f times too large
+fits cameras that are f times as far apart, so the factor is found by scaling the distance between the
+cameras. If points come with the poses, depth is compared with them directly. A few views, subsampled, are
+enough.
 """
 
 import os
@@ -28,7 +29,7 @@ _FACTORS = np.geomspace(1e-3, 1e3, 271)  # 5 % apart
 _AGREES = 0.05  # relative difference of two depths of one surface
 _RIGHT = 1.25  # a smaller factor may be noise, or a calibration that is slightly off
 _LEAST_SHARE = 0.2  # of the points must agree with some factor, for a verdict
-_TIMES_AS_MANY = 2.0  # as without a factor, or as poses are
+_TIMES_AS_MANY = 2.0  # points that agree, relative to no factor or to the poses as given
 _ANGLE = np.deg2rad(40)  # between views that may see the same surface
 _FLIP = np.diag([1.0, -1.0, -1.0, 1.0])  # between the axes of OpenCV's and of OpenGL's cameras
 _MISREAD = {
@@ -36,15 +37,14 @@ _MISREAD = {
     "in OpenGL's axes": lambda viewmats: _FLIP @ viewmats,
     "from the camera to the world, in OpenGL's axes": lambda viewmats: _FLIP @ np.linalg.inv(viewmats),
 }
-"""How poses may have been misread, which should be from the world to the camera in OpenCV's axes, and how to
-mend each."""
+"""Conventions that poses may be in instead of world to camera in OpenCV's axes, and how to convert each."""
 _JUMP, _FEW = 20.0, 0.1  # in median steps; of all steps
 _SAME_PLACE = 1e-6  # of their distance from the origin
-_LEAST_LEFT = 0.02  # of what masks are asked about: the points in view or, without points, the pixels
+_LEAST_LEFT = 0.02  # share that masks must leave of the points in view or, without points, of the pixels
 
 
 class _View(NamedTuple):
-    """Intrinsics, world to camera, and depth, 0 where it is invalid."""
+    """Intrinsics, world-to-camera transform, and depth, 0 = invalid."""
 
     K: Float[np.ndarray, "3 3"]
     viewmat: Float[np.ndarray, "4 4"]
@@ -52,10 +52,10 @@ class _View(NamedTuple):
 
 
 def check_recording(sequence: Sequence) -> None:
-    """Look for mistakes in a recording that no part of it shows by itself.
+    """Check a recording for mistakes that no part of it reveals by itself.
 
     Warns with DataWarning if depth is in another unit than the poses, or fits them only if they are inverted
-    or in OpenGL's axes; if cameras look away from each other or stand at one place; if time jumps; or if a
+    or in OpenGL's axes; if cameras look away from each other or share one position; if time jumps; or if a
     picture is listed for several frames.
     """
     name, cameras = sequence.name, sequence.num_cameras
@@ -76,11 +76,11 @@ def check_recording(sequence: Sequence) -> None:
 
 
 def check_photographs(photographs: Photographs) -> None:
-    """Look for mistakes in a set of photographs that none of them shows by itself.
+    """Check a set of photographs for mistakes that none of them reveals by itself.
 
     Warns with DataWarning if depth is in another unit than the poses or the points that come with them; if
-    the cameras look away from each other or from the points, or stand at one place; or if masks hide nearly
-    all.
+    the cameras look away from each other or from the points, or share one position; or if masks hide nearly
+    everything.
     """
     name, cloud, load = photographs.name, photographs.cloud, photographs.load_depth
     _check_places(name, photographs.viewmats, "photographs")
@@ -106,7 +106,7 @@ def _at(load: Callable[[int, int], np.ndarray | None], t: int) -> np.ndarray | N
 
 
 def _spread(count: int, most: int = _MOST_VIEWS) -> list[int]:
-    """Some of so many views, evenly spread."""
+    """Indices of at most `most` of `count` views, evenly spaced."""
     return np.unique(np.linspace(0, count - 1, most).astype(int)).tolist()
 
 
@@ -122,7 +122,7 @@ def _simultaneous_pairs(
 
 
 def _depth(load: Callable[[], np.ndarray | None]) -> Float[np.ndarray, "height width"] | None:
-    """Depth with 0 where it is invalid; None if there is none, or if it cannot be read, which is said when it
+    """Depth with 0 where it is invalid; None if there is none or it cannot be read, which is reported when it
     is used."""
     try:
         depth = load()
@@ -155,8 +155,8 @@ def _moved_pairs(
 
 
 def _factor_of_pairs(pairs: list[tuple[_View, _View]]) -> float | None:
-    """By which depth is too large, judged by how many points agree between the views of each pair; None if
-    the views do not tell, 1 if it is right."""
+    """The factor by which depth is too large, judged by how many points agree between the views of each pair;
+    1 if depth is right, None if the views do not tell."""
     if not pairs:
         return None
     both = [pair for a, b in pairs for pair in ((a, b), (b, a))]
@@ -168,7 +168,7 @@ def _factor_of_pairs(pairs: list[tuple[_View, _View]]) -> float | None:
 
 
 def _are_misread(name: str, pairs: list[tuple[_View, _View]]) -> bool:
-    """Whether depth of the cameras agrees much better with poses that mean something else; warns if so."""
+    """Whether the cameras' depth agrees much better with the poses in another convention; warns if so."""
 
     def agree(mended: Callable[[np.ndarray], np.ndarray]) -> float:
         views = [[view._replace(viewmat=mended(view.viewmat)) for view in pair] for pair in pairs]
@@ -186,7 +186,7 @@ def _are_misread(name: str, pairs: list[tuple[_View, _View]]) -> bool:
 
 
 def _verdict(best: float, shares: Float[np.ndarray, "factors"]) -> float | None:
-    """The best factor, if it explains the data much better than 1 does; None if none explains them."""
+    """The best factor if it explains the data much better than 1 does, else 1; None if none explains them."""
     near_one = shares[(_FACTORS < _RIGHT) & (_FACTORS > 1 / _RIGHT)].max()
     if shares.max() < _LEAST_SHARE:
         return None
@@ -196,8 +196,8 @@ def _verdict(best: float, shares: Float[np.ndarray, "factors"]) -> float | None:
 def _shares(
     a: _View, b: _View, factors: Float[np.ndarray, "factors"], agrees: float = _AGREES
 ) -> Float[np.ndarray, "factors"]:
-    """For each factor, the share of points of view a where view b measures them, if its depth is as many
-    times too large as the factor says."""
+    """For each factor, the share of the points of view `a` that lie where view `b` measures them, assuming
+    that depth is too large by that factor."""
     rows, columns = np.nonzero(a.depth)
     some = np.linspace(0, len(rows) - 1, min(len(rows), _POINTS)).astype(int)
     rows, columns = rows[some], columns[some]
@@ -215,8 +215,8 @@ def _shares(
 
 
 def _factor_of_points(views: list[_View], points: Float[np.ndarray, "m 3"]) -> float | None:
-    """By which depth is larger than the distance of the points that it should show; None if it does not show
-    them, 1 if it is right."""
+    """The factor by which depth exceeds that of the points that it should show; 1 if depth is right, None if
+    it does not show them."""
     some = points[:: max(1, len(points) // (10 * _POINTS))]
     ratios = []
     for view in views:
@@ -245,7 +245,7 @@ def _warn_of_factor(name: str, factor: float | None, others: str) -> None:
 
 
 def _check_places(name: str, viewmats: Float[np.ndarray, "n 4 4"], noun: str) -> None:
-    """Warns if all views are from one place, or all look away from the point around which they stand."""
+    """Warns if all views share one position, or all look away from the point that they surround."""
     centers, axes = np.linalg.inv(viewmats)[:, :3, 3], viewmats[:, 2, :3]
     if len(centers) < 2:
         return
@@ -283,7 +283,7 @@ def _check_directions(photographs: Photographs, points: Float[np.ndarray, "m 3"]
 def _in_view(
     photographs: Photographs, i: int, points: Float[np.ndarray, "m 3"]
 ) -> Float[np.ndarray, "seen 2"]:
-    """The pixels of a photograph at which its points in view lie."""
+    """Pixel coordinates of the points that are in view of a photograph."""
     local = points @ photographs.viewmats[i, :3, :3].T + photographs.viewmats[i, :3, 3]
     lens = None if photographs.fisheye is None else photographs.fisheye[i]
     pixels, _ = pixels_at(local, photographs.Ks[i], lens)
@@ -296,7 +296,7 @@ def _check_masks(photographs: Photographs, points: Float[np.ndarray, "m 3"]) -> 
     for i in _spread(photographs.num):
         try:
             mask = photographs.mask(i)
-        except (ValueError, OSError):  # which is said when it is used
+        except (ValueError, OSError):  # reported when it is used
             return
         if mask is None:
             mask = np.ones(photographs.sizes[i][::-1], bool)
@@ -313,7 +313,7 @@ def _check_masks(photographs: Photographs, points: Float[np.ndarray, "m 3"]) -> 
 
 
 def _check_clock(name: str, sequence: Sequence) -> None:
-    """Warns of a few steps of time that are many times longer than the others."""
+    """Warns if a few time steps are many times longer than the others."""
     steps = np.diff(sequence.times)
     if (steps > 0).sum() < 3:
         return

@@ -1,4 +1,4 @@
-"""Photographs that a dataset lists twice, of which one would be fitted and the other held out."""
+"""Removal of photographs that a dataset lists twice, so that none is both fitted and held out."""
 
 import os
 import warnings
@@ -19,13 +19,13 @@ _NEAR_ANGLE = np.deg2rad(1.0)
 
 
 def without_duplicates(photographs: Photographs) -> Photographs:
-    """The photographs with one of each: without those whose file is listed again (also by another path to
-    it), and without copies of a file under another name, from the same place and time.
+    """The photographs without duplicates: files that are listed again (also by another path), and copies of a
+    file under another name that were taken from the same place at the same time.
 
-    Of those in several splits, the one of the latest of train, val and test stays, so that no picture is both
-    fitted and held out. Warns with DataWarning if some are left out, and counts them.
+    Of duplicates in several splits, the one in the latest of train, val and test is kept, so that no picture
+    is both fitted and held out. Warns with DataWarning if some are left out, and counts them.
     """
-    same = np.arange(photographs.num)  # the first that each is the same as
+    same = np.arange(photographs.num)  # the first duplicate of each
     for i, j in _pairs(photographs):
         same[same == same[j]] = same[i]
     groups = [np.flatnonzero(same == first) for first in np.unique(same)]
@@ -47,7 +47,7 @@ def _chosen(group: np.ndarray, photographs: Photographs) -> int:
 
 
 def _pairs(photographs: Photographs) -> Iterator[tuple[int, int]]:
-    """Pairs of photographs (the first one first) that are one."""
+    """Pairs of duplicates, the earlier photograph first."""
     centers = np.linalg.inv(photographs.viewmats)[:, :3, 3]
     far = _NEAR * np.median(np.linalg.norm(centers - np.median(centers, axis=0), axis=1))
     files: dict[tuple[int, int], int] = {}
@@ -75,8 +75,8 @@ def _pairs(photographs: Photographs) -> Iterator[tuple[int, int]]:
 def _near(
     photographs: Photographs, first: int, rest: Int[np.ndarray, "n"], far: float
 ) -> Bool[np.ndarray, "n"]:
-    """Which of the rest were taken within a distance of the first one, in almost the same direction and at
-    the same time."""
+    """Which of the rest were taken within the distance `far` of the first one, with almost the same
+    orientation and at the same time."""
     poses = np.linalg.inv(photographs.viewmats[[first, *rest]])
     near = np.linalg.norm(poses[1:, :3, 3] - poses[0, :3, 3], axis=1) <= far
     turns = np.einsum("nij,ij->n", poses[1:, :3, :3], poses[0, :3, :3])

@@ -87,7 +87,7 @@ def read_endonerf(
     """
     _expect_options(depth_unit_m, pose_unit_m, baseline_m, depth_percentiles)
     root = Path(path)
-    # Relative to no origin until the unit is known.
+    # Without `near_origin`: the unit of the poses is not applied yet.
     rows = inspect.unwrap(poses_bounds.read_llff)(root, axes, images)
     frames = pictures(root / images)
     width, height = check_one_size(frames)

@@ -3,12 +3,12 @@
 from gsjax.io.brief import brief
 
 COMPLETE = "Was the folder copied completely?"
-"""The advice where a file is missing that others tell of."""
-_EXPECTED = 800  # characters of all that may be expected
+"""The advice if a file is missing that other files refer to."""
+_EXPECTED = 800  # largest length of what was expected, characters
 
 
 class DataError(ValueError):
-    """A file or folder that cannot be used: its path, what was expected, what was found, what to do."""
+    """A file or folder cannot be used. The message has its path, what was expected and found, and advice."""
 
     def __init__(self, path: object, expected: str, found: str, advice: str):
         super().__init__(f"{path}: expected {brief(expected, _EXPECTED)}, found {brief(found)}. {advice}")
@@ -16,7 +16,7 @@ class DataError(ValueError):
 
 
 class MissingFile(DataError):
-    """An image or array of a frame is not where it should be."""
+    """An image or array of a frame does not exist."""
 
 
 class DataWarning(UserWarning):

@@ -1,8 +1,9 @@
 """OpenEXR pictures with depth in floats, as depth cameras of phones export them.
 
-https://openexr.com/en/latest/OpenEXRFileLayout.html: a header of named attributes, a table with the place of
+https://openexr.com/en/latest/OpenEXRFileLayout.html: a header of named attributes, a table with the offset of
 each chunk of lines, and the chunks. Header and table are checked here, so that a file that is cut off, or
-claims to be larger than any depth camera, is refused before memory is taken; OpenEXR decodes the chunks.
+claims more pixels than any depth camera has, is refused before memory is allocated; the package OpenEXR
+decodes the chunks.
 """
 
 import math
@@ -24,8 +25,8 @@ MOST_VALUES = 2**24
 
 _MAGIC = b"\x76\x2f\x31\x01"
 _SHORT_NAMES, _LONG_NAMES = 0, 0x400  # other flags mark tiles, deep pixels and several parts
-_LINES = (1, 1, 1, 16, 32, 16, 32, 32, 32, 256)  # of a chunk, by compression
-_INTEGERS, _FLOATS = 0, {1: np.float16, 2: np.float32}  # types of channels
+_LINES = (1, 1, 1, 16, 32, 16, 32, 32, 32, 256)  # per chunk, by compression
+_INTEGERS, _FLOATS = 0, {1: np.float16, 2: np.float32}  # channel types
 _DEPTHS = ("Z", "Y", "R")
 _KIND = "depth in one OpenEXR picture of scan lines"
 _FETCH = "Fetch the file again."
@@ -33,7 +34,7 @@ _EXPORT = "Export depth again."
 
 
 class _Header(NamedTuple):
-    """What a header says: size in pixels, lines of a chunk, channels' types by name, and where it ends."""
+    """A header: size in pixels, lines per chunk, channel types by name, and the offset at which it ends."""
 
     width: int
     height: int
@@ -62,7 +63,7 @@ def read_exr_depth(path: Path) -> Float[np.ndarray, "height width"]:
     if not _is_complete(content, header):
         raise DataError(path, _KIND, f"a file that is cut off ({len(content)} bytes)", _FETCH)
     try:
-        pixels = codec.InputFile(str(path)).channel(name)  # codec.File tells of damage on stdout
+        pixels = codec.InputFile(str(path)).channel(name)  # codec.File reports damage on stdout
         depth = np.frombuffer(pixels, _FLOATS[header.channels[name]]).reshape(header.height, header.width)
     except (OSError, RuntimeError, ValueError, TypeError, KeyError) as error:
         raise DataError(path, _KIND, f"bad data ({error})", _FETCH) from None
@@ -70,7 +71,7 @@ def read_exr_depth(path: Path) -> Float[np.ndarray, "height width"]:
 
 
 def _checked(path: Path, header: _Header) -> str:
-    """The channel with the depth, of a header that can be true."""
+    """The name of the depth channel, after a check that the header is plausible."""
     width, height, channels = header.width, header.height, header.channels
     if min(width, height) < 1 or width * height * max(1, len(channels)) > MOST_VALUES:
         expected = f"depth of at most {MOST_VALUES:,} values"
@@ -84,7 +85,8 @@ def _checked(path: Path, header: _Header) -> str:
 
 
 def _header(content: bytes) -> _Header:
-    """Raises ValueError, IndexError, struct.error or KeyError if there is none of one picture in lines."""
+    """The header. Raises ValueError, IndexError, struct.error or KeyError if it is not that of one picture of
+    scan lines."""
     if content[:4] != _MAGIC:
         raise ValueError("it does not begin as OpenEXR does")
     if (flags := struct.unpack_from("<I", content, 4)[0] & ~0xFF) not in (_SHORT_NAMES, _LONG_NAMES):
@@ -113,7 +115,7 @@ def _channels(content: bytes) -> Iterator[tuple[str, int]]:
 
 
 def _name(content: bytes, at: int) -> tuple[str, int]:
-    """A text that ends in a zero byte, and what follows it."""
+    """A zero-terminated string, and the offset after it."""
     end = content.index(b"\0", at)
     return content[at:end].decode(), end + 1
 

@@ -22,7 +22,7 @@ SATURATED_DEPTH = 65535
 Color = tuple[float, float, float]
 """RGB, 0 to 1."""
 
-_HEAD = 32  # bytes that tell a format
+_HEAD = 32  # bytes that identify a format
 _LOOKED_AT = 4
 BLACK: Color = (0.0, 0.0, 0.0)
 WHITE: Color = (1.0, 1.0, 1.0)
@@ -58,7 +58,7 @@ def read_json(path: Path) -> Any:
     text = read_text(path, "a JSON file")
     try:
         return _parsed(text)
-    except (ValueError, RecursionError) as error:  # a number of too many digits is no JSONDecodeError
+    except (ValueError, RecursionError) as error:  # a number with too many digits is not a JSONDecodeError
         raise DataError(path, "a JSON file", f"bad JSON ({error})", "Fetch the file again.") from None
 
 
@@ -68,7 +68,7 @@ def _parsed(text: str) -> Any:
     except json.JSONDecodeError as error:
         if not error.msg.startswith("Invalid \\"):
             raise
-    return json.loads(_LONE_BACKSLASH.sub(r"\\\\", text))  # paths of Windows that were written as they are
+    return json.loads(_LONE_BACKSLASH.sub(r"\\\\", text))  # Windows paths written without escaping
 
 
 def read_arrays(path: Path) -> dict[str, np.ndarray]:
@@ -86,21 +86,21 @@ def read_arrays(path: Path) -> dict[str, np.ndarray]:
 
 
 def as_numbers(path: Path, what: str, value: Any, shape: tuple[int | None, ...]) -> Float[np.ndarray, "..."]:
-    """Numbers of a file, of a given shape, as float64.
+    """Numbers read from a file, as float64, after a check of their shape.
 
     Args:
         path: the file, for messages.
         what: what they are, for messages.
-        value: what the file holds for them.
-        shape: the shape; None where any size will do.
+        value: what the file holds.
+        shape: the expected shape; None for a dimension of any size.
 
     Raises:
-        DataError: they are no numbers, or of another shape.
+        DataError: they are not numbers, or have another shape.
     """
     try:
         found = np.asarray(value)
         given = found.astype(np.float64) if found.dtype.kind in "iuf" else None
-    except (ValueError, TypeError, OverflowError):  # rows of several lengths
+    except (ValueError, TypeError, OverflowError):  # rows of different lengths
         given = None
     if (
         given is None
@@ -145,16 +145,16 @@ def picture_size(path: Path) -> tuple[int, int]:
 
 
 def background_behind(paths: list[Path], background: Color = WHITE) -> Color | None:
-    """The background to show photographs before: `background` if some are transparent, else None.
+    """The background to composite photographs on: `background` if some are transparent, else None.
 
-    Few of those that have transparency at all are looked at; of the others, none is read.
+    Only a few of the photographs are decoded, and only those with transparency according to their header.
 
     Args:
         paths: the photographs.
         background: RGB, 0 to 1.
 
     Raises:
-        DataError: one that is looked at is unreadable.
+        DataError: one of those decoded is unreadable.
     """
     able = [path for path in paths if _has_transparency(path)]
     some = able[:: max(1, len(able) // _LOOKED_AT)]
@@ -165,13 +165,13 @@ def read_image(
     path: Path, width: int, height: int, background: Color = BLACK
 ) -> UInt8[np.ndarray, "height width 3"]:
     """An 8-bit colour image, RGB, in its stored orientation: cameras are calibrated for the stored pixels,
-    so the EXIF orientation is ignored. What is transparent shows the background: the colours stored there
-    mean nothing.
+    so the EXIF orientation is ignored. Transparent pixels are composited on the background: the colours
+    stored there mean nothing.
 
     Args:
         path: the file.
         width, height: expected size, pixels.
-        background: RGB, 0 to 1, behind what is transparent.
+        background: RGB, 0 to 1, behind transparent pixels.
 
     Raises:
         DataError: the file is missing, truncated, not an image, or of another size.
@@ -216,14 +216,14 @@ def _is_transparent(pixels: UInt8[np.ndarray, "height width channels"]) -> bool:
 
 
 def _has_transparency(path: Path) -> bool:
-    """Whether a photograph has a channel or a colour for it, by its header."""
+    """Whether a photograph has an alpha channel or a transparent colour, according to its header."""
     from PIL import Image
 
     try:
         with pillow_errors(), Image.open(path) as image:
             return image.has_transparency_data
     except PictureError:
-        return False  # whoever reads it tells
+        return False  # reported when it is read
 
 
 def read_depth(path: Path, unit_m: float, width: int, height: int) -> Float[np.ndarray, "height width"]:
@@ -250,21 +250,21 @@ def read_depth(path: Path, unit_m: float, width: int, height: int) -> Float[np.n
 
 def decode(path: Path, kind: str) -> np.ndarray:
     """The pixels of a picture as they are stored, of any type: [H,W], or [H,W,3] or [H,W,4] in the order
-    blue, green, red, alpha. Colours of a palette are looked up.
+    blue, green, red, alpha. Palette indices are replaced by their colours.
 
     Args:
         path: the file.
         kind: what it is, for messages.
 
     Raises:
-        DataError: the file is missing, truncated, not a picture that is read, or says that it has far more
-            pixels than a camera takes.
+        DataError: the file is missing, truncated, not a picture in a format that is read, or claims far more
+            pixels than any camera has.
     """
     content = read_complete(path, kind)
     if _is_bomb(content):
         found = f"{len(content)} bytes that say they are far more pixels than any camera takes"
         raise DataError(path, kind, found, "Fetch the file again, or save it smaller.")
-    # Pictures are decoded in several threads, which share the filters of warnings: none may change them.
+    # Pictures are decoded in several threads, which share the warning filters, so none may change them.
     image = None if _has_transparent_grey(content) else _decoded_by_opencv(content)
     image = _decoded_by_pillow(content) if image is None else image
     if image is None:
@@ -273,7 +273,7 @@ def decode(path: Path, kind: str) -> np.ndarray:
 
 
 def _is_bomb(content: bytes) -> bool:
-    """Whether a picture, by its header, has more pixels than Pillow would decode; OpenCV would."""
+    """Whether a picture has more pixels than Pillow accepts, by its header; OpenCV would decode it."""
     from PIL import Image
 
     try:
@@ -333,7 +333,7 @@ def read_complete(path: Path, kind: str) -> bytes:
 
 
 def _not_read(path: Path, kind: str, head: bytes, why: str = "") -> DataError:
-    """The error for a file that no decoder takes."""
+    """The error for a file that no decoder can read."""
     if (unread := unread_format(path, head)) is not None:
         return DataError(path, kind, f"{unread[0]}, a format that is not read", unread[1])
     return DataError(path, kind, f"something else ({why})", "Fetch the file again.")

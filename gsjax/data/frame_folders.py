@@ -55,7 +55,7 @@ def numbered(folder: Path, suffixes: tuple[str, ...] = SUFFIXES) -> dict[int, Pa
         suffixes: extensions, in lower case.
 
     Raises:
-        DataError: two pictures have one number.
+        DataError: two pictures have the same number.
     """
     found: dict[int, Path] = {}
     for path in sorted(folder.iterdir()) if folder.is_dir() else ():

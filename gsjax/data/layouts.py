@@ -1,4 +1,4 @@
-"""The layouts of recordings and photographs in folders: how each is told by its files, and what reads it."""
+"""The layouts of recordings and photographs in folders: the files that identify each, and its reader."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -24,11 +24,11 @@ class Layout(NamedTuple):
 
     Attributes:
         name: as users know it.
-        marks: the files that mark it: glob patterns of which only this layout matches one, or, with
-            `recognise`, words for a message.
-        read: its reader, whose arguments are those of the `ReadOptions` that it has a use for.
-        recognise: whether a folder has this layout, where patterns do not tell, with the name of the folder
-            of images within.
+        marks: the files that identify it: glob patterns that match in no other layout or, with `recognise`,
+            a description for messages.
+        read: its reader, which has an argument for each of the `ReadOptions` that apply to this layout.
+        recognise: (folder, name of the folder of images within) -> whether it has this layout; None if the
+            patterns decide.
         needs_axes: whether its reader must be told the meaning of the rotation columns.
     """
 
@@ -111,5 +111,5 @@ def layout_of(root: Path, layouts: tuple[Layout, ...], images: str = "images") -
 
 
 def in_words(*layouts: Layout) -> str:
-    """The names of layouts, each with what marks it."""
+    """The names of layouts, each with the files that identify it."""
     return ", ".join(f"{layout.name} ({' or '.join(layout.marks)})" for layout in layouts)

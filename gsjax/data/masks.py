@@ -1,4 +1,4 @@
-"""Masks in pictures: labels of pixels, and shades of black and white."""
+"""Masks stored as pictures: one label per pixel, or black and white."""
 
 import io
 from pathlib import Path
@@ -11,15 +11,15 @@ from gsjax.data.files import check_size, decode, read_complete
 from gsjax.io.pictures import PictureError, pillow_errors
 
 _KIND, _EXPECTED = "a mask", "one label per pixel"
-_HALF = 128  # of alpha
+_HALF = 128  # alpha, of 255, from which a pixel counts as opaque
 _WHITE = 255
 _ADVICE = "Save one label per pixel, as a single-channel PNG."
 
 
 def read_mask(path: Path, width: int, height: int) -> Int[np.ndarray, "height width"]:
-    """Integer labels, int32: the values of a picture of one channel or of three equal ones, 0 where it is
-    transparent, or the indices of a palette, unless that is of shades of grey in no order, as programs make
-    of grey pictures to save space.
+    """Integer labels, int32: the values of a picture with one channel or three equal ones, 0 where it is
+    transparent, or the indices of a palette. If the palette consists of unsorted shades of grey, which
+    programs write for grey pictures to save space, the shades are the labels.
 
     Args:
         path: the file.
@@ -37,8 +37,8 @@ def read_mask(path: Path, width: int, height: int) -> Int[np.ndarray, "height wi
 
 
 def read_shades(path: Path, width: int, height: int) -> Int[np.ndarray, "height width"]:
-    """Shades of grey, int32, of a mask in black and white. In one of black and a colour, or with a palette of
-    colours, whatever is not black is white.
+    """The shades of grey, int32, of a black-and-white mask. If it has black and one colour, or a palette of
+    colours, whatever is not black is white; with a palette and no black pixel, index 0 counts as black.
 
     Args:
         path: the file.
@@ -77,7 +77,7 @@ def _shades(path: Path, width: int, height: int) -> np.ndarray:
 
 
 def _opaque(path: Path, colors: np.ndarray, alpha: np.ndarray) -> np.ndarray:
-    """The colours where they are opaque; what is transparent is black."""
+    """The colours, with transparent pixels turned black."""
     full = np.iinfo(alpha.dtype).max
     opaque = alpha >= _HALF * (full // 255)
     if not opaque.all() and opaque.any() and not colors[opaque].any():
@@ -98,10 +98,10 @@ def _indexed(path: Path) -> tuple[np.ndarray, np.ndarray]:
                 return none
             return np.asarray(image), np.array(image.getpalette("RGB"), np.uint8).reshape(-1, 3)
     except PictureError:
-        return none  # whoever decodes it tells
+        return none  # reported when it is decoded
 
 
 def _is_shuffled_grey(palette: UInt8[np.ndarray, "n 3"]) -> bool:
-    """Whether the indices of a palette mean nothing; so it is without one."""
+    """Whether the indices are not labels: the palette has unsorted shades of grey, or there is none."""
     shades = list(dict.fromkeys(palette[:, 0].tolist()))
     return bool((palette == palette[:, :1]).all()) and (not shades or shades != sorted(shades))

@@ -1,4 +1,4 @@
-"""Files by the names that data give them, which may have been written on another system."""
+"""Lookup of files by the names in a dataset, which may have been written on another system."""
 
 import os
 import re
@@ -12,15 +12,16 @@ _ABSOLUTE = re.compile(r"[A-Za-z]:/|/")
 
 
 def portable(name: str) -> str:
-    """A name with forward slashes; also one whose backslashes were taken for escapes, as in images\\frame."""
+    """The name with forward slashes, even where backslashes were read as escapes, as in images\\frame."""
     return name.strip().translate(_SLASHES)
 
 
 def find_file(root: Path, name: str, suffixes: tuple[str, ...] = ()) -> Path | None:
-    """The file of a name; None if there is none.
+    """The file that a name refers to; None if there is none.
 
-    A name counts as written, or else with forward slashes, in other case, in another form of its accents,
-    or, if it is an absolute path that does not exist, by as many of its last parts as exist in the folder.
+    The name is tried as written, then with forward slashes, regardless of case and of the Unicode form of
+    accents. An absolute path that does not exist is matched by as many of its last parts as exist in the
+    folder.
 
     Args:
         root: the folder that names are relative to.

@@ -17,10 +17,10 @@ class ObjectModel:
     """The model of an object in the frame of its true poses, for scoring only.
 
     Attributes:
-        source: the file that it comes from, as it is reported.
+        source: the file that it comes from, for reports.
         points: vertices, metres, [V,3].
         diameter: the largest distance between two vertices, metres.
-        symmetries: motions that leave the model as it was, the identity first, [S,4,4].
+        symmetries: rigid motions that map the model onto itself, the identity first, [S,4,4].
 
     Raises:
         ValueError: shapes are not as above.

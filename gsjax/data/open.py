@@ -38,7 +38,7 @@ SIMULATED_SCENES = {
     "tissue": tissue,
 }
 
-# Option -> what it is about, and whether data that were read have that.
+# Option -> what it applies to, and whether the data that were read have it.
 _ABOUT = {
     "depth_unit_m": ("depth", lambda data: data.load_depth is not None),
     "depth_percentiles": ("depth", lambda data: data.load_depth is not None),
@@ -51,11 +51,11 @@ Data = TypeVar("Data", Sequence, Photographs)
 
 @dataclass(frozen=True)
 class ReadOptions:
-    """Options for what some layouts leave open. A layout's reader takes those that it has arguments for; the
-    others are refused rather than ignored."""
+    """Options for what some layouts do not specify. A layout's reader takes those that it has arguments for;
+    the others are refused rather than ignored."""
 
     K: tuple[float, float, float, float] | None = None
-    """fx fy cx cy for data without intrinsics (Open3D, videos) or by one's own camera (TUM, 7-Scenes), in
+    """fx fy cx cy for data without intrinsics (Open3D, videos) or from one's own camera (TUM, 7-Scenes), in
     pixels, with pixel centres at +0.5."""
     axes: poses_bounds.Axes | None = None
     """Meaning of the rotation columns in poses_bounds.npy: llff (down, right, back; DyNeRF too) or endonerf
@@ -69,8 +69,8 @@ class ReadOptions:
     tool: Tool = "white"
     """Colour of the tool in black-and-white masks (EndoNeRF, videos): white or black."""
     fisheye: Fisheye = "undistort"
-    """Photographs by fisheyes (COLMAP, nerfstudio): undistort to pinhole views, which lose what lies far off
-    the axis, or keep as they are and render through the same lens."""
+    """Fisheye photographs (COLMAP, nerfstudio): undistort to pinhole views, which lose what lies far off the
+    axis, or keep as they are and render through the same lens."""
     depth_unit_m: float | None = None
     """Metres per unit of the stored depth values (TUM, 7-Scenes, BOP, PARIS, Panoptic, Open3D, nerfstudio,
     EndoNeRF, RealSense); default: the value given in the data, else that of the layout: 0.0002 for TUM,
@@ -81,15 +81,15 @@ class ReadOptions:
     pose_unit_m: float = 1.0
     """Metres per unit of the poses (EndoNeRF), for a camera that moves."""
     world: str | None = None
-    """What stands still in a recording without poses of its camera (BOP): camera, or the number of an object,
-    such as 5, whose frame is then the world."""
+    """What is static in a recording without camera poses (BOP): camera, or the number of an object, such as
+    5, whose frame is then the world."""
     split: Split = "train"
-    """Which pictures of the two states (PARIS): train, val or test."""
+    """Which pictures of the two states to read (PARIS): train, val or test."""
     baseline_m: float | None = None
     """Metres from the left eye to the right one (EndoNeRF, EndoVis without a calibration)."""
     near: float = NEAR
-    """Near clipping distance, in the unit of the poses: nothing nearer to a camera is drawn, for example the
-    rig where cameras see each other."""
+    """Near clipping distance, in the unit of the poses: nothing nearer to a camera is rendered, for example
+    not the rig, where cameras see each other."""
 
     def __post_init__(self):
         if not 0 <= self.near < np.inf:
@@ -100,16 +100,16 @@ class ReadOptions:
 
 
 def open_sequence(path: str | Path, options: ReadOptions | None = None) -> Sequence:
-    """Open the sequence in a folder, whose layout is recognised, a video, or a built-in scene.
+    """Open the sequence in a folder (its layout is recognised), a video, or a built-in scene.
 
-    A video, or frames with masks but without poses, are read as one camera that stands still. A built-in
-    scene is "simulated:NAME", optionally followed by arguments of its function, as in
+    A video, or a folder of frames with masks but without poses, is read as the recording of one static
+    camera. A built-in scene is "simulated:NAME", optionally followed by arguments of its function, as in
     "simulated:tabletop?seed=3&frames=20&hide=true".
 
     Raises:
         DataError: there is no such folder, its layout is unknown, or it holds photographs without a time.
         ValueError: there is no built-in scene of that name, it has no such argument, an option is missing, or
-            one is given that the layout has no use for.
+            one is given that does not apply to the layout.
     """
     options = options or ReadOptions()
     return replace(_sequence(path, options), near=options.near)
@@ -159,10 +159,11 @@ def _read(
     unused: Collection[str] = (),
     **settled: Any,
 ) -> Data:
-    """What a reader makes of a path and of the options that were given, which it takes by their names.
+    """Call a reader with a path and the options that were given, matched by name.
 
     Raises:
-        ValueError: an option is given that the reader has no argument for, or that the data has no use for.
+        ValueError: an option is given that the reader has no argument for, or that does not apply to the
+            data.
     """
     given = {f.name for f in fields(options) if getattr(options, f.name) != f.default} - {"near"}
     taken = (inspect.signature(read).parameters.keys() & {f.name for f in fields(options)}) - set(unused)
@@ -180,14 +181,14 @@ def _read(
 
 
 def _flag(name: str) -> str:
-    """An option as the command line spells it."""
+    """The name of an option on the command line."""
     return f"--read.{name.replace('_', '-')}"
 
 
 def open_photographs(path: str | Path, options: ReadOptions | None = None) -> Photographs:
-    """Open the photographs in a folder, whose layout is recognised, or all frames of a recording.
+    """Open the photographs in a folder (its layout is recognised), or all frames of a recording.
 
-    Of photographs that are listed twice, one is left (see `gsjax.data.duplicates`).
+    Of photographs that are listed twice, one is kept (see `gsjax.data.duplicates`).
 
     Raises:
         DataError: there is no such folder, or its layout is unknown.

@@ -41,7 +41,7 @@ def is_open3d(root: Path) -> bool:
 
 
 def without_poses(root: Path) -> DataError | None:
-    """What a folder of this layout lacks, if it is that of poses alone."""
+    """The error for a folder that lacks only the poses of this layout; None if it lacks pictures too."""
     if not _has_pictures(root):
         return None
     advice = (

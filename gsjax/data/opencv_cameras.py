@@ -89,8 +89,8 @@ def calibrated_camera(index: int, capture: Capture, viewmat: Float[np.ndarray, "
 
 
 def snapshots(cameras: Sequence[RgbdCamera]) -> Iterator[Snapshot]:
-    """Snapshots from all cameras until one of them ends. All are grabbed first, then decoded, to keep them
-    close in time.
+    """Snapshots from all cameras until one of them ends. All frames are grabbed first, then decoded, to keep
+    them close in time.
 
     Raises:
         DataError: a camera returns a frame without depth, or of another size than the first one.

@@ -1,4 +1,4 @@
-"""Photographs that one camera took in succession, as a recording: for example the frames of a video whose
+"""A recording from photographs that one camera took in succession, for example the frames of a video whose
 poses were estimated by structure from motion."""
 
 import re
@@ -14,7 +14,7 @@ from gsjax.data.tool_masks import LABEL_NAMES, TISSUE, TOOL
 
 
 def open_as_sequence(dataset: str, read: ReadOptions | None = None) -> Sequence:
-    """Open a recording, or a set of photographs as one, as `gsjax poses` writes it for a video.
+    """Open a recording, or a set of photographs as one, such as `gsjax poses` writes for a video.
 
     Raises:
         DataError: the data cannot be read, or photographs differ in size.
@@ -35,7 +35,7 @@ def sequence_of(photographs: Photographs) -> Sequence:
     stay in the photographs' unit.
 
     Raises:
-        DataError: the photographs differ in size, or are kept as fisheyes took them.
+        DataError: the photographs differ in size, or are fisheye photographs that are kept as they are.
     """
     if photographs.fisheye is not None:
         raise DataError(

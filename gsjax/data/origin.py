@@ -1,4 +1,4 @@
-"""Recordings and photographs whose coordinates lie far from 0: read relative to an origin of their own."""
+"""Recordings and photographs with coordinates far from 0, read relative to an origin of their own."""
 
 import functools
 import warnings
@@ -18,13 +18,13 @@ from gsjax.scene.origin import about, far_origin, in_words
 Data = TypeVar("Data", Photographs, Sequence)
 Given = ParamSpec("Given")
 _FARTHEST = 1e30  # squares of it are still finite
-_LEAST = 1.0  # size of what cameras that stand still see
+_LEAST = 1.0  # assumed size of what static cameras see
 _STILL = 1e-9  # movement, relative to the distance from 0
 
 
 def near_origin(read: Callable[Given, Data]) -> Callable[Given, Data]:
-    """A reader whose data, where they lie far from 0, are relative to an `origin`; it warns of that. What its
-    data refuse (`Sequence`, `Photographs`) is told with the folder, which they do not know.
+    """Decorate a reader so that data far from 0 become relative to an `origin`, with a DataWarning. Errors of
+    `Sequence` and `Photographs`, which do not know the folder, are raised again with its name.
 
     Args:
         read: reads photographs or a recording in the coordinates of the files.
@@ -56,7 +56,7 @@ def near_origin(read: Callable[Given, Data]) -> Callable[Given, Data]:
 
 
 def _stand_still(centers: Float[np.ndarray, "frames *cameras 3"]) -> bool:
-    """Whether no camera moves. Where those of a pair or a rig stand says nothing of the size of a scene."""
+    """Whether no camera moves: then the baseline of a pair or a rig says nothing about the scene's size."""
     return bool(np.ptp(centers, axis=0).max() <= _STILL * np.abs(centers).max())
 
 
@@ -93,7 +93,7 @@ def _moved_model(model: PointModel, shift: Float[np.ndarray, "3"]) -> PointModel
 def _moved_poses(
     poses: Float[np.ndarray, "*batch 4 4"], shift: Float[np.ndarray, "3"]
 ) -> Float[np.ndarray, "*batch 4 4"]:
-    """Transforms from an object to the world, of a world whose origin was moved by `shift`."""
+    """Object-to-world transforms after the world's origin has moved by `shift`."""
     moved = np.array(poses, np.float64)
     moved[..., :3, 3] -= shift
     return moved

@@ -185,7 +185,7 @@ def _read_metas(root: Path) -> dict[str, Any]:
 def _read_meta(path: Path) -> dict[str, Any]:
     try:
         return _checked(path, read_json(path))
-    except (AttributeError, TypeError, KeyError, OverflowError) as error:  # a number for a list, and the like
+    except (AttributeError, TypeError, KeyError, OverflowError) as error:  # such as a number for a list
         found = f"something else ({error})"
         raise DataError(path, "the lists and numbers of this layout", found, _ADVICE_META) from None
 
@@ -261,7 +261,7 @@ def _present_frames(root: Path, names: list[list[str]]) -> list[int]:
 
 
 def _names_of_labels(path: Path, names: Any) -> dict[int, str]:
-    """Names of mask values, which JSON has as text."""
+    """Names of mask values, which are text in JSON."""
     if not isinstance(names, dict) or not all(
         label.isascii() and label.isdigit() and isinstance(name, str) for label, name in names.items()
     ):

@@ -1,8 +1,8 @@
-"""Two states of an articulated object, as in PARIS (Liu et al. 2023): pictures of each by cameras of its own.
+"""Two states of an articulated object, as in PARIS (Liu et al. 2023), each photographed by its own cameras.
 
 start/camera_train.json       K (3x3, pixel centres at +0.5), and for each NAME camera to world, OpenGL axes;
                               _val and _test likewise
-start/train/NAME.png          the object before what is transparent; or in start/train/rgba/
+start/train/NAME.png          the object on a transparent background; or in start/train/rgba/
 start/train/depth/NAME.png    uint16 millimetres, 0 = invalid, of depth-augmented copies, optional
 end/                          the same of the other state
 trans.json                    optional; also in gt/ or textured_objs/: trans_info with axis (o, d), type, and
@@ -47,13 +47,13 @@ class _State(NamedTuple):
 
 @near_origin
 def read_paris(path: str | Path, *, split: Split = "train", depth_unit_m: float = DEPTH_UNIT_M) -> Sequence:
-    """Two frames, the start at 0 s and the end at 1 s. Pictures of one name are one camera, though it stands
-    elsewhere in each state (in PARIS's own data it does, except for the cameras of test).
+    """Two frames, the start at 0 s and the end at 1 s. Pictures of the same name count as one camera, even if
+    its pose differs between the states (as in PARIS's own data, except for the test cameras).
 
     Cameras have the numbers of their names. Pictures without a file, without a finite pose or without a
     partner in the other state are left out, with a DataWarning that counts them. Lengths are in the unit of
-    the poses, in which PARIS's objects are about 1 wide. There are no masks; the truth, if there is one, has
-    the moving parts and their joints.
+    the poses; PARIS's objects are about 1 unit wide. There are no masks; the truth, if there is one, has the
+    moving parts and their joints.
 
     Args:
         path: the folder that holds start and end.

@@ -50,7 +50,7 @@ class Cloud:
 
 @dataclass(frozen=True, eq=False)
 class Photographs:
-    """N photographs by calibrated cameras, pinholes or fisheyes, each of its own size. They are loaded on
+    """N photographs by calibrated cameras, pinhole or fisheye, each with its own size. They are loaded on
     demand and not cached. Lengths are in the data's own unit, which is metres only if a depth sensor fixes
     the scale.
 
@@ -72,12 +72,12 @@ class Photographs:
         background: RGB, 0 to 1, composited behind transparent photographs; None if none is transparent.
         near: near clipping distance, in the data's unit.
         locate: (kind, i) -> path of a file, for messages; kind is "image", "mask", "labels" or "depth".
-        origin: where the data lie far from 0, what poses and points are relative to, in the coordinates of
+        origin: for data far from 0, the point that poses and points are relative to, in the coordinates of
             the files, [3] float64; None if they are as in the files.
         fisheye: coefficients k1 to k4 of each camera (see `gsjax.geometry.cameras.Camera`), [N,4] float64;
             None for pinholes.
-        layout: name of the layout of its files, such as "COLMAP"; empty where it was not opened by its
-            folder.
+        layout: name of the layout of its files, such as "COLMAP"; empty if it was not opened with
+            `open_photographs`.
 
     Raises:
         ValueError: shapes disagree, a pose is not a rigid motion, the background is not from 0 to 1, or there
@@ -153,7 +153,7 @@ class Photographs:
         )
 
     def _cameras(self, i: int) -> Camera:
-        """The camera of photograph `i`, as one of one, on the host."""
+        """The camera of photograph `i` as a batch of one, on the host."""
         width, height = (int(size) for size in self.sizes[i])
         fisheye = None if self.fisheye is None else self.fisheye[i][None]
         return Camera(self.viewmats[i][None], self.Ks[i][None], width, height, self.near, fisheye)
@@ -225,7 +225,7 @@ class Photographs:
         labels are sampled at its centre.
 
         Args:
-            scale: of all, or of each.
+            scale: one for all photographs, or one for each.
 
         Raises:
             ValueError: a scale is not above 0 and at most 1.

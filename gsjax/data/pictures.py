@@ -1,4 +1,4 @@
-"""Formats of pictures: which are read, which are known but not read, and whether a file is complete."""
+"""Picture formats: which are read, which are known but not read, and whether a file is complete."""
 
 import re
 import warnings
@@ -41,27 +41,27 @@ _HEADS = {
 _WEB = re.compile(rb"RIFF....WEBP|....ftypavi[fs]", re.DOTALL)
 _JPEG, _PNG = b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n"
 _ENDS = {_JPEG: b"\xff\xd9", _PNG: b"IEND"}
-_LARGE, _TAIL = 2**20, 2**16  # bytes; those of a thumbnail are never the last of a large file
+_LARGE, _TAIL = 2**20, 2**16  # bytes; a thumbnail never lies at the end of a large file
 _MARKER = re.compile(rb"\xff[^\x00\xff]")
-_AFTER_SCAN = re.compile(rb"\xff[^\x00\xd0-\xd7\xff]")  # neither a stuffed 0xff nor a restart mark
+_AFTER_SCAN = re.compile(rb"\xff[^\x00\xd0-\xd7\xff]")  # neither a stuffed 0xff nor a restart marker
 _START_OF_SCAN, _END_OF_IMAGE = 0xDA, 0xD9
 
 
 def is_picture(path: Path) -> bool:
-    """Whether a name is that of a picture that is read; hidden files are none."""
+    """Whether a file name is that of a picture in a format that is read; hidden files do not count."""
     return path.suffix.lower() in SUFFIXES and not path.name.startswith(".")
 
 
 def is_unread(path: Path) -> bool:
-    """Whether a name is that of a picture in a format that is known but not read."""
+    """Whether a file name is that of a picture in a format that is known but not read."""
     return path.suffix.lower() in _UNREAD and not path.name.startswith(".")
 
 
 def unread_format(path: Path, head: bytes = b"") -> tuple[str, str] | None:
-    """The format of a picture that is not read, and what to do about it; None if the format is another.
+    """The format of a picture that is known but not read, and what to do about it; None for other formats.
 
     Args:
-        path: the file, whose extension tells the format where its first bytes do not.
+        path: the file, whose extension decides if its first bytes do not.
         head: its first bytes, if known.
     """
     if head.startswith((_JPEG, _PNG)):
@@ -71,13 +71,13 @@ def unread_format(path: Path, head: bytes = b"") -> tuple[str, str] | None:
 
 
 def is_web_format(path: Path) -> bool:
-    """Whether a file is WebP or AVIF by its first bytes, which programs read less often than JPEG and PNG."""
+    """Whether a file is WebP or AVIF by its first bytes: fewer programs read these than JPEG and PNG."""
     with path.open("rb") as file:
         return _WEB.match(file.read(16)) is not None
 
 
 def is_raw(path: Path, head: bytes) -> bool:
-    """Whether a file is a camera's raw data. Decoders of TIFF read its thumbnail instead.
+    """Whether a file is a camera's raw data, of which TIFF decoders would read the thumbnail.
 
     Args:
         path: the file.
@@ -87,7 +87,7 @@ def is_raw(path: Path, head: bytes) -> bool:
 
 
 def refuse_unread(where: Path, expected: str, paths: Iterable[Path], *, others: int = 0) -> None:
-    """Tell of pictures in formats that are not read: a DataWarning if there are others that are.
+    """Report pictures in formats that are not read: with a DataWarning if others can be read.
 
     Args:
         where: the folder, for messages.
@@ -111,11 +111,11 @@ def refuse_unread(where: Path, expected: str, paths: Iterable[Path], *, others: 
 
 
 def warn_of_cut_off(where: object, paths: Iterable[Path]) -> None:
-    """Warn with DataWarning of JPEG and PNG files that end before the picture does, without decoding them.
+    """Warn with DataWarning about JPEG and PNG files that end before the picture does, without decoding them.
 
     Args:
         where: the folder, for messages.
-        paths: the files; those that are none are passed over.
+        paths: the files; paths that are not files are skipped.
     """
     files = [path for path in paths if path.is_file()]
     if damaged := [str(path) for path in files if _ends_early(path)]:
@@ -140,7 +140,7 @@ def _ends_early(path: Path) -> bool:
 def is_cut_off(content: bytes) -> bool:
     """Whether the bytes of a JPEG or PNG picture end before the picture does; other formats give False.
 
-    Whatever follows the end does not matter: films of motion photos, further pictures of MPO, and padding.
+    Whatever follows the end does not matter: the video of a motion photo, further pictures of MPO, padding.
     The end marks of thumbnails lie within segments, which are skipped.
     """
     if content.startswith(_JPEG[:2]):

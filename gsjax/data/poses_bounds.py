@@ -36,7 +36,7 @@ _TO_OPENCV = {
 
 @near_origin
 def read_llff(path: str | Path, axes: Axes, images: str = "images") -> Photographs:
-    """Photographs sorted by name, one per row of poses_bounds.npy; transparent ones are shown before white.
+    """Photographs sorted by name, one per row of poses_bounds.npy; transparent ones are composited on white.
 
     Args:
         path: the folder.
@@ -74,7 +74,7 @@ def read_dynerf(path: str | Path, axes: Axes = "llff") -> Sequence:
 
     The sequence is as long as the shortest video, and its times are those of the first.
 
-    Warns with DataWarning if frames of one number are more than half a frame apart in time.
+    Warns with DataWarning if frames with the same number are more than half a frame interval apart in time.
 
     Raises:
         DataError: as for `read_llff`, or the videos differ in size.
@@ -115,7 +115,7 @@ def read_dynerf(path: str | Path, axes: Axes = "llff") -> Sequence:
 
 
 def _warn_of_clocks(paths: list[Path], times: list[Float[np.ndarray, "t"]]) -> None:
-    """Warns if the frames of one number, which count as simultaneous, are apart in time."""
+    """Warns if frames with the same number, which count as simultaneous, are apart in time."""
     apart = np.abs(np.stack(times) - times[0])
     step = np.median(np.diff(times[0])) if apart.shape[1] > 1 else np.inf
     if apart.max() > 0.5 * step:

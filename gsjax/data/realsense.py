@@ -3,11 +3,11 @@
 /device_0/sensor_0/Depth_0/image/data         sensor_msgs/Image: mono16, in steps of a depth unit, 0 = invalid
 /device_0/sensor_1/Color_0/image/data         the same: rgb8, bgr8, rgba8, bgra8, YUYV or UYVY
 .../Depth_0/info/camera_info                  sensor_msgs/CameraInfo: K, pixel centres at integers, and D
-.../Color_0/tf/0                              geometry_msgs/Transform: to it from stream 0, which is depth
+.../Color_0/tf/0                              geometry_msgs/Transform: from stream 0, which is depth, to it
 /device_0/sensor_0/option/Depth_Units/value   std_msgs/Float32: metres per step
 
-Newer versions mark images by a header whose frame_id is "1". These end with four bytes that the type of the
-message does not have: the depth unit, float32; 0 for colour.
+Newer versions write images with frame_id "1" in their header. These end with four bytes that the message type
+does not define: the depth unit, float32; 0 for colour.
 """
 
 import re
@@ -62,7 +62,7 @@ _COLORS: dict[str, tuple[int, int | None]] = {
 def read_realsense(
     path: str | Path, *, depth_unit_m: float | None = None, max_skew: float = MAX_SKEW_S
 ) -> Sequence:
-    """The colour camera of a recording, 0, which stands still at the origin, with depth moved to it.
+    """The colour camera of a recording: camera 0, static at the origin, with depth registered to it.
 
     Frames are its pictures, each with the depth nearest in time; those with none within `max_skew` are left
     out, with a DataWarning that counts them, as are images that repeat a time. Times are the camera's. If a
@@ -74,8 +74,8 @@ def read_realsense(
         max_skew: largest time between colour and depth of a frame, seconds.
 
     Raises:
-        DataError: the file is no such recording or is damaged, it lacks depth or colour, or an encoding or a
-            lens is not one that is read.
+        DataError: the file is not such a recording or is damaged, it lacks depth or colour, or an encoding or
+            a lens model is not supported.
         MissingExtra: rosbags is not installed.
     """
     bag = Bag(Path(path))
@@ -86,7 +86,7 @@ def read_realsense(
     depth_K, depth_as_pinhole = undistort(depth.lens, depth.width, depth.height)
     to_color = _from_reference(bag, color) @ np.linalg.inv(_from_reference(bag, depth))
     for stream, encodings in ((color, _COLORS), (depth, _DEPTHS)):
-        _pixels(bag, stream, 0, encodings)  # before anything of the size that is stated is made
+        _pixels(bag, stream, 0, encodings)  # before anything of the stated size is allocated
     unit = _recorded_unit(bag, depth) if depth_unit_m is None else depth_unit_m
 
     def load_image(t: int, c: int) -> UInt8[np.ndarray, "height width 3"]:
@@ -131,7 +131,7 @@ class _Stream(NamedTuple):
 
 
 def _streams(bag: Bag) -> tuple[_Stream, _Stream]:
-    """The first stream of colour and that of depth."""
+    """The first colour stream and the first depth stream."""
     found = [match for topic in bag.topics if (match := _IMAGES.fullmatch(topic))]
     names = [next((m["stream"] for m in found if m["kind"] == kind), None) for kind in ("Color", "Depth")]
     if None in names:
@@ -147,7 +147,7 @@ def _streams(bag: Bag) -> tuple[_Stream, _Stream]:
 
 
 def _stream(bag: Bag, name: str, stamped: dict[int, float]) -> _Stream:
-    """A stream, from the stamp of each image by the time when it was recorded."""
+    """A stream, from the stamps of its images by the times at which they were recorded."""
     if not stamped:
         raise DataError(bag.path, "images", f"none in {name}/image/data", _RECORD)
     stamps, first = np.unique([*stamped.values()], return_index=True)
@@ -172,7 +172,7 @@ def _stream(bag: Bag, name: str, stamped: dict[int, float]) -> _Stream:
 
 
 def _from_reference(bag: Bag, stream: _Stream) -> Float[np.ndarray, "4 4"]:
-    """From coordinates of the stream that others refer to, to those of a stream."""
+    """Transform from the coordinates of the reference stream to those of a stream."""
     topic = f"{stream.name}/tf/0"
     if (found := bag.first(topic, _TRANSFORM)) is None:
         raise DataError(bag.path, f"the place of a camera in {topic}", "none", _RECORD)
@@ -205,7 +205,7 @@ def _message(bag: Bag, stream: _Stream, number: int) -> Message:
 
 
 def _stated_unit(bag: Bag, message: Message) -> float | None:
-    """What stands behind an image, metres; None if nothing does."""
+    """The depth unit appended to an image, metres; None if there is none."""
     marked = message.content[_FRAME_ID_AT : _FRAME_ID_AT + len(_ENDS_WITH_UNIT)] == _ENDS_WITH_UNIT
     return _unpacked(bag, "<f", message.content[-4:], 0)[0] if marked else None
 
@@ -233,7 +233,7 @@ def _read_depth(bag: Bag, stream: _Stream, number: int, unit: float) -> Float[np
 def _pixels(
     bag: Bag, stream: _Stream, number: int, encodings: dict[str, tuple[int, int | None]]
 ) -> tuple[UInt8[np.ndarray, "height width bytes"], str, bool]:
-    """The bytes of each pixel, the encoding in lower case, and whether numbers begin with their high byte."""
+    """The bytes of each pixel, the encoding in lower case, and whether values are big-endian."""
     message, where = _message(bag, stream, number), _where(bag, stream, number)
     end = None if _stated_unit(bag, message) is None else -4
     image = bag.decoded(message.content[:end], _IMAGE)

@@ -1,4 +1,4 @@
-"""RealSense cameras, read through pyrealsense2 as `gsjax.data.opencv_cameras` reads those of OpenCV."""
+"""RealSense cameras, read through pyrealsense2 with the interface of `gsjax.data.opencv_cameras`."""
 
 from typing import Any
 
@@ -18,7 +18,7 @@ _MILLIMETRES = 1e3
 class RealSenseCapture:
     """An open RealSense camera as `opencv_cameras.Capture` describes one: colour, and depth registered to it.
 
-    Lenses count as pinholes, as those of D4xx cameras nearly are.
+    Lenses are treated as pinholes, which those of D4xx cameras nearly are.
 
     Args:
         rs: the module pyrealsense2.
@@ -41,11 +41,11 @@ class RealSenseCapture:
         self._size = {cv2.CAP_PROP_FRAME_WIDTH: seen.width, cv2.CAP_PROP_FRAME_HEIGHT: seen.height}
 
     def isOpened(self) -> bool:
-        """Whether the camera is open: it is, once it is made."""
+        """Whether the camera is open: always, since the constructor opens it."""
         return True
 
     def get(self, propId: int) -> float:
-        """The width or height in pixels, by OpenCV's properties; 0 for others."""
+        """The width or height in pixels, by OpenCV's property; 0 for other properties."""
         return self._size.get(propId, 0)
 
     def grab(self) -> bool:
@@ -63,7 +63,7 @@ class RealSenseCapture:
         picture = self._frames.get_depth_frame() if is_depth else self._frames.get_color_frame()
         if not picture:
             return False, np.zeros(0)
-        pixels = np.array(picture.get_data())  # the driver takes its own back
+        pixels = np.array(picture.get_data())  # a copy: the driver reuses its own
         return True, self._to_millimetres * pixels if is_depth else pixels
 
 
@@ -71,7 +71,7 @@ def open_realsense(index: int, viewmat: Float[np.ndarray, "4 4"] | None = None) 
     """Open a RealSense camera, with depth registered to colour.
 
     Args:
-        index: its number among those that are connected, from 0.
+        index: its number among the connected cameras, from 0.
         viewmat: world to camera, [4,4]; default: the world frame is the camera's own.
 
     Raises:

@@ -1,11 +1,11 @@
 """Exports of the app Record3D ("EXR + RGB sequence"): one moving phone with depth and ARKit's poses.
 
 rgb/NUMBER.jpg          or .png, from 0
-depth/NUMBER.exr        metres in floats, registered to colour, of fewer pixels (256x192 by LiDAR)
-metadata.json           or metadata: w, h, fps; K, 9 numbers by columns, for pictures of w x h pixels;
-                        poses, a row [qx qy qz qw tx ty tz] a frame, camera to world, OpenGL axes, metres;
-                        in newer versions perFrameIntrinsicCoeffs, [fx fy cx cy] a frame, and
-                        frameTimestamps, seconds. initPose, which turns the world, is not needed.
+depth/NUMBER.exr        metres in floats, registered to colour, at lower resolution (256x192 from LiDAR)
+metadata.json           or metadata: w, h, fps; K, 9 numbers in column-major order, for w x h pixels;
+                        poses, a row [qx qy qz qw tx ty tz] per frame, camera to world, OpenGL axes, metres;
+                        in newer versions perFrameIntrinsicCoeffs, [fx fy cx cy] per frame, and
+                        frameTimestamps, seconds. initPose, which rotates the world, is not needed.
 
 The app's author describes them in github.com/marek-simonik/record3d, issues 27, 33, 36, 67, 83 and 108.
 """
@@ -34,16 +34,16 @@ from gsjax.io.brief import shortened
 
 EXPORT_THIS = 'In Record3D choose Export, "EXR + RGB sequence", and give that folder.'
 _FOLDER = "EXR_RGBD"
-_SAME_SHAPE = 0.05  # on a ratio of sides: that of a small depth map is rounded
+_SAME_SHAPE = 0.05  # on the aspect ratio: that of a small depth map is rounded
 
 
 def is_record3d(root: Path) -> bool:
-    """Whether a folder, or one within, has this layout."""
+    """Whether a folder, or one inside it, has this layout."""
     return bool(_exports(root)) or _is_unpacked(root)
 
 
 def _exports(root: Path) -> list[Path]:
-    """The folders that hold rgb and depth: this one, or else the ones within."""
+    """The folders that hold rgb and depth: this one, or else those inside it."""
     found = {file.parents[1] for file in root.glob("depth/*.exr")}
     found = found or {file.parents[1] for file in root.glob("*/depth/*.exr")}
     found = found or {file.parents[1] for file in root.glob(f"*/{_FOLDER}/depth/*.exr")}
@@ -60,15 +60,16 @@ def read_record3d(path: str | Path) -> Sequence:
     """The frames of an export that have colour, depth and a pose: one camera, 0.
 
     The others are left out, with a DataWarning that counts them. Depth is resampled to the pictures' size:
-    each pixel takes the depth that its centre lies in. Where pictures are a downscaled copy, intrinsics are
-    scaled with them. Without times in the metadata, frames follow at its rate or, without one, at 30 Hz.
+    each pixel takes the value of the depth pixel that its centre lies in. If the pictures are downscaled
+    copies, intrinsics are scaled with them. Without times in the metadata, frames follow at its rate or,
+    without one, at 30 Hz.
 
     Args:
         path: the folder with rgb and depth, or the one that it lies in.
 
     Raises:
         DataError: there are several exports or an unpacked .r3d file, metadata are missing or malformed, or
-            no frame has all.
+            no frame is complete.
         MissingExtra: the package OpenEXR is not installed.
     """
     root = Path(path)
@@ -122,12 +123,12 @@ def _metadata_of(folder: Path) -> Path:
 
 
 class _Metadata:
-    """Poses, intrinsics and times, a row a frame; NaN where a frame has none.
+    """Poses, intrinsics and times, one row per frame; NaN where a frame has none.
 
     Attributes:
         path: the file.
-        size: width and height in pixels that intrinsics are for.
-        poses: quaternions x y z w and places, [frames, 7].
+        size: width and height that the intrinsics are for, pixels.
+        poses: quaternions x y z w and positions, [frames, 7].
         Ks: intrinsics, [frames, 3, 3].
         times: seconds, [frames].
     """
@@ -152,7 +153,7 @@ class _Metadata:
             self.times = np.arange(frames) / self._number("fps", DEFAULT_RATE_HZ)
 
     def _rows(self, key: str, columns: int) -> Float[np.ndarray, "rows columns"]:
-        """The numbers of a key, which may be missing in single rows, but not in all."""
+        """The numbers of a key, in rows; null becomes NaN."""
         expected = f"{key}, {columns} numbers" + (" a frame" if key != "K" else "")
         if key not in self.values:
             raise DataError(self.path, expected, f"no {key}", "Export the recording again.")
@@ -177,14 +178,14 @@ class _Metadata:
 
 
 def _of_length(rows: Float[np.ndarray, "n k"], frames: int) -> Float[np.ndarray, "frames k"]:
-    """Rows for as many frames as there are poses; NaN where there are fewer."""
+    """The rows, truncated or padded with NaN to the number of frames."""
     padded = np.full((frames, rows.shape[1]), np.nan)
     padded[: len(rows)] = rows[:frames]
     return padded
 
 
 def _usable(folder: Path, meta: _Metadata, images: dict[int, Path], depths: dict[int, Path]) -> list[int]:
-    """Numbers of the frames that have all, in order; those of the others are counted in a DataWarning."""
+    """Numbers of the complete frames, in order; a DataWarning counts the others."""
     lengths = np.linalg.norm(meta.poses[:, :4], axis=1)
     posed = set(np.flatnonzero(np.isfinite(meta.poses).all(axis=1) & (lengths > 0)).tolist())
     measured = set(np.flatnonzero(np.isfinite(meta.Ks).all(axis=(1, 2))).tolist())
@@ -222,7 +223,7 @@ def _usable(folder: Path, meta: _Metadata, images: dict[int, Path], depths: dict
 
 
 def _of_shape(path: Path, size: tuple[int, int]) -> Float[np.ndarray, "height width"]:
-    """Depth of a picture's shape, in its own size."""
+    """The stored depth, after a check that its aspect ratio is that of the pictures."""
     depth = read_exr_depth(path)
     rows, columns = depth.shape
     if abs(columns * size[1] / (rows * size[0]) - 1) > _SAME_SHAPE:

@@ -1,9 +1,9 @@
-"""Depth moved from the camera that measured it to another one beside it: registration."""
+"""Registration: depth reprojected from the camera that measured it to another one beside it."""
 
 import numpy as np
 from jaxtyping import Float
 
-_FINEST = 16  # parts of a pixel a side: more than cameras beside each other need
+_FINEST = 16  # parts of a pixel per side: more than cameras beside each other need
 _AT_ONCE = 2**20  # points: about 100 MB
 
 
@@ -15,11 +15,11 @@ def registered(
     width: int,
     height: int,
 ) -> Float[np.ndarray, "height width"]:
-    """Depth as another camera would measure it: moved point by point, of which the nearest counts; 0 where
-    no point falls.
+    """Depth as another camera would measure it: reprojected point by point with a z-buffer; 0 where no point
+    falls.
 
-    Where the other camera's pixels are narrower, each point counts for as many of them as it is wide, so
-    surfaces that face it have no holes.
+    If the other camera's pixels are narrower, each measured pixel is divided into as many points as it covers
+    of them, so that surfaces that face the camera have no holes.
 
     Args:
         depth: metres, 0 = invalid.
@@ -34,7 +34,7 @@ def registered(
     across = (np.arange(depth.shape[1] * finer[0]) + 0.5) / finer[0]
     down = (np.arange(depth.shape[0] * finer[1]) + 0.5) / finer[1]
     band = max(1, _AT_ONCE // max(1, len(across)))
-    for start in range(0, len(down), band):  # of rows, for their points take far more memory than they do
+    for start in range(0, len(down), band):  # bands of rows: the points take far more memory than the depth
         y = down[start : start + band]
         fine = depth[y.astype(int)].repeat(finer[0], axis=1)
         rows, columns = np.nonzero(fine)

@@ -27,7 +27,7 @@ class Message(NamedTuple):
 
 
 class Bag:
-    """An open rosbag. Topics are known by names with _ for spaces.
+    """An open rosbag. Spaces in the names of topics are replaced by _.
 
     Args:
         path: the file.
@@ -59,16 +59,16 @@ class Bag:
     def messages(
         self, topics: list[str], kind: str, start: int | None = None, stop: int | None = None
     ) -> Iterator[Message]:
-        """The messages of some topics, in the order of time.
+        """The messages of some topics, in order of time.
 
         Args:
-            topics: their names; one that the file does not have has no messages.
-            kind: the type of the messages; others are passed over.
-            start, stop: the first time, and that after the last, nanoseconds; None: all.
+            topics: their names; topics that the file lacks are ignored.
+            kind: the type of the messages; others are skipped.
+            start, stop: the first time, and the first time after the last, nanoseconds; None: all.
         """
         of_topics = (connection for topic in topics for connection in self._of.get(topic, ()))
         connections = [connection for connection in of_topics if connection.msgtype == kind]
-        if not connections:  # for the library, none means all
+        if not connections:  # the library takes an empty list for all
             return
         with self._lock, self._telling_of_damage():
             for connection, recorded, content in self._reader.messages(connections, start, stop):
@@ -96,7 +96,7 @@ class Bag:
 
     @contextmanager
     def _telling_of_damage(self) -> Iterator[None]:
-        """What rosbags raises for a damaged file, of many kinds, becomes a DataError."""
+        """Raise a DataError instead of the many kinds of errors that rosbags raises for damaged files."""
         try:
             yield
         except Exception as error:

@@ -52,7 +52,7 @@ class Sequence:
         load_image: (t, c) -> RGB, [H,W,3] uint8; or floats in 0..1 if `float_images`.
         load_depth: (t, c) -> metres, [H,W], 0 = invalid; or None for a camera without depth.
         load_mask: (t, c) -> labels, [H,W] integers; or None for a camera without masks.
-        load_flow: (t, u, c) -> displacement in pixels [H,W,2] of each pixel of frame t until frame u; NaN =
+        load_flow: (t, u, c) -> displacement in pixels [H,W,2] of each pixel from frame t to frame u; NaN =
             unknown.
         truth: ground truth of the objects, for scoring.
         models: objects of known shape.
@@ -61,10 +61,10 @@ class Sequence:
             are invalid in `depth`.
         near: near clipping distance, metres.
         locate: (kind, t, c) -> path of a file, for messages; kind is "image", "depth", "mask" or "flow".
-        origin: where the data lie far from 0, what all places are relative to, in the coordinates of the
-            files, [3] float64; None if they are as in the files.
-        layout: name of the layout of its files, such as "TUM RGB-D"; empty where it was not opened by its
-            folder.
+        origin: for data far from 0, the point that all positions are relative to, in the coordinates of the
+            files, [3] float64; None if positions are as in the files.
+        layout: name of the layout of its files, such as "TUM RGB-D"; empty if it was not opened with
+            `open_sequence`.
         shared_times: whether frames may share a time, as photographs of a moving scene do.
         splits: "train", "val" or "test" for each frame; None if the data has no splits.
         background: RGB, 0 to 1, composited behind transparent images; None if none is transparent.
@@ -102,7 +102,7 @@ class Sequence:
         for name in ("times", "Ks", "viewmats"):
             object.__setattr__(self, name, np.asarray(getattr(self, name), np.float64))
         frames, cameras = self.num_frames, self.num_cameras
-        for name, side in (("Ks", 3), ("viewmats", 4)):  # of cameras that do not change
+        for name, side in (("Ks", 3), ("viewmats", 4)):  # given once per camera, for all frames
             if getattr(self, name).shape == (cameras, side, side):
                 of_frames = np.tile(getattr(self, name), (frames, 1, 1, 1))
                 object.__setattr__(self, name, of_frames)

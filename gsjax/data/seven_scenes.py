@@ -62,7 +62,7 @@ def read_seven_scenes(
             z-buffer, and invalid where the depth camera has no data. False returns the depth camera with the
             files unchanged, for use with depth alone or with colour that is already registered.
         K: intrinsics of one's own camera, or (fx, fy, cx, cy), with pixel centres at +0.5. Then pictures may
-            have any one size, and depth is taken as registered to colour; default: the Kinect of 7-Scenes.
+            have any common size, and depth is taken as registered to colour; default: the Kinect of 7-Scenes.
         depth_unit_m: metres per depth step.
 
     Raises:

@@ -1,4 +1,4 @@
-"""Live streams of frames: the consumer always gets the newest; those it is too slow for are dropped.
+"""Live streams of frames: the consumer always gets the newest; frames that it is too slow for are dropped.
 
 A source is any iterator of `Snapshot`s that blocks until one is available: a recording replayed in real time,
 cameras read through OpenCV, or a user-defined iterator. `NewestSnapshots` reads it in a thread of its own.

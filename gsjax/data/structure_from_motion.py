@@ -229,7 +229,7 @@ def _as_colmap_reads(folder: Path, names: Sequence[str], copy: Path) -> Path:
     for name in names:
         source, target = (folder / name).resolve(), copy / name
         target.parent.mkdir(parents=True, exist_ok=True)
-        if name in lacking:  # COLMAP tells formats by content
+        if name in lacking:  # COLMAP recognises formats by content
             picture = read_image(source, *picture_size(source), WHITE)
             target.write_bytes(cv2.imencode(".png", cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))[1].tobytes())
         else:

@@ -1,10 +1,10 @@
-"""Text of any system: its encoding, the ends of its lines, and what separates its fields."""
+"""Text files of any system: their encoding, line endings and field separators."""
 
 import codecs
 import re
 from contextlib import suppress
 
-# UTF-32's mark of little endian begins with UTF-16's.
+# UTF-32 comes first: its little-endian byte order mark begins with that of UTF-16.
 _MARKS = {
     codecs.BOM_UTF8: "utf-8-sig",
     codecs.BOM_UTF32_LE: "utf-32",
@@ -21,11 +21,11 @@ _DECIMAL_LINE = re.compile(rf"\s*{_NUMBER}(?:\s+{_NUMBER})+\s*")
 
 
 def decoded(content: bytes) -> str:
-    """Text from bytes, with lines that end in a newline: by the mark at their start, else as UTF-8 (or
-    UTF-16, told by its zeros), else as Windows-1252.
+    """Decode bytes to text with lines that end in a newline: by their byte order mark, else as UTF-8 (or
+    UTF-16, recognised by its zero bytes), else as Windows-1252.
 
     Raises:
-        ValueError: the bytes are no text.
+        ValueError: the bytes are not text.
     """
     marked = next((name for mark, name in _MARKS.items() if content.startswith(mark)), None)
     text = content.decode(marked) if marked else _guessed(content)
@@ -43,7 +43,7 @@ def _guessed(content: bytes) -> str:
 
 
 def _unmarked(content: bytes) -> list[str]:
-    """UTF-16 without a mark has a zero byte beside each Latin letter."""
+    """Candidates for UTF-16 without a byte order mark, which has a zero byte beside each Latin letter."""
     zeros = [content[start:200:2].count(0) for start in (0, 1)]
     return [name for name, share in (("utf-16-be", zeros[0]), ("utf-16-le", zeros[1])) if share > 20]
 
@@ -51,8 +51,8 @@ def _unmarked(content: bytes) -> list[str]:
 def fields(line: str) -> list[str]:
     """The fields of a line, separated by spaces, tabs, commas or semicolons, without quotes.
 
-    Commas are decimal marks in a line with semicolons, within quotes, and between numbers separated by spaces
-    or tabs of which none has two.
+    Commas are decimal marks in a line with semicolons, within quotes, and in a line of numbers that are
+    separated by spaces or tabs and have at most one comma each.
 
     Args:
         line: a line of text.

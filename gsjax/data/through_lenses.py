@@ -1,4 +1,4 @@
-"""Photographs through lenses: undistorted to pinholes, or, by fisheyes, kept as they were taken."""
+"""Photographs through lenses: undistorted to pinhole views or, for fisheyes, kept as they were taken."""
 
 import warnings
 from collections.abc import Callable, Sequence
@@ -16,19 +16,19 @@ from gsjax.geometry.sight import rays
 
 Fisheye = Literal["undistort", "keep"]
 
-_MUCH = 0.25  # of the pixels of a photograph: losing more is said
-_GRID = 64  # pixels along each side that are looked at
+_MUCH = 0.25  # share of a photograph's pixels: losing more causes a warning
+_GRID = 64  # samples along each side of a photograph
 
 
 @dataclass(frozen=True, eq=False)
 class ThroughLenses:
-    """How N photographs are seen, and what of their files becomes what is seen.
+    """The cameras that see N photographs, and the maps from their files to the views of these cameras.
 
     Attributes:
         Ks: intrinsics in pixels, pixel centres at +0.5, [N,3,3].
-        fisheye: k1 to k4 of each, [N,4]; None if all are seen by pinholes.
-        views: maps each picture to what is seen: (picture, OpenCV interpolation flag) -> picture.
-        reaches: which pixels of each a fisheye shows; None if all.
+        fisheye: k1 to k4 of each, [N,4]; None if all views are pinhole views.
+        views: map of each: (stored picture, OpenCV interpolation flag) -> picture in the view.
+        reaches: which pixels of each its fisheye covers; None if all.
     """
 
     Ks: Float[np.ndarray, "n 3 3"]
@@ -38,7 +38,7 @@ class ThroughLenses:
 
     @property
     def has_edges(self) -> bool:
-        """Whether some photograph has pixels that its lens does not show."""
+        """Whether some photograph has pixels that its lens does not cover."""
         return any(reached is not None for reached in self.reaches)
 
     def image(
@@ -50,7 +50,7 @@ class ThroughLenses:
     def mask(
         self, i: int, shades: Integer[np.ndarray, "height width"] | None
     ) -> Bool[np.ndarray, "height width"] | None:
-        """Which pixels count: those whose shade is not 0 and that the lens shows; None if all."""
+        """Which pixels count: those whose shade is not 0 and that the lens covers; None if all."""
         reached = self.reaches[i]
         if shades is None:
             return reached
@@ -58,7 +58,7 @@ class ThroughLenses:
         return counts if reached is None else counts & reached
 
     def depth(self, i: int, depth: Float[np.ndarray, "height width"]) -> Float[np.ndarray, "height width"]:
-        """Depth as the camera has it: for a fisheye the distance, from depth along the axis."""
+        """Depth as the view's camera defines it, from depth along the axis: for a fisheye, the distance."""
         seen = self.views[i](depth, cv2.INTER_NEAREST)
         if self.fisheye is None:
             return seen
@@ -69,15 +69,15 @@ class ThroughLenses:
 def through_lenses(
     lenses: Sequence[Lens], sizes: Sequence[tuple[int, int]], where: object, fisheye: Fisheye
 ) -> ThroughLenses:
-    """Pinhole views of photographs, or the photographs as fisheyes took them.
+    """Undistort photographs to pinhole views, or keep them as fisheyes took them.
 
-    Warns with DataWarning if undistorting loses a quarter of the pixels of fisheye photographs.
+    Warns with DataWarning if undistorting loses more than a quarter of a fisheye photograph.
 
     Args:
-        lenses: of each photograph.
+        lenses: the lens of each photograph.
         sizes: width and height of each, pixels.
         where: name of the photographs in messages.
-        fisheye: whether to undistort those of fisheyes, or to keep them.
+        fisheye: whether to undistort fisheye photographs, or to keep them.
 
     Raises:
         DataError: fisheyes are to be kept, and not all lenses are fisheyes.
@@ -120,7 +120,7 @@ def _reach(lens: Lens, width: int, height: int) -> Bool[np.ndarray, "height widt
 
 
 def _shown(lens: Lens, K: Float[np.ndarray, "3 3"], width: int, height: int) -> float:
-    """Share of what a fisheye shows of a photograph that its pinhole view shows too."""
+    """Share of what a fisheye photograph shows that its pinhole view shows too."""
     if not lens.fisheye:
         return 1.0
     small = np.diag([_GRID / width, _GRID / height, 1.0])

@@ -10,10 +10,10 @@ integer_depth_scale            instant-ngp's length of a depth step; depth_unit_
                                enable_depth_loading false leaves depth out
 train_filenames, ...           nerfstudio's splits: files in none of the lists are left out, as nerfstudio
                                does; Blender has a file per split: transforms_train.json, ...
-ply_file_path                  nerfstudio's sparse points; default: sparse_pc.ply, if it lies there
+ply_file_path                  nerfstudio's sparse points; default: sparse_pc.ply or points3D.ply, if there
 
-Poses and points are in one frame, so nerfstudio's applied_transform, which tells how that came to be, and the
-scale, offset and aabb_scale by which instant-ngp places its grid, change nothing here.
+Poses and points share one frame, so nerfstudio's applied_transform, which records how that frame was chosen,
+and instant-ngp's scale, offset and aabb_scale, which place its grid, have no effect here.
 """
 
 import warnings
@@ -92,9 +92,9 @@ def read_transforms(
         path: the folder, or one such file.
         background: RGB, 0 to 1, behind transparent photographs; default: white, as is usual.
         depth_unit_m: length of one depth step; None: as the file states, else 0.001, as in nerfstudio.
-        fisheye: whether photographs by fisheyes are undistorted or kept.
+        fisheye: whether fisheye photographs are undistorted or kept.
 
-    Warns with DataWarning if the file has keys that look like data and are not read, or instant-ngp's depth
+    Warns with DataWarning if the file has keys that look like data but are not read, or instant-ngp's depth
     without its unit.
 
     Raises:
@@ -165,7 +165,7 @@ def _files(path: Path) -> tuple[Path, dict[Path, str | None]]:
 
 
 def _listed(name: Any) -> Path:
-    """A name in a form in which different spellings are equal."""
+    """A normalised form of a name, the same for its different spellings."""
     return Path(portable(str(name)))
 
 
@@ -175,7 +175,7 @@ def _beside(root: Path, name: str) -> Path:
 
 
 def _named_splits(file: Path, meta: dict[str, Any]) -> dict[Path, str]:
-    """The split of each photograph that the file assigns to one."""
+    """The split of each photograph to which the file assigns one."""
     named = {}
     for split in SPLITS:
         names = meta.get(f"{split}_filenames") or []
@@ -209,7 +209,7 @@ class _Entry(NamedTuple):
         return DataError(f"{self.file}, frame {self.number}", expected, str(found), advice)
 
     def value(self, *names: str) -> Any:
-        """The first of these keys that the frame or else the file has; or None."""
+        """The value of the first of these keys that the frame, or else the file, has; None if none has."""
         for name in names:
             for place in (self.entry, self.meta):
                 if place.get(name) is not None:

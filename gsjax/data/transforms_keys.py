@@ -1,4 +1,4 @@
-"""The keys of a transforms.json: those that are read, and warnings of those that are not."""
+"""The keys of a transforms.json: those that are read, and warnings about those that are not."""
 
 import os
 import re
@@ -14,7 +14,7 @@ SPLITS = ("train", "val", "test")
 DEPTH_UNIT_M = 0.001  # nerfstudio's default
 DEPTHS = ("depth_file_path", "depth_path")
 UNITS = ("integer_depth_scale", "depth_unit_scale_factor")
-# instant-ngp selects the model by keys of their own.
+# instant-ngp selects the camera model by keys of its own.
 MODEL_KEYS = {"is_fisheye": "OPENCV_FISHEYE", "latlong": "LATLONG", "ftheta_p0": "FTHETA"}
 
 _READ = {
@@ -42,8 +42,8 @@ _DATA = re.compile(
 
 
 def warn_of_unread(root: Path, file: Path, meta: Mapping[str, Any]) -> None:
-    """Warns with DataWarning of keys that look like data, by their names or as their values name files, and
-    are not read.
+    """Warns with DataWarning about keys that are not read but look like data, by their names or because
+    their values name files.
 
     Args:
         root: the folder to which such names are relative.
@@ -64,7 +64,7 @@ def warn_of_unread(root: Path, file: Path, meta: Mapping[str, Any]) -> None:
 
 
 def warn_of_unknown_unit(file: Path, meta: Mapping[str, Any]) -> None:
-    """Warns with DataWarning of instant-ngp's depth without its unit, which has no default there."""
+    """Warns with DataWarning if instant-ngp's depth comes without its unit, which has no default there."""
     frames = [frame for frame in meta["frames"] if isinstance(frame, dict)]
     if any("depth_path" in frame for frame in frames) and not any(
         name in place for name in UNITS for place in (meta, *frames)

@@ -31,10 +31,10 @@ def check_shape(name: str, array: np.ndarray, shape: tuple[int, ...]) -> None:
 
 
 def check_loaded(where: str, array: np.ndarray | None, shape: tuple[int, ...], kind: type) -> None:
-    """Raises DataError unless what a loader gave has the expected shape and type.
+    """Raises DataError unless what a loader returned has the expected shape and type.
 
     Args:
-        where: the file, or what it is, for the message.
+        where: the file, or a description of the data, for the message.
         array: what was loaded.
         shape: the expected shape.
         kind: the expected type, or a group of them: np.uint8, np.integer, np.floating.
@@ -50,13 +50,13 @@ def check_loaded(where: str, array: np.ndarray | None, shape: tuple[int, ...], k
 
 
 def check_background(background: tuple[float, float, float] | None) -> None:
-    """Raises a ValueError unless a colour behind pictures is RGB from 0 to 1, or None."""
+    """Raises ValueError unless a background colour is RGB from 0 to 1, or None."""
     if background is not None and not (len(background) == 3 and all(0 <= c <= 1 for c in background)):
         raise ValueError(f"background: expected RGB from 0 to 1, found {background}; divide bytes by 255")
 
 
 def positions_of(indices: Any, count: int) -> list[int]:
-    """Positions in a list of `count`, from positions or from a mask.
+    """Positions in a list of `count` items, given as positions or as a mask.
 
     Raises:
         ValueError: a mask has another length.
@@ -101,7 +101,7 @@ def check_poses(
 
 
 def check_quaternions(quats: Float[np.ndarray, "n 4"], where: Callable[[int], str], advice: str) -> None:
-    """Check that every quaternion has length 1, as far as few digits tell.
+    """Check that every quaternion has length 1, apart from rounding to few digits.
 
     Args:
         quats: the quaternions.

@@ -2,7 +2,7 @@
 
 Cameras of phones and screen recorders write frames at a varying rate, and headers are often wrong about
 their number. So times are those of the file's packets (presentation timestamps), which ffmpeg lists without
-decoding anything; where that list leaves a doubt, the video is decoded once to see what it holds.
+decoding anything; if that list is doubtful, the video is decoded once to see what it holds.
 """
 
 import threading
@@ -31,8 +31,8 @@ class VideoFile(NamedTuple):
     Attributes:
         width: pixels, as players show it: with the file's rotation applied.
         height: pixels.
-        times: of the frames that can be decoded, seconds after the first, [T].
-        stamped: whether the file has those times; otherwise they are counted from its rate.
+        times: time of each frame that can be decoded, seconds after the first, [T].
+        stamped: whether the file stores these times; otherwise they follow from its frame rate.
     """
 
     width: int
@@ -101,7 +101,7 @@ class Video:
             path: the file.
             width, height: pixels.
             num_frames: number of frames.
-            file: what `describe_video` says of it; None: that is asked at the first read.
+            file: the result of `describe_video`; None: called at the first read.
 
         Raises:
             DataError: the file is missing.

@@ -1,6 +1,7 @@
-"""Built-in scenes: ray-cast, textured and shadowed solids that move rigidly, twist and bend, seeded.
+"""Built-in scenes: ray-cast, textured and shadowed solids that move rigidly, twist and bend.
 
-They are not made of Gaussians, so no reconstruction can fit them by construction, and need no download.
+They are generated from a seed and need no download. Since they are not made of Gaussians, no reconstruction
+fits them by construction.
 """
 
 from gsjax.data.simulated.articulated import articulated

@@ -1,4 +1,4 @@
-"""A cabinet in two states: doors and drawers before and after they moved, each by cameras of its own."""
+"""A cabinet in two states: doors and drawers before and after they moved, each seen by its own cameras."""
 
 import numpy as np
 from jaxtyping import Float
@@ -18,7 +18,7 @@ _SHELF = 0.34  # height of the board between doors and drawers, metres
 _TARGET = np.array([0.0, 0.0, 0.26])
 _LIGHT = Light(position=(1.6, 0.9, 2.2), radius=0.03)
 _OPEN = {"revolute": np.deg2rad((5.0, 110.0)), "prismatic": np.array((0.01, 0.24))}
-_LEAST = 0.4  # of that range that each part moves
+_LEAST = 0.4  # share of that range that each part moves at least
 
 
 def cabinet(
@@ -30,12 +30,12 @@ def cabinet(
     cameras: int = 24,
 ) -> Sequence:
     """Two states of a cabinet with doors that turn and drawers that slide, as PARIS has them: RGB-D, labels,
-    exact poses and joints. Each state is seen by cameras of its own, around the front and above.
+    exact poses and joints. Each state is seen by its own cameras, in front of the cabinet and above it.
 
     Labels are 0 scene (the floor and the cabinet), then the doors, then the drawers.
 
     Args:
-        doors: number of doors; they hang on the left and on the right in turn.
+        doors: number of doors, hinged alternately on the left and on the right.
         drawers: number of drawers, above the doors.
         seed: seed of the patterns, of how far parts are open, and of the cameras.
         width: pixels.
@@ -90,7 +90,7 @@ def _values(kind: str, random: np.random.Generator) -> Float[np.ndarray, "2"]:
 
 
 def _eyes(random: np.random.Generator, count: int, distance: float) -> Float[np.ndarray, "count 3"]:
-    """Places in front of the cabinet and above it."""
+    """Camera positions in front of the cabinet and above it."""
     azimuths = np.deg2rad(random.uniform(-100, 100, count))
     heights = np.arcsin(random.uniform(0.1, 0.95, count))
     flat = np.stack([np.cos(azimuths), np.sin(azimuths)], -1) * np.cos(heights)[:, None]
@@ -98,7 +98,7 @@ def _eyes(random: np.random.Generator, count: int, distance: float) -> Float[np.
 
 
 def _frame(middles: Float[np.ndarray, "columns"], seed: int) -> list[Primitive]:
-    """The floor, and a cabinet without a top, whose columns are apart."""
+    """The floor, and a cabinet without a top, with a wall between neighbouring columns."""
     floor = Texture("checker", ((0.44, 0.45, 0.47), (0.56, 0.57, 0.58)), 0.12, seed=1)
     wood = Texture("stripes", ((0.50, 0.34, 0.22), (0.66, 0.48, 0.32)), 0.06, seed=20 * seed)
     wide = _COLUMN * len(middles)
@@ -133,7 +133,7 @@ def _drawer(body: int, middle: float, wood: Texture) -> list[Primitive]:
 
 
 def _wood(seed: int, body: int) -> Texture:
-    """Wood of a part, lighter from part to part."""
+    """Wood of a part, in one of four brightnesses."""
     light = np.array([0.06, 0.05, 0.03]) * (body % 4)
     dark, bright = (
         tuple((np.array(color) + light).tolist()) for color in ((0.42, 0.46, 0.40), (0.62, 0.66, 0.58))

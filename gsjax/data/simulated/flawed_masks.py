@@ -1,5 +1,5 @@
-"""Corruption of true masks by the typical errors of a segmenter: shifted outlines, merged, split or missing
-things."""
+"""Corruption of true masks by the typical errors of a segmenter: inaccurate outlines, and things that are
+merged, split or missing."""
 
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -32,7 +32,7 @@ class Flaws:
 
 
 class FlawedMasks(NamedTuple):
-    """Masks of V pictures as a segmenter might produce them, and embeddings as of an encoder of each mask.
+    """Masks of V pictures as a segmenter might produce them, and embeddings as an encoder of masks might.
 
     Attributes:
         labels: [H,W] for each picture; 0 is the background, -1 is in no mask.

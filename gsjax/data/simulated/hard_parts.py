@@ -32,7 +32,7 @@ _FRAMES = 15.0  # duration of all motions
 
 
 class _Hard(NamedTuple):
-    """Solids of the part around the middle of its body at rest, that middle, and the joint."""
+    """Solids of the part relative to the centre of its body at rest, that centre, and the joint."""
 
     solids: list[Primitive]
     middle: Float[np.ndarray, "3"]
@@ -49,8 +49,8 @@ def hard_parts(
     cameras: int = 8,
 ) -> Sequence:
     """A part that is hard to find, and a box that is not: RGB-D, labels, optical flow, exact poses, and the
-    joint of the part; 15 Hz. The failures of MotionSplicer, figure 9, as hard as requested. A sequence of
-    fewer frames is the beginning of the longer one; after frame 15 all is at rest.
+    joint of the part; 15 Hz. These are the failure cases of MotionSplicer, figure 9, with adjustable
+    difficulty. A sequence of fewer frames is a prefix of the longer one; after frame 15 nothing moves.
 
     Labels are 0 scene (a floor and a wall), 1 the part, 2 a box that slides by 0.2 m and turns. The cameras
     are on an arc in front of the wall.

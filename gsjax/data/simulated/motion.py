@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 def rigid(
     rotation: Rotation | None, translation: Float[np.ndarray, "*frames 3"] | Sequence[float]
 ) -> Float[np.ndarray, "*frames 4 4"]:
-    """Transforms that rotate, then translate, from one rotation or a batch of them; None is no rotation."""
+    """Transforms that rotate, then translate; the rotation is one, a batch, or None for the identity."""
     translation = np.asarray(translation, np.float64)
     matrices = np.eye(3) if rotation is None else rotation.as_matrix()
     batch = np.broadcast_shapes(translation.shape[:-1], matrices.shape[:-2])

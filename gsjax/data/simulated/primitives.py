@@ -1,6 +1,6 @@
 """Solids, a plane and a sheet: ray intersections and normals. Rays are columns, [3,N].
 
-Every intersection solves for the smallest s > 0 at which origin + s * direction enters the solid; it is
+Every intersection solves for the smallest s > 0 at which origin + s * direction enters the solid; s is
 infinite for rays that miss it or start inside.
 """
 

@@ -43,8 +43,8 @@ def robot_poses(
     """Poses of the arm's bodies in the world.
 
     Args:
-        grasp: pose of the frame between the fingers; they close along its y axis, and the hand is up its z
-            axis.
+        grasp: pose of the frame between the fingers; they close along its y axis, and its z axis points to
+            the hand.
         opening: distance of each finger from the middle, metres.
     """
     wrist = grasp[:, :3, 3] + _WRIST_HEIGHT * grasp[:, :3, 2]
