@@ -66,7 +66,7 @@ def _poses_of(
 def _of_objects(
     values: list[np.ndarray], label_of: np.ndarray, joined: np.ufunc, first: bool | np.float32
 ) -> Shaped[np.ndarray, "T K"]:
-    """The value of each object in each frame: those of its parts, combined by `joined`; `first` in frame 0."""
+    """The value of each object in each frame: those of its parts combined by `joined`; `first` in frame 0."""
     rows = np.full((1 + len(values), label_of.max()), first)
     for t, row in enumerate(values, 1):
         joined.at(rows[t], label_of[1:] - 1, row)

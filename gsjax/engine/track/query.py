@@ -30,7 +30,7 @@ from gsjax.perception.closed_vocabulary import ClosedVocabulary
 from gsjax.scene.origin import in_world
 from gsjax.viz.colors import label_color, to_uint8
 
-_CLOSE = 0.02  # a smaller margin is called a close call
+_CLOSE = 0.02  # a smaller margin is reported as a close call
 
 
 @dataclass(frozen=True)

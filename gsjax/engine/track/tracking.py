@@ -47,7 +47,7 @@ def track(
 
     Args:
         scene: from `start_scene` or `scene_from_shapes`; not used with `after`.
-        first: the frame that `scene` shows; with `after`, the frame that it shows.
+        first: the frame that `scene` shows or, if given, `after`.
         frames: the frames after it, in order of time; all of one size and number of cameras.
         config: see `TrackConfig` (default: its defaults).
         budget_ms: time that an update may take, milliseconds. The richest settings that keep to it are then

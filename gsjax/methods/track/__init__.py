@@ -1,7 +1,7 @@
 """The object-aware tracker (Object-Aware Gaussian Splatting for Robotic Manipulation).
 
 A first RGB-D frame and the mask of one camera become a scene of labelled Gaussians, whose objects are then
-tracked rigidly from frame to frame:
+tracked from frame to frame:
 
 scene = start_scene(first, mask, mask_camera, config)
 for now in gsjax.track(scene, first, frames, config):

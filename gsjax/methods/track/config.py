@@ -75,7 +75,7 @@ class AlignConfig:
     """Pixels aligned per group and camera: this many from the last frame and as many from the group's
     keyframe."""
     keyframe_turn: float = 0.4
-    """Rotation at which a group's keyframe is replaced, radians; its weight fades to 0 up to there."""
+    """Rotation at which a group's keyframe is replaced, radians; until then its weight fades to 0."""
     max_thickness: float = 0.06
     """Measured depth that differs from the model's by more than this belongs to another object, metres."""
     shading: float = 0.3
@@ -223,5 +223,5 @@ ACCURATE = replace(
 PAPER = replace(ACCURATE, refine=RefineConfig(), matching=True, redraw="all")
 PRESETS = {"fast": TrackConfig(), "balanced": BALANCED, "accurate": ACCURATE, "paper": PAPER}
 """`fast`, the default, is for 30 Hz on one core, and searches for two objects per update;
-`balanced` and `accurate` align more and more points. `paper` has all stages of the paper, including template
+`balanced` and `accurate` align ever more points. `paper` has all stages of the paper, including template
 matching and photometric refinement, which cost much and gain little: see docs/results-tracking.md."""

@@ -206,7 +206,7 @@ def guesses_at(
     Args:
         key: random key.
         shifts: shifts of the places around.
-        reference: reference points of the group. One of a similar colour is put at each unexplained pixel.
+        reference: reference points of the group. One of a similar colour is placed at an unexplained pixel.
         center: centroid of the group, metres.
         unexplained: see `unexplained_pixels`.
         config: nothing is rotated if its `max_turn` is 0.
@@ -238,7 +238,7 @@ def guesses_spun(
     config: AlignConfig,
 ) -> Float[Array, "n 6"]:
     """The guess of the last frame, as it is or flipped about one of its axes, and spun about one by any
-    angle: objects that look alike when rotated, like a can or a box, are often found rotated at first.
+    angle, because objects that look alike when rotated (cans, boxes) are often found rotated at first.
 
     Args:
         key: random key.

@@ -1,4 +1,4 @@
-"""Initialization without depth: known shapes, given as Gaussians, are fitted to the first images.
+"""Initialisation without depth: known shapes, given as Gaussians, are fitted to the first images.
 
 A shape with a pose (the ground) is placed as it is. One without is placed on its plane where it matches the
 images: position and heading are searched for, scored by the colours of the pixels that its centres project

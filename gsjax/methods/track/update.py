@@ -79,7 +79,7 @@ def track_step(
         if everywhere is None:
             most = config.align.everywhere
             everywhere = jnp.int32(scene.num_objects if most is None else most)
-        with jax.default_matmul_precision("highest"):  # poses compound: no TF32 on GPUs that have it
+        with jax.default_matmul_precision("highest"):  # errors of poses add up: no TF32 on GPUs that have it
             centers = group_means(pose.means, scene.groups, scene.num_objects)
             images = tone_images(frame, config.align.shading)
             reference = reference_points(scene, pose, config.align)

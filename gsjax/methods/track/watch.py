@@ -51,7 +51,7 @@ class SearchResult(NamedTuple):
 
 
 class Watch(NamedTuple):
-    """Record of how each group has been followed; it decides which are searched for first, and are lost."""
+    """Record of how each group has been followed; it decides where to search first, and which are lost."""
 
     usual: Float[Array, "k"]  # running mean of the residual
     waited: Float[Array, "k"]  # frames since the group was last `SearchResult.searched`
