@@ -62,6 +62,6 @@ def prepared(frame: Frame, config: TrackConfig) -> tuple[Frame, Int[Array, ""]]:
     that were not finite.
 
     Raises:
-        ValueError: a camera does not exist, or nothing is left of the images.
+        ValueError: a camera does not exist, or the reduced images would be empty.
     """
     return without_broken(part_of(frame, config.cameras, config.shrink))

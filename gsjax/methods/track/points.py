@@ -178,7 +178,7 @@ def first_keyframe(pixels: Points) -> Keyframe:
 
 
 def turn_since(keyframe: Keyframe) -> Float[Array, "k"]:
-    """Angle by which each group has turned since its keyframe, radians."""
+    """Angle by which each group has rotated since its keyframe, radians."""
     return 2 * jnp.arccos(jnp.clip(jnp.abs(keyframe.turned[:, 0]), 0.0, 1.0))
 
 

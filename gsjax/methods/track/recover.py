@@ -122,7 +122,7 @@ def recover(
         return jnp.concatenate([twists, jnp.broadcast_to(guess, (count - len(twists), 6))])
 
     def one_round(_, tried):
-        """The best of what was tried, and rotations of these."""
+        """The best of the twists tried so far, and rotations of these."""
         twists, confidence = places(tried, few, partial(align, widen=config.widen))
         best = best_distinct(beam, twists, evidence(confidence), config)
         turned = [turn_hypotheses(twist, axes, turns) if turns else twist[None] for twist in best]

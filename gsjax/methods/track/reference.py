@@ -20,7 +20,7 @@ from gsjax.methods.track.scene import TrackedScene
 
 
 class ReferencePoints(NamedTuple):
-    """Up to p reference points of each group, where it is believed to be."""
+    """Up to p reference points of each group, at its estimated pose."""
 
     means: Float[Array, "*k 3 p"]
     normals: Float[Array, "*k 3 p"]  # outward; 0 if both sides are visible
