@@ -230,9 +230,9 @@ class Log:
             self._memory_mb.append(resident_mb())
 
     def _carried(self, twists: np.ndarray, centers: np.ndarray) -> np.ndarray:
-        """The present position of each group's first centre, and its rotation since.
+        """The current position of each group's first centre, and its rotation since then.
 
-        The tracker's own centres shift with what joins a group; these go where its motion carries them.
+        The tracker's own centres shift as Gaussians join a group; these only move with the group.
         """
         before, turns = centers - twists[:, :3], Rotation.from_rotvec(twists[:, 3:])
         old = before if self._centers is None else self._centers
@@ -247,7 +247,7 @@ class Log:
         return {name: self._column(name) for name in names} | {"label_ids": self._ids}
 
     def metrics(self) -> dict[str, Any]:
-        """What metrics.json holds of the stream."""
+        """The part of metrics.json about the stream."""
         span, looked_for, memory = self._now - self._begun, self._column("looked_for"), self._memory_mb
         return {
             "frames": dict(self.counts),

@@ -40,17 +40,17 @@ class Tracking:
         joined: number of Gaussians that had joined by each frame.
         update_s: seconds of each update; 0 for the first frame, which is initialisation.
         compile_s: seconds spent compiling, since the run began or was resumed.
-        planning_s: seconds before the first update, without compiling: for the plan, the first look and,
-            under a budget, trials of settings.
+        planning_s: seconds before the first update, without compiling: for the plan, processing the first
+            frame and, under a budget, trials of settings.
         loading_s: seconds that the loop waited for images.
         loop_s: seconds of the whole loop.
         plans: number of plans; more than one means that a plan had become too small.
         visible: [K] per update: which objects some camera saw.
         lost: [K] per update: which objects were not where they were believed to be.
         turn_known: [K] per update: whether the rotation of each object since the first frame is known.
-        agrees: [K] per update: the share of what is seen of each object that agrees with the pictures.
+        agrees: [K] per update: the fraction of what is seen of each object that agrees with the pictures.
         skipped: number of updates that changed nothing, because a number in them was not finite.
-        everywhere: number of groups that each update turned or searched for.
+        everywhere: number of groups for which each update tried rotations or other places.
         resumed: number of frames that an earlier run had tracked; 0 without one.
         stopped: what ended the loop early, or None.
     """
@@ -75,7 +75,7 @@ class Tracking:
     stopped: BaseException | None = None
 
     def add(self, now: Tick) -> None:
-        """One frame more."""
+        """Append one frame."""
         self.tick, info = now, now.info
         self.poses.append(jax.device_get(now.result.pose))
         self.joined.append(int(info["joined"]))
@@ -148,7 +148,7 @@ class Tracking:
 
 
 def begin(scene: TrackedScene) -> Tracking:
-    """Tracking that has come to the first frame."""
+    """Tracking that has reached the first frame."""
     return Tracking(scene, [jax.device_get(first_pose(scene))])
 
 

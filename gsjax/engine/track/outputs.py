@@ -21,13 +21,13 @@ from gsjax.viz.colors import overlay_labels
 def write_tracking(
     folder: RunFolder, tracking: Tracking, times: np.ndarray, origin: Float[np.ndarray, "3"] | None = None
 ) -> None:
-    """Write trajectory.npz and scene.ply; this comes before scoring, which may be stopped.
+    """Write trajectory.npz and scene.ply; this precedes scoring, which may be interrupted.
 
     Args:
         folder: of the run.
         tracking: the scene and its poses.
         times: [T] of the frames, seconds.
-        origin: what places are relative to; it is put back, and means are then float64.
+        origin: what positions are relative to; it is added back, and means are then float64.
     """
     # Parts of one object are one label in the files.
     label_ids, label_of = np.unique(tracking.scene.label_ids, return_inverse=True)
@@ -51,7 +51,7 @@ def write_tracking(
 def _poses_of(
     tracking: Tracking, labels: Int[np.ndarray, "N"], origin: Float[np.ndarray, "3"] | None
 ) -> Float[np.ndarray, "T K 4 4"]:
-    """The rigid motion of each object since the first frame, in the world; of one without Gaussians, none."""
+    """The rigid motion of each object since the first frame, in the world; none for one without Gaussians."""
     means, count = tracking.means().astype(np.float64), len(np.unique(tracking.scene.label_ids)) - 1
     poses = np.tile(np.eye(4), (len(means), count, 1, 1))
     for k in range(count):
@@ -66,7 +66,7 @@ def _poses_of(
 def _of_objects(
     values: list[np.ndarray], label_of: np.ndarray, joined: np.ufunc, first: bool | np.float32
 ) -> Shaped[np.ndarray, "T K"]:
-    """What each update says of an object, joined from what it says of its parts; `first` in frame 0."""
+    """The value of each object in each frame: those of its parts combined by `joined`; `first` in frame 0."""
     rows = np.full((1 + len(values), label_of.max()), first)
     for t, row in enumerate(values, 1):
         joined.at(rows[t], label_of[1:] - 1, row)
@@ -145,7 +145,7 @@ def _centroids(tracking: Tracking, names: dict[int, str], group_labels: np.ndarr
 def _true_paths(
     recording: Recording, tracking: Tracking, paths: dict[str, np.ndarray], names: dict[int, str]
 ) -> dict[str, np.ndarray]:
-    """The paths of the same centroids under the true motion."""
+    """The paths that the same centroids have under the true motion."""
     truth, true = recording.tracked.truth, {}
     if truth is None:
         return true

@@ -1,4 +1,4 @@
-"""Poses of tracked objects, scored as benchmarks of pose estimation score them; docs/scores.md has the
+"""Scores of the poses of tracked objects, as in benchmarks of pose estimation; docs/scores.md has the
 definitions."""
 
 from typing import Any
@@ -23,7 +23,7 @@ from gsjax.metrics.pose import (
 from gsjax.metrics.segmentation import IGNORED_LABEL
 
 OWN_POINTS = "Gaussians of the first frame"
-"""The model of an object of which the recording has none."""
+"""Source of the model of an object for which the recording has none."""
 
 
 def pose_metrics(
@@ -36,8 +36,7 @@ def pose_metrics(
     have no points.
 
     An object's pose is its true one in the first frame, moved as its Gaussians move. The model is the
-    recording's, or else those Gaussians in the first frame, less those that are known to belong to something
-    else.
+    recording's, or else those Gaussians in the first frame, except those known to belong to something else.
 
     Args:
         tracking: the scene and its poses.

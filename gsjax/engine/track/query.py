@@ -1,4 +1,4 @@
-"""The query of a run of `gsjax track`: the object that a text means, and where it is in every frame."""
+"""The query of a run of `gsjax track`: the object that a text refers to, and where it is in every frame."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -30,7 +30,7 @@ from gsjax.perception.closed_vocabulary import ClosedVocabulary
 from gsjax.scene.origin import in_world
 from gsjax.viz.colors import label_color, to_uint8
 
-_CLOSE = 0.02  # a smaller margin is called a close call
+_CLOSE = 0.02  # a smaller margin is reported as a close call
 
 
 @dataclass(frozen=True)
@@ -46,14 +46,14 @@ class ObjectQuery(Common, ClipWeights, ObjectText):
 
 
 class Answer(NamedTuple):
-    """The object that a text means.
+    """The object that a text refers to.
 
     Attributes:
         group: its label in the run's files, 1 to K.
         name: its name.
         scores: cosine of each object, by name.
-        margin: difference of its cosine and the next one.
-        min_score: the least cosine that means an object.
+        margin: difference between its cosine and the next one.
+        min_score: the smallest cosine that counts as a match.
         rows: its Gaussians, as rows of scene.ply.
     """
 
@@ -66,13 +66,13 @@ class Answer(NamedTuple):
 
 
 def ask_for_object(options: ObjectQuery, console: Console, folder: Path, *, pictures: bool = True) -> None:
-    """Answer, and write the folder of the answer.
+    """Answer a query, and write the folder of the answer.
 
     Args:
         options: the run and the text.
         console: shows the progress.
         folder: for the answer.
-        pictures: whether to draw the object's masks, and film it.
+        pictures: whether to write the object's masks and a video of it.
 
     Raises:
         ValueError, OSError: there is no such run or encoder, or no object matches the text.
@@ -109,7 +109,7 @@ def ask_for_object(options: ObjectQuery, console: Console, folder: Path, *, pict
 
 
 def _draw(folder: Path, saved: SavedRun, recording: Recording, group: int, console: Console) -> list[int]:
-    """Write the masks of an object and its film; returns the number of pixels of each mask."""
+    """Write the masks of an object and a video of it; returns the number of pixels of each mask."""
     pixels = []
     with VideoWriter(folder / "video.mp4", frame_rate(recording.tracked.times)) as video:
         for view in progress(views(saved.tracking, recording), saved, console):
@@ -133,7 +133,7 @@ def ask(options: ObjectQuery, console: Console, notes: Notes) -> tuple[SavedRun,
     """
     _check_encoder(options)
     saved = open_run(options.run)
-    saved.seen_by(options.camera)  # these two first: a wrong camera or word is reported at once
+    saved.seen_by(options.camera)  # these two first, to report a wrong camera or word at once
     encoder = _encoder(options, saved)
     wanted = encoder.embed_text(options.text)
     with console.status("encoding the first frame"):

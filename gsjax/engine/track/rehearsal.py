@@ -12,7 +12,7 @@ from gsjax.scene.frame import Frame
 
 @dataclass
 class Rehearsal:
-    """An update of a scene that is not fitted yet, which has the shapes of the fitted one.
+    """An update of a scene that is not fitted yet, but already has the array shapes of the fitted one.
 
     Args:
         first: the first frame, which also stands for the second.
@@ -28,7 +28,7 @@ class Rehearsal:
     _job: Future | None = field(default=None, init=False)
 
     def begin(self, scene: TrackedScene) -> None:
-        """Begin on a thread of its own."""
+        """Begin the update of `scene` on a thread of its own."""
         if not self.needed:
             return
         config = first_rung(self.config, len(self.first.images)) if self.budgeted else self.config
@@ -37,6 +37,6 @@ class Rehearsal:
         executor.shutdown(wait=False)
 
     def tick(self) -> Tick | None:
-        """The tick of the rehearsal, once it has ended; None if there was none or it failed, for then the
-        tracker's own update says why."""
+        """The tick of the rehearsal, once it has ended; None if there was none or it failed, because the
+        tracker's own update will then say why."""
         return None if self._job is None or self._job.exception() else self._job.result()

@@ -20,7 +20,7 @@ from gsjax.engine.summary import (
 from gsjax.viz.colors import label_color
 
 MOVED_MM = 30.0
-"""An object that moved less is no test of a tracker."""
+"""An object that moved less does not test a tracker."""
 
 
 def _worst_error(found: Metrics) -> float | None:
@@ -34,7 +34,7 @@ def _worst_error(found: Metrics) -> float | None:
 
 
 def _lowest_auc(found: Metrics) -> float | None:
-    """The area under the curve of ADD-S of the worst object that moved far enough to tell, in per cent."""
+    """The area under the ADD-S curve of the worst object that moved far enough to tell, in per cent."""
     areas = [
         100 * scored["pose"]["add_s_auc"]
         for scored in found["objects"].values()
@@ -48,7 +48,7 @@ def _lowest_iou(found: Metrics) -> float | None:
 
 
 def _least_agreement(found: Metrics) -> float | None:
-    """The share of what is seen of the worst object, in its worst frame, that agrees with the pictures."""
+    """How much of what is seen of the worst object agrees with the pictures in its worst frame, per cent."""
     shares = [scored.get("agrees_least") for scored in found["objects"].values()]
     return min((100 * share for share in shares if share is not None), default=None)
 
@@ -124,7 +124,7 @@ def summarize(folder: RunFolder, found: Metrics, plots: Sequence[Media], images:
     Args:
         folder: of the run.
         found: its metrics.json.
-        plots, images: those that it has written.
+        plots, images: those that the run has written.
     """
     rows = _object_rows(found)
     colors = [label_color(row["label"]) for row in rows]
@@ -151,7 +151,7 @@ def summarize(folder: RunFolder, found: Metrics, plots: Sequence[Media], images:
 
 
 def _object_rows(found: Metrics) -> list[dict[str, Any]]:
-    """One row an object, by the keys of the columns."""
+    """One row per object, by the keys of the columns."""
     return [
         {
             **scored,
@@ -166,7 +166,7 @@ def _object_rows(found: Metrics) -> list[dict[str, Any]]:
 
 
 def _camera_rows(found: Metrics) -> list[dict[str, Any]]:
-    """One row a camera, with the PSNR of its first and of its last picture."""
+    """One row per camera, with the PSNR of its first and of its last picture."""
     over_frames = found["over_frames"]["psnr"]
     return [
         row | {"psnr_first": over_frames[row["name"]][0], "psnr_last": over_frames[row["name"]][-1]}

@@ -1,4 +1,4 @@
-"""Saving and loading what an unfinished run of `gsjax track` resumes from."""
+"""Saving and loading the state from which an unfinished run of `gsjax track` resumes."""
 
 from pathlib import Path
 
@@ -17,7 +17,7 @@ _PER_UPDATE = ("visible", "lost", "turn_known", "agrees")
 
 
 class Saver:
-    """Writes the state of a run into its folder `resume/`, and the poses that are new since the last time.
+    """Writes the state of a run into its folder `resume/`, and the poses that are new since the last save.
 
     Args:
         folder: RUN/resume.
@@ -28,13 +28,13 @@ class Saver:
         self._folder, self._saved, self._save = folder, saved, saving.Saver("tracking")
 
     def __call__(self, tracking: Tracking, *, last: bool) -> None:
-        """Save if the last time is long enough ago, or this is the last; warn if it cannot be written."""
+        """Save if the last save is long enough ago or this is the last one; warn if it cannot be written."""
         self._save(lambda: self._write(tracking), last=last)
 
     def _write(self, tracking: Tracking) -> None:
         assert tracking.tick is not None
         for path in _parts(self._folder):
-            if _frames_of(path) > self._saved:  # by a save that failed, or an earlier run
+            if _frames_of(path) > self._saved:  # left by a save that failed, or by an earlier run
                 path.unlink()
         news = tracking.poses[max(self._saved, 1) :]  # the first one is the scene's own
         if news:

@@ -28,7 +28,7 @@ class SavedRun:
         path: the folder.
         tracking: the scene and its poses; parts of one object are one group here.
         recording: the same frames and cameras as when it was tracked.
-        mask_camera: id of the camera whose first mask named the objects; the first tracked one if none did.
+        mask_camera: id of the camera whose first mask gave the objects; the first tracked one if none did.
         names: name of each object, by its group, 1 to K.
     """
 
@@ -104,8 +104,8 @@ def read_tracking(path: Path) -> tuple[Tracking, Float[np.ndarray, "3"] | None]:
 
 
 def _read_metrics(file: Path, scene: TrackedScene) -> tuple[int | None, dict[int, str]]:
-    """The camera whose mask named the objects, and the name of each group; only labels of the recording's own
-    masks have one in it."""
+    """The camera whose mask gave the objects, and the name of each group; only labels of the recording's own
+    masks have names in the file, others are numbered."""
     try:
         metrics = parse_json(file.read_text(encoding="utf-8"))
         camera, source = metrics["mask"]["camera"], metrics["mask"]["source"]

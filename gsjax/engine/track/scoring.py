@@ -33,16 +33,16 @@ def group_values(tracking: Tracking, mask: FirstMask, recording: Recording) -> n
 
 
 def labels_of_groups(tracking: Tracking, values: np.ndarray | None) -> np.ndarray:
-    """The label of each group of a tracking, [K+1]: its value from `group_values`, or if that is None that
-    of the first mask."""
+    """The label of each group of a tracking, [K+1]: its value from `group_values` or, if that is None, its
+    value in the first mask."""
     return np.asarray(tracking.scene.label_ids) if values is None else values
 
 
 def score_motion(
     tracking: Tracking, recording: Recording, labels: Int[np.ndarray, "N"] | None
 ) -> dict[int, ObjectScore]:
-    """How well the motion of each object of the truth was followed, by its mask value; empty without truth,
-    depth or masks.
+    """How well the motion of each object in the ground truth was tracked, by its mask value; empty without
+    ground truth, depth or masks.
 
     Args:
         tracking: the scene and its poses.
@@ -152,7 +152,7 @@ def object_names(tracking: Tracking, recording: Recording, values: np.ndarray | 
 
 def _iou(scores: Scores, names: dict[int, str], held_out: bool) -> dict[str, float]:
     """IoU of each object; none in the tracked cameras where only the first of several frames has masks, from
-    which objects were started."""
+    which tracking started."""
     if not held_out and scores.num_frames > 1 and not scores.later_masks[False]:
         return {}
     overlap = scores.overlaps[held_out]
@@ -162,7 +162,7 @@ def _iou(scores: Scores, names: dict[int, str], held_out: bool) -> dict[str, flo
 def lost_over_frames(
     tracking: Tracking, values: np.ndarray | None, label: int
 ) -> Bool[np.ndarray, "updates"]:
-    """In which updates the tracker took the object, or a part of it, for lost.
+    """In which updates the tracker considered the object, or a part of it, lost.
 
     Args:
         tracking: the scene and the tracker's flags.
@@ -173,8 +173,8 @@ def lost_over_frames(
 
 
 def _agreement(tracking: Tracking, values: np.ndarray | None, label: int) -> dict[str, float | None]:
-    """The share of what is seen of an object, or of the part of it where that is least, that agrees with the
-    pictures: the least of all updates, and that of the last one; None where nothing of it was seen."""
+    """The fraction of what is seen of an object, or of its worst part, that agrees with the pictures: the
+    least over all updates, and that of the last one; None where nothing of it was seen."""
     shares = _of_object(tracking, tracking.agrees, values, label, float)
     shares = np.where(_of_object(tracking, tracking.visible, values, label), shares, np.inf)
     least = shares.min(axis=1, initial=np.inf)
@@ -192,8 +192,8 @@ def turn_unknown(tracking: Tracking, values: np.ndarray | None, label: int) -> B
 
 
 def turn_unknown_from(tracking: Tracking, values: np.ndarray | None, label: int) -> int | None:
-    """The frame from which on, to the end, the tracker did not know the object's rotation, lost or not; None
-    if it knew it at the end.
+    """The first frame from which on the tracker no longer knew the object's rotation, lost or not, until the
+    end; None if it knew it at the end.
 
     Args:
         tracking, values, label: as for `lost_over_frames`.
@@ -206,6 +206,6 @@ def turn_unknown_from(tracking: Tracking, values: np.ndarray | None, label: int)
 def _of_object(
     tracking: Tracking, rows: list[np.ndarray], values: np.ndarray | None, label: int, kind: type = bool
 ) -> Shaped[np.ndarray, "updates parts"]:
-    """What each update says of one object's groups."""
+    """The values of one object's groups in each update; `rows` has those of all groups."""
     ids = labels_of_groups(tracking, values)
     return np.asarray(rows, kind).reshape(len(rows), len(ids) - 1)[:, ids[1:] == label]

@@ -47,15 +47,15 @@ def track(
 
     Args:
         scene: from `start_scene` or `scene_from_shapes`; not used with `after`.
-        first: the frame that `scene` shows; with `after`, the frame that it shows.
+        first: the frame that `scene` shows or, if given, `after`.
         frames: the frames after it, in order of time; all of one size and number of cameras.
         config: see `TrackConfig` (default: its defaults).
         budget_ms: time that an update may take, milliseconds. The richest settings that keep to it are then
             chosen by measured cost, and of `config` only `start`, `grow.slots`, `headroom` and `seed` are
             used; a warning names others that are not the default.
         after: a tick to continue from, with its scene, state and chosen settings.
-        like: returns a tick of another scene of the same shapes, or None. Its plan is used again, so that
-            nothing is compiled for settings that it has too; see `gsjax.engine.track.rehearsal`.
+        like: returns a tick of another scene of the same shapes, or None. Its plan is reused, so that nothing
+            is compiled for settings that it has too; see `gsjax.engine.track.rehearsal`.
         extra_losses: custom losses `loss(scene, rendered, frame)` added to the loss of the refinement; see
             `track_step`.
 
@@ -63,9 +63,9 @@ def track(
         ticks. `result` is the `Tracked` scene: `.scene`, `.pose`, `.labels` and `.gaussians()`. `info` is
         that of `track_step`; `run.plans["track"]` is the plan, and `run.kept.chosen` the settings chosen for
         a budget. `seconds` go from images in memory to the new state, re-planning included. Before the first
-        tick the update is planned and compiled and the first frame looked at, which takes a minute or two
-        unless `gsjax.keep_programs` has kept the programs; `compile_seconds` of that tick has the compiling,
-        and the time that `like` took.
+        tick the update is planned and compiled and the first frame processed, which takes a minute or two
+        unless `gsjax.keep_programs` has kept the programs; `compile_seconds` of that tick includes the
+        compiling and the time that `like` took.
 
     Raises:
         ValueError: a frame has other shapes than the first one, the budget is not above 0, or there are extra
@@ -120,8 +120,8 @@ def _ticks(
     governor: Governor | None,
     compiled: float,
 ) -> Iterator[Tick]:
-    """An update per frame; the governor limits how many groups are searched for, or the config. `compiled`
-    are seconds of compiling before the first one, which count as the first's."""
+    """One update per frame; the governor, or else the config, limits how many groups are searched for.
+    `compiled`, the seconds of compiling before the first update, counts as the first's."""
     advance, count = _Updates(method, shape, run), run.params.scene.num_objects
     most = method.config.align.everywhere
     usually = count if most is None else min(most, count)
@@ -138,7 +138,7 @@ def _ticks(
 
 
 def first_update(scene: TrackedScene, first: Frame, config: TrackConfig) -> Tick:
-    """The tick of the first look, whose programs are then at hand."""
+    """The tick of an update to the first frame, after which its programs are compiled."""
     method = Track(config)
     shape, run = method.start(scene, first)
     run, info, *seconds = _Updates(method, shape, run)(run, first, 0)
@@ -171,13 +171,13 @@ def _begun(
 
 
 def _alike(state: Any, other: Any) -> bool:
-    """Whether both are states of settings under which the same things are remembered, in the same sizes."""
+    """Whether two states have the same structure and array shapes."""
     same = jax.tree.structure(state) == jax.tree.structure(other)
     return same and all(map(lambda a, b: a.shape == b.shape, *map(jax.tree.leaves, (state, other))))
 
 
 def _looked(method: Track, shape: FrameShape, run: Run, first: Frame) -> Run:
-    """A run that had seen no frame yet, after the first one."""
+    """A run that had seen no frame yet, after an update to the first one."""
     return _Updates(method, shape, run)(run, first, 0)[0].having(step=run.step)
 
 
@@ -204,8 +204,8 @@ class _Updates:
 
 @lru_cache(maxsize=8)
 def _compiled(method: Track, shape: FrameShape, reduction: int, outside: tuple) -> Callable:
-    """The jitted update, cached so that a second sequence like the first starts at once. Nothing is donated,
-    so ticks stay valid. What its custom losses take from `outside` is compiled in."""
+    """The jitted update, cached so that another sequence of the same shapes starts at once. Nothing is
+    donated, so ticks stay valid. What its custom losses take from `outside` is compiled in."""
     update = method.step(shape, reduction).update
 
     def advance(params, state, batch, step, key):
@@ -215,7 +215,7 @@ def _compiled(method: Track, shape: FrameShape, reduction: int, outside: tuple) 
 
 
 def _measured(start: Callable[[Track], tuple[FrameShape, Run]], second: Frame, config: TrackConfig) -> Costs:
-    """The cost of updates: those to the second frame, which shows new background where cameras move."""
+    """The cost of updates, measured on the second frame, which shows new background if cameras move."""
     method = Track(config)
     shape, run = start(method)
     advance, count = _Updates(method, shape, run), run.params.scene.num_objects

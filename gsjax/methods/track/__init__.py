@@ -1,29 +1,32 @@
-"""The object-aware tracker (Object-Aware Gaussian Splatting for Robotic Manipulation), from one view's mask.
+"""The object-aware tracker (Object-Aware Gaussian Splatting for Robotic Manipulation).
+
+A first RGB-D frame and the mask of one camera become a scene of labelled Gaussians, whose objects are then
+tracked from frame to frame:
 
 scene = start_scene(first, mask, mask_camera, config)
 for now in gsjax.track(scene, first, frames, config):
     now.result.gaussians()
 
-What a frame goes through, in its order, and what each step is made of:
+The modules, in the order in which data flows through them:
 
 config.py     settings
 scene.py      Gaussians with labels, the moving ones first
-first_fit.py  the scene at frame one; shapes.py: the same without depth, from known shapes
+first_fit.py  the scene at the first frame; shapes.py: the same without depth, from known shapes
 state.py      parameters, state and batch of the step; plan.py: its capacities
 frames.py     preparation of a frame
 update.py     the step, whose six stages are in stages/
 motion.py     twists of groups, displacements of Gaussians
-layers.py     moving Gaussians over a background that is drawn once
-points.py     the points that are aligned: pixels of the last frame and of a keyframe, centres
+layers.py     moving Gaussians over a background that is rendered once
+points.py     the points to align: pixels of the last frame and of a keyframe, centres of Gaussians
 align.py      Levenberg-Marquardt on points, without rendering
-search.py     several starts, aligned; the one that agrees best is kept
-matching.py   masked cross-correlation of templates (the paper's)
+search.py     alignment from several starts, of which the best is kept
+matching.py   template matching by masked cross-correlation (the paper's)
 refine.py     photometric refinement (the paper's), in the tiles of region.py
-reference.py  the Gaussians that the first mask labelled: what an object has to look like
-watch.py      the record of each object: what is usual, whether it is lost or was found
+reference.py  the Gaussians labelled by the first mask, which define what an object looks like
+watch.py      the record of each object: its usual residual, whether it is lost or was found again
 lost.py       detection of lost objects; recover.py: their relocation
-grow.py       surfaces that come into view
-method.py     the tracker as one value; budget.py: settings for a time limit
+grow.py       growth of objects by surfaces that come into view
+method.py     the tracker as a method; budget.py: choice of settings for a time budget
 features.py   features that move with the Gaussians; query.py: language queries
 """
 

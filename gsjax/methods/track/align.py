@@ -1,4 +1,4 @@
-"""Direct alignment of a group with the images: Levenberg-Marquardt over six numbers, nothing rendered.
+"""Direct alignment of a group with the images: Levenberg-Marquardt over its rigid motion, without rendering.
 
 A set of points with colours is aligned: pixels that showed the group earlier, and centres (see `points`).
 Each is compared in colour and depth with the pixel it projects to:
@@ -6,10 +6,10 @@ Each is compared in colour and depth with the pixel it projects to:
     r_i = ( (I(pi(D x_i)) - c_i) / s_color,  (Z(pi(D x_i)) - z(D x_i)) / s_depth )
 
 with I and c as tones (see `points`), which depend little on shading, and weighted by 1 / (1 + r^2)^2
-(Geman-McClure), which ignores points that something else hides. An iteration costs a fraction of a rendered
-one, and depth converges from further away than colour, so groups get, even after large turns, to where
-refinement by rendering converges. All functions here are for one group and one start; `jax.vmap` makes it
-many.
+(Geman-McClure), which suppresses occluded points. An iteration costs a fraction of one that renders, and
+depth converges from further away than colour, so even after large rotations, groups come close enough for
+photometric refinement to converge. All functions here are for one group and one start; `jax.vmap` maps them
+over many.
 """
 
 from typing import NamedTuple
@@ -24,7 +24,7 @@ from gsjax.methods.track.config import AlignConfig
 from gsjax.methods.track.points import Points, ToneImages, carry, rotated, sum_of_three
 from gsjax.optim.compiler import in_memory
 
-_CHANNELS = (3, 1)  # number of channels of colour, each of which has the mean of the three, and of depth
+_CHANNELS = (3, 1)  # number of channels of colour, each counted with the mean of the three, and of depth
 
 
 class Sample(NamedTuple):
@@ -91,7 +91,7 @@ def _residuals(
         found, (across, along), nearest = bilinear(image, at)
         wanted, counts = tones, inside[None]
         if channels == 4:
-            # No surface has the depth between pixels on two surfaces: take the nearest pixel's there.
+            # Depth interpolated between two surfaces is that of neither: take the nearest pixel's there.
             smooth = jnp.abs(found[3] - nearest[3]) < scales[3]
             found = found.at[3].set(jnp.where(smooth, found[3], nearest[3]))
             across, along = (slope.at[3].set(jnp.where(smooth, slope[3], 0.0)) for slope in (across, along))
@@ -137,7 +137,7 @@ def _normal_equations(
     config: AlignConfig,
     widen: Float[ArrayLike, ""] = 1.0,
 ) -> _Fit:
-    """Cost, J^T W J and J^T W r after `twist`, for a small twist about the moved centre that follows it."""
+    """Cost, J^T W J and J^T W r after `twist`, for a small twist that follows it about the moved centre."""
     moved = carry(points, twist, center)
     residuals = _residuals(moved, images, config, widen)
     squared = _squared(residuals)
@@ -152,7 +152,7 @@ def _normal_equations(
         return jnp.asarray(sum(w * ab for w, ab in zip(weights, _by_kind(a * b), strict=True)))
 
     # A row of the Jacobian is (g, arm x g), so a point adds (F, F A^T; A F, A F A^T) with A v = arm x v and F
-    # the sum of g g^T over its channels. No row is stored, which XLA:CPU would do for a matrix product.
+    # the sum of g g^T over its channels. No row is stored, as XLA:CPU would for a matrix product.
     products = [over_channels(*pair) for pair in ((x, x), (x, y), (x, z), (y, y), (y, z), (z, z))]
     pulls = [over_channels(a, residuals.values) for a in (x, y, z)]
     (xx, xy, xz, yy, yz, zz), pulls, costs = in_memory((products, pulls, costs), images.cameras.K)
@@ -216,7 +216,7 @@ def align_from_afar(
     images: ToneImages,
     config: AlignConfig,
 ) -> Float[Array, "6"]:
-    """The twist after `align` with wide scales, from there with the usual ones. Arguments as for `align`."""
+    """The twist after `align` with wide scales, then with the usual ones. Arguments as for `align`."""
 
     def once(twist, widen):
         return align(twist, points, center, images, config, widen), None
@@ -232,7 +232,7 @@ def ball_grid(radius: float, spacing: float) -> Float[np.ndarray, "n 3"]:
 
 
 def coarse_shifts(config: AlignConfig, images: ToneImages) -> Float[Array, "n 6"]:
-    """Twists that shift to all sides; none without depth, because objects of one colour would slide about."""
+    """Twists that shift in all directions; none without depth, where objects of one colour would slide."""
     if not config.reach or images.depths is None:
         return jnp.zeros((0, 6))
     shifts = jnp.asarray(ball_grid(config.reach, config.spacing), float)
@@ -240,7 +240,7 @@ def coarse_shifts(config: AlignConfig, images: ToneImages) -> Float[Array, "n 6"
 
 
 def principal_axes(points: Points, center: Float[Array, "3"]) -> Float[Array, "3 3"]:
-    """Principal axes of a group, one a row: a bottle rolls about its own, whichever way it lies."""
+    """Principal axes of a group, one per row: a bottle rolls about its own, whichever way it lies."""
     away = (points.means - center[:, None]) * (points.seen > 0)[:, None]
     _, vectors = jnp.linalg.eigh(jnp.einsum("cip,cjp->ij", away, away))
     return vectors.T
@@ -249,7 +249,7 @@ def principal_axes(points: Points, center: Float[Array, "3"]) -> Float[Array, "3
 def turn_hypotheses(
     twist: Float[Array, "6"], axes: Float[Array, "3 3"], angles: tuple[float, ...]
 ) -> Float[Array, "h 6"]:
-    """The twist itself, and the twist after a turn to either side by each angle about each of the axes."""
+    """The twist itself, and the twist after a rotation by plus or minus each angle about each of the axes."""
     steps = jnp.concatenate([axes * s * angle for angle in angles for s in (1.0, -1.0)])
     steps = jnp.concatenate([jnp.zeros_like(steps[:1]), steps])
     rotations = (jaxlie.SO3.exp(twist[3:]) @ jaxlie.SO3.exp(steps)).log()
@@ -270,7 +270,7 @@ def disagreement(
     config: AlignConfig,
     widen: Float[ArrayLike, ""] = 1.0,
 ) -> Float[Array, ""]:
-    """Disagreement of a group's points with the images after its twist: 0 perfect, 1 not at all.
+    """Disagreement of a group's points with the images after its twist: 0 if perfect, 1 if nothing agrees.
 
     Colour and depth have equal weight; a point outside the image counts half. Arguments as for `align`.
     """

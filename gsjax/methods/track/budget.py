@@ -1,8 +1,8 @@
 """A time budget for updates, and what to omit to meet it.
 
 Before the first frame, the richest settings whose measured cost fits are chosen from a ladder. Then, from
-frame to frame, a `Governor` decides how many groups may be searched for everywhere, a number that a compiled
-update can vary. Delays are compensated by the updates that follow.
+frame to frame, a `Governor` decides how many groups may be searched for everywhere, a number that can vary
+without recompilation. Delays are compensated by the updates that follow.
 """
 
 from collections.abc import Callable
@@ -57,14 +57,14 @@ def ladder(config: TrackConfig, num_cameras: int) -> dict[str, TrackConfig]:
 
 
 def not_used(config: TrackConfig) -> list[str]:
-    """Names of settings that are not the default and that no rung of `ladder` takes."""
+    """Names of settings that are not the default and that no rung of `ladder` adopts."""
     mine, usual = _flat(config), _flat(TrackConfig())
     differ = [name for name in mine if mine[name] != usual[name]]
     return [name for name in differ if name not in _KEPT and name.partition(".")[0] not in _KEPT]
 
 
 def _flat(settings: Any, prefix: str = "") -> dict[str, Any]:
-    """Settings within settings by their dotted names."""
+    """Nested settings by their dotted names."""
     found = {}
     for one in fields(settings):
         value, name = getattr(settings, one.name), f"{prefix}{one.name}"

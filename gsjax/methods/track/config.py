@@ -22,7 +22,7 @@ class StartConfig:
     part_size: float = 0.15
     """Approximate size of those parts, metres."""
     label_distance: float = 0.15
-    """Longest path along the surface to the label of a point unseen by the mask's camera, metres."""
+    """Longest path along a surface by which labels spread to points unseen by the mask's camera, metres."""
     label_step: float = 0.02
     """Points further apart than this do not share a surface, metres."""
     depth_gap: float = 0.015
@@ -75,7 +75,7 @@ class AlignConfig:
     """Pixels aligned per group and camera: this many from the last frame and as many from the group's
     keyframe."""
     keyframe_turn: float = 0.4
-    """Rotation of a group at which its keyframe, whose weight has then faded to 0, is replaced, radians."""
+    """Rotation at which a group's keyframe is replaced, radians; until then its weight fades to 0."""
     max_thickness: float = 0.06
     """Measured depth that differs from the model's by more than this belongs to another object, metres."""
     shading: float = 0.3
@@ -88,8 +88,8 @@ class AlignConfig:
     spacing: float = 0.015
     """Distance between those shifts, metres."""
     everywhere: int | None = 2
-    """Groups per frame that are turned to all sides or, if they may be lost, searched for elsewhere (which
-    counts as two), those that agree worst first; None: all. Three times as many are shifted."""
+    """Groups per frame for which rotations are tried or, if they may be lost, other places (which counts as
+    two), worst residuals first; None: all. Shifts are tried for three times as many."""
     turns: tuple[float, ...] = (0.2, 0.6)
     """Angles by which the best start is rotated, both ways about each principal axis, radians."""
     max_step: float = 0.1
@@ -159,7 +159,7 @@ class GrowConfig:
     """Largest distance from a pixel to a Gaussian whose object it continues, metres."""
     color: float = 0.15
     """Largest difference of their colours, 0 to 1. The squares of distance and difference, each relative to
-    its limit, add up; the background competes."""
+    its limit, add up; the nearest Gaussian wins, and may be of the background."""
 
     def __post_init__(self):
         expect(self, "track.grow.", **dict.fromkeys(("min_gap", "distance", "color"), ABOVE_ZERO))
@@ -223,5 +223,5 @@ ACCURATE = replace(
 PAPER = replace(ACCURATE, refine=RefineConfig(), matching=True, redraw="all")
 PRESETS = {"fast": TrackConfig(), "balanced": BALANCED, "accurate": ACCURATE, "paper": PAPER}
 """`fast`, the default, is for 30 Hz on one core, and searches for two objects per update;
-`balanced` and `accurate` align more and more points. `paper` has all stages of the paper, including template
+`balanced` and `accurate` align ever more points. `paper` has all stages of the paper, including template
 matching and photometric refinement, which cost much and gain little: see docs/results-tracking.md."""

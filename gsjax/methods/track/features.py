@@ -4,7 +4,7 @@ Robotic Manipulation, section III-A). Later frames need no others: the features 
 Rendering is linear in what is rendered: F = W f, where W [pixels, N] holds the weight of each Gaussian in
 each pixel. W is never formed: a render applies it, and the render's VJP applies its transpose, exactly. The
 paper names two ways from maps m to features f. *Projection* gives each Gaussian the mean of the pixels in
-which it shows, weighted by how much it shows there:
+which it is visible, weighted by its contribution to them:
 
     f = (W^T m) / (W^T 1)
 
@@ -38,8 +38,8 @@ from gsjax.scene.gaussians import Gaussians
 from gsjax.scene.render import plan_render, render
 
 MIN_WEIGHT = 0.1
-"""A Gaussian with less weight in all pixels together counts as unseen."""
-_CHANNELS = 16  # rendered at a time; hundreds, as of foundation models, compile slowly and fill the memory
+"""A Gaussian with less total weight over all pixels counts as unseen."""
+_CHANNELS = 16  # rendered at a time; hundreds, as in foundation models, compile slowly and fill the memory
 
 
 class FeatureBatch(NamedTuple):
@@ -47,7 +47,7 @@ class FeatureBatch(NamedTuple):
 
     Attributes:
         gaussians: the scene, frozen.
-        cameras: C of them.
+        cameras: C cameras.
         maps: features of each pixel.
         valid: 1 for pixels that count, else 0.
         prior: features towards which damping pulls.
@@ -85,10 +85,10 @@ class DistillState(NamedTuple):
 def project_features(
     scene: TrackedScene, frame: Frame, maps: Float[Array | np.ndarray, "..."]
 ) -> Float[np.ndarray, "n d"]:
-    """The mean feature of the pixels in which each Gaussian shows. On the host.
+    """The mean feature of the pixels in which each Gaussian is visible. On the host.
 
-    A Gaussian that shows nowhere takes the feature of the nearest visible one with its label, because the far
-    side of an object is mostly like its near side; zeros if none of its label is visible.
+    A Gaussian that is visible nowhere takes the feature of the nearest visible one with its label, because
+    the far side of an object mostly resembles its near side; zeros if none of its label is visible.
 
     Args:
         scene: the scene at the time of `frame`.
@@ -110,14 +110,14 @@ def distill_features(
     iterations: int = 10,
     damping: float = 0.1,
 ) -> Float[np.ndarray, "n d"]:
-    """The features whose render is closest to the maps; hidden Gaussians keep their projected ones. On the
+    """The features whose render is closest to the maps; invisible Gaussians keep their projected ones. On the
     host.
 
     Args:
         scene, frame, maps: as for `project_features`.
         iterations: steps of conjugate gradients, each a render and its transpose.
         damping: weight of the projected feature of each Gaussian, in pixels. Without damping, Gaussians that
-            hardly show would take whatever values compensate for others.
+            are hardly visible would take whatever values compensate for others.
 
     Raises:
         ValueError: as for `project_features`; or damping is negative.

@@ -26,8 +26,8 @@ from gsjax.scene.render import plan_render, render
 # Depth has measured the means, so they hardly move; the other fields learn to blend into the images.
 RATES = {"means": 2e-5, "quats": 5e-3, "log_scales": 1e-2, "logit_opacities": 3e-2, "sh0": 1e-2}
 _DEPTH_WEIGHT, _DEPTH_LIMIT = 1.0, 0.05
-_NOISY = 0.2  # share of depth that lies on no surface
-_FEW = 2 * MIN_POINTS  # Gaussians of an object, of which a camera sees about half
+_NOISY = 0.2  # fraction of depths on no surface above which a warning is issued
+_FEW = 2 * MIN_POINTS  # an object needs this many Gaussians, because a camera sees about half of them
 
 
 def start_scene(
@@ -45,8 +45,8 @@ def start_scene(
         mask: labels [H, W] of one camera's image; 0 is background.
         mask_camera: index of that camera.
         config: configuration of the tracker (default: `TrackConfig()`).
-        before_fit: called with the scene before its optimisation, which changes no shape of it: what depends
-            on shapes, such as a program, can then be made meanwhile.
+        before_fit: called with the scene before its optimisation. Array shapes do not change after that, so
+            programs that depend on them can be compiled meanwhile.
 
     Raises:
         ValueError: there is no depth, the mask does not fit the images, or cameras are fisheyes.
@@ -63,7 +63,7 @@ def start_scene(
 
 
 def _surfaces(depths: np.ndarray) -> np.ndarray:
-    """Depths of surfaces; warns where much of it is not."""
+    """The depths that lie on surfaces, else 0; warns if many do not."""
     surfaces = on_surfaces(depths)
     share = 1 - (surfaces > 0).sum() / max((depths > 0).sum(), 1)
     if share > _NOISY:
@@ -76,7 +76,7 @@ def _surfaces(depths: np.ndarray) -> np.ndarray:
 
 
 def _warn_of_few(scene: TrackedScene) -> None:
-    """Warns of objects, and parts of large ones, that could go astray without a word."""
+    """Warns of objects, and parts of large ones, with too few Gaussians to tell whether they are lost."""
     counts = np.bincount(np.asarray(scene.labels), minlength=len(scene.label_ids))[1:].tolist()
     fewest: dict[int, int] = {}
     for label, count in zip(scene.label_ids[1:], counts, strict=True):
@@ -118,7 +118,7 @@ def fit_scene(
 ) -> tuple[TrackedScene, dict]:
     """The scene after `iterations` steps of Adam on the first frame, and the info of the last step.
 
-    `headroom` is that of the plan, 1 or more, which grows if it overflows.
+    `headroom`, 1 or more, is that of the plan, which grows if it overflows.
 
     Raises:
         ValueError: no step had a finite loss.

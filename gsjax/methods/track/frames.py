@@ -29,7 +29,7 @@ class FrameShape:
 
 
 def expect_pinholes(frame: Frame) -> None:
-    """Raises a ValueError where the frame's cameras are fisheyes, whose pixels the tracker cannot match."""
+    """Raises a ValueError if the frame's cameras are fisheyes, which the tracker does not support."""
     if frame.cameras.fisheye is not None:
         raise ValueError(
             "cameras: expected pinholes, found fisheyes, which the tracker cannot follow; undistort the "
@@ -38,8 +38,8 @@ def expect_pinholes(frame: Frame) -> None:
 
 
 def first_seen(frame: Frame) -> Frame:
-    """The first frame, from which a scene starts: in floats, and without pixels that are not finite, which a
-    warning counts. On the host.
+    """The first frame, from which a scene starts, as floats and without pixels that are not finite; a warning
+    reports their number. On the host.
 
     Raises:
         ValueError: the cameras are fisheyes.
@@ -62,6 +62,6 @@ def prepared(frame: Frame, config: TrackConfig) -> tuple[Frame, Int[Array, ""]]:
     that were not finite.
 
     Raises:
-        ValueError: a camera does not exist, or nothing is left of the images.
+        ValueError: a camera does not exist, or the reduced images would be empty.
     """
     return without_broken(part_of(frame, config.cameras, config.shrink))

@@ -1,6 +1,6 @@
-"""Surfaces that the first frame did not show join the object that they continue.
+"""Growth: surfaces that the first frame did not show join the object that they continue.
 
-A box that turns shows its back, and a gripper that leaves reveals what it hid. A measured pixel that the
+A box that rotates shows its back, and a gripper that leaves reveals what it hid. A measured pixel that the
 model does not explain, because it lies in front of what is drawn there or nothing is drawn, is compared with
 the scene's Gaussians in position and colour together. If the nearest belongs to an object, the pixel becomes
 a Gaussian of that object. Array shapes are static, so new Gaussians take slots that were reserved for them.
@@ -69,14 +69,14 @@ def grow(
         frame: the frame at this pose, with depth.
         step: a number that differs from frame to frame, and selects which pixels are examined.
         coarseness: n, if `shown` has every n-th pixel.
-        lost: objects that nothing joins, because they are not where they are believed to be.
+        lost: objects that nothing may join, because they are not where they are believed to be.
     """
     assert frame.depths is not None
     # Only pixels near an object can continue it; others wait until one comes by.
     near, width = shown.labels > 0, 2 * (config.reach // coarseness) + 1
     for reach in ((1, width, 1), (1, 1, width)):
         near = jax.lax.reduce_window(near, False, jnp.logical_or, reach, (1, 1, 1), "SAME")
-    # Every second pixel each way, or the pixels of `shown` if they are fewer.
+    # Every second pixel along each axis, or the pixels of `shown` if they are fewer.
     lattice = max(2, coarseness)
     chosen = unexplained(shown, frame.depths[:, ::coarseness, ::coarseness], config) & near
     chosen = chosen[:, :: lattice // coarseness, :: lattice // coarseness]

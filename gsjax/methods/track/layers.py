@@ -2,8 +2,8 @@
 
 Either the whole scene is drawn, or the moving Gaussians are drawn over the background, which is drawn once
 and stored until a camera moves. If the background is opaque and the moving Gaussians of a pixel lie all in
-front of it or all behind it, the second way is exact, but for what `plan_moving` omits; else a pixel belongs
-to whichever is nearer.
+front of it or all behind it, the second way is exact except for what `plan_moving` omits; else a pixel
+belongs to whichever is nearer.
 """
 
 from functools import partial
@@ -35,7 +35,7 @@ class Shown(NamedTuple):
 
 
 class Backdrop(NamedTuple):
-    """The background alone, drawn for these cameras."""
+    """The background alone, as drawn for these cameras."""
 
     cameras: Camera
     depths: Float[Array, "c height width"]
@@ -119,11 +119,10 @@ def are_same(a: Camera, b: Camera) -> Bool[Array, ""]:
 def plan_moving(moving: Gaussians, cameras: Camera, headroom: float) -> Plan:
     """A plan for `show_moving`, which needs only labels and depths, with a relative `headroom` of 1 or more.
 
-    Alphas below 3 % of a pixel are omitted, and so is all that lies behind once less than a tenth of the
-    light is left. A Gaussian that would leave less than 1 % is not drawn, so `alpha_max` prevents a single
-    one from taking that much. Therefore, if a single Gaussian shows an opaque object, the depth shifts by up
-    to 9 % of the way to whatever moves behind it. Small tiles fit small Gaussians, and batches of fewer tiles
-    finish sooner (tuned on a CPU).
+    Alphas below 3 % of a pixel are omitted. A pixel ends before the Gaussian that would leave 1 % of its
+    light or less, so `alpha_max` prevents a single one from taking that much. Therefore, if a single Gaussian
+    shows an opaque object, the depth shifts by up to 9 % of the way to whatever moves behind it. Small tiles
+    fit small Gaussians, and batches of fewer tiles finish sooner (tuned on a CPU).
     """
     limits = {"alpha_min": 0.03, "alpha_max": 0.9, "min_transmittance": 0.01}
     tiles = {"tile_size": 4, "tiles_per_batch": 384}
@@ -136,7 +135,7 @@ def show_moving(
     """What the moving Gaussians, `thinned`, show over the backdrop; and the capacity needed.
 
     Labels are drawn as their binary digits, which take few channels: if one label has more than half of a
-    pixel's weight, so has each of its digits.
+    pixel's weight, so does each of its digits.
 
     Args:
         scene, pose: the tracked scene.

@@ -1,9 +1,9 @@
-"""Detect lost objects.
+"""Detection of lost objects.
 
-Residuals of the alignment rise while a group is getting lost, but not once it is: pixels of the last frame
-are taken from where the group was believed to be, and agree again with whatever is there. The Gaussians of
-the first frame do not: if the group is elsewhere, cameras see past them, or see other colours. So these
-Gaussians decide whether a group is lost, and whether it is found again (see `recover`).
+Residuals of the alignment rise while a group is being lost, but not afterwards: pixels of the last frame are
+taken from where the group was believed to be, and agree with whatever is there now. The Gaussians of the
+first frame do not: if the group is elsewhere, cameras see past them, or see other colours. So these Gaussians
+decide whether a group is lost, and whether it is found again (see `recover`).
 """
 
 from typing import NamedTuple
@@ -15,30 +15,31 @@ from jaxtyping import Array, Bool, Float
 from gsjax.methods.track.points import Points, ToneImages, rotated, sum_of_three
 
 COLOR_SCALE = 0.15
-"""Scale of the difference of tones, which allows for turns and shadows since the first frame."""
+"""Scale of the difference of tones, which allows for rotations and shadows since the first frame."""
 MIN_POINTS = 6
 """Fewer visible points are not conclusive."""
-_FLAT = 0.9  # a group with more than this fraction of its points in the background's surface is a card on it
+_FLAT = 0.9  # a group with more than this fraction of its points in the background's surface lies flat on it
 
 LOST, DOUBTFUL, FOUND = 0.35, 0.6, 0.6
 """Thresholds of `Confidence.agreement`: below the first a group is lost, below the second it may be
 elsewhere, above the third it may be found. docs/results-hard-cases.md has measured values."""
 SURELY_LOST, SURELY_FOUND = 0.25, 0.7
-"""The same for a group whose residual and turn raise no doubt: it has turned to sides that look otherwise;
-and for what needs no further frame to be found."""
+"""The same for a group whose residual and orientation are not in doubt, which may have turned to sides that
+look different; and for a group that is found without confirmation by further frames."""
 SUDDEN = 0.6
 """A group is lost at once if its agreement drops by this factor from one frame to the next."""
 FOUND_FRAMES = 4
-"""Frames in a row in which a group has to look found unless it surely is: chance does not persist."""
+"""Frames in a row in which a group has to look found, unless it surely is: agreement by chance does not
+persist."""
 PROBATION = 4
-"""Searches that must find no better place for a group that was found; it has to go on looking found."""
+"""Searches that must find no better place for a group that was found, which has to keep looking found."""
 
 
 class Confidence(NamedTuple):
     """How well the images agree with where each group is believed to be."""
 
     agreement: Float[Array, "k"]  # fraction of the visible points that look as at first, 0 to 1
-    coverage: Float[Array, "k"]  # the same of all points: hidden ones and those outside the image are missing
+    coverage: Float[Array, "k"]  # the same of all points, including occluded ones and those outside the image
     conclusive: Bool[Array, "k"]  # whether enough points were visible
 
 
@@ -56,10 +57,10 @@ def group_confidence(
             should see them.
         images: the new frame.
         gap: tolerance of measured depth, metres. A camera that measures more sees past the group, which
-            counts as disagreement; less means that the group is hidden, which counts as nothing.
+            counts as disagreement; less means that the group is occluded, which does not count.
         background: depth of the background, metres, 0 if unknown; of every n-th pixel. A camera that measures
-            the background itself does not see the group, however near it is: a group that slipped into a wall
-            would agree with the wall. A card that lies flat on the background is exempt.
+            the background itself does not see the group, however near it is; otherwise, a group that slipped
+            into a wall would agree with the wall. A card that lies flat on the background is exempt.
         others: the same of other groups, without the exemption.
     """
     height, width = images.pixels.shape[1:3]
@@ -106,6 +107,7 @@ def group_confidence(
 
 
 def is_found(confidence: Confidence, showed: Float[Array, "k"]) -> Bool[Array, "k"]:
-    """Whether a lost group is in the place of `confidence`; `showed` is its coverage in the first frame."""
+    """Whether a lost group is in a place, by the `confidence` there; `showed` is its coverage in the first
+    frame."""
     enough = confidence.coverage > FOUND * showed
     return confidence.conclusive & (confidence.agreement > FOUND) & enough

@@ -1,5 +1,5 @@
-"""The tracker as one value. Its frames are not steps of descent, so it is run not by `drive` but by the
-generator of `gsjax.engine.track.tracking`, on the same runs and ticks."""
+"""The tracker as a method (see `gsjax.optim.method`). Its frames are not steps of an optimisation, so it is
+run by the generator of `gsjax.engine.track.tracking` instead of `drive`, with the same runs and ticks."""
 
 from dataclasses import dataclass, field
 from typing import NamedTuple
@@ -53,19 +53,19 @@ class Track:
 
     def start(self, scene: TrackedScene, first: Frame, like: Run | None = None) -> tuple[FrameShape, Run]:
         """The shape of the frames and a run that has seen no frame yet, with slots if there is depth. Its
-        first update, to the frame that the scene shows, only looks.
+        first update, to the frame that the scene shows, only observes.
 
         Args:
             scene: from `start_scene` or `scene_from_shapes`.
             first: the frame that it shows, of all cameras.
-            like: an earlier run of a scene of the same shapes, whose plans are used again.
+            like: an earlier run of a scene of the same shapes, whose plans are reused.
         """
         if self.config.grow.slots and first.depths is not None:
             scene = with_slots(scene, self.config.grow.slots)
         return self.start_at(Tracked(scene, first_pose(scene)), first, like)
 
     def start_at(self, params: Tracked, frame: Frame, like: Run | None = None) -> tuple[FrameShape, Run]:
-        """The same with the slots that the scene has, where it shows `frame` at the pose of `params`.
+        """The same, for a scene that already has its slots, and shows `frame` at the pose of `params`.
 
         Args:
             params: the scene and the pose.

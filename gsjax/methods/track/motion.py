@@ -45,8 +45,8 @@ def group_means(
 
 @partial(jax.jit, inline=True)
 def move(pose: Pose, motion: Motion, centers: Float[Array, "k 3"], groups: Int[Array, "m"]) -> Pose:
-    """The pose after each group is rotated about its center, metres, and translated, and each Gaussian is
-    displaced; `groups` has the group of each Gaussian, 1..K."""
+    """The pose after each group is rotated about its centre (`centers`, metres) and translated, and each
+    Gaussian is displaced; `groups` has the group of each Gaussian, 1..K."""
     rotation = jaxlie.SO3.exp(motion.twists[:, 3:])
     member = groups - 1
     center = centers[member]

@@ -1,4 +1,4 @@
-"""Capacities of the tracker's step, which are static like shapes, and what a step needed of them."""
+"""Static capacities of the tracker's step, and how much of each a step needed."""
 
 from dataclasses import dataclass
 from typing import NamedTuple

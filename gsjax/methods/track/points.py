@@ -1,9 +1,9 @@
-"""The points that are aligned with the images: with tones, equally many for each group.
+"""The points that are aligned with the images: positions with tones, equally many for each group.
 
 They are pixels of the last frame, which look most like the new one; pixels of a keyframe, carried along since
-then; and centres of the Gaussians that the first mask labelled. Pixels of the last frame alone would drift,
-and a group that once slid off its object would take its neighbours' pixels for its own; the others remember
-what the object looked like.
+then; and centres of the Gaussians labelled by the first mask. With pixels of the last frame alone, a group
+would drift, and once it slid off its object, it would take its neighbours' pixels for its own; the other two
+remember what the object looked like.
 """
 
 from typing import NamedTuple
@@ -35,7 +35,7 @@ def join(*several: Points) -> Points:
 
 
 class ToneImages(NamedTuple):
-    """A frame in the form that points are compared with."""
+    """A frame as tones and depth, for comparison with points."""
 
     cameras: Camera
     pixels: Float[Array, "c height width d"]  # tones of red, green and blue and, if measured, depth in metres
@@ -80,7 +80,7 @@ def where_groups(chosen: Bool[Array, "k"], a: Shaped[Array, "k *d"], b: Shaped[A
 
 
 def carry(points: Points, twist: Float[Array, "6"], center: Float[Array, "3"]) -> Points:
-    """The points of one group after its twist (translation, metres, and rotation vector) about its center."""
+    """The points of one group after its twist (translation, metres, and rotation vector) about `center`."""
     moved = rotated(matrix_of(twist[3:]), points.means - center[:, None]) + (center + twist[:3])[:, None]
     return points._replace(means=moved)
 
@@ -178,13 +178,13 @@ def first_keyframe(pixels: Points) -> Keyframe:
 
 
 def turn_since(keyframe: Keyframe) -> Float[Array, "k"]:
-    """Angle by which each group has turned since its keyframe, radians."""
+    """Angle by which each group has rotated since its keyframe, radians."""
     return 2 * jnp.arccos(jnp.clip(jnp.abs(keyframe.turned[:, 0]), 0.0, 1.0))
 
 
 def faded(keyframe: Keyframe, max_turn: float) -> Points:
-    """The keyframe's points, with weights that fade to 0 as a group turns by `max_turn`, radians: it is then
-    lit differently."""
+    """The keyframe's points, with weights that fade to 0 as a group rotates by `max_turn`, radians, because
+    it is then lit differently."""
     share = jnp.clip(1 - turn_since(keyframe) / max(max_turn, 1e-9), 0.0, 1.0)
     return keyframe.points._replace(seen=keyframe.points.seen * share[:, None, None])
 
@@ -192,8 +192,8 @@ def faded(keyframe: Keyframe, max_turn: float) -> Points:
 def renewed(
     keyframe: Keyframe, pixels: Points, max_turn: float, relocated: Bool[Array, "k"] | None = None
 ) -> Keyframe:
-    """The keyframe, replaced by `pixels` for groups that have turned by more than `max_turn` radians, and now
-    show other sides, and for `relocated` ones, whose pixels were those of something else."""
+    """The keyframe, replaced by `pixels` for groups that have rotated by more than `max_turn`, radians, and
+    so show other sides, and for `relocated` ones, whose keyframe shows something else."""
     old = turn_since(keyframe) > max_turn
     old = old if relocated is None else old | relocated
     return jax.tree.map(lambda new, kept: where_groups(old, new, kept), first_keyframe(pixels), keyframe)
@@ -201,6 +201,6 @@ def renewed(
 
 def carry_keyframe(keyframe: Keyframe, twists: Float[Array, "k 6"], centers: Float[Array, "k 3"]) -> Keyframe:
     """The keyframe after the twists of the groups (translations, metres, and rotation vectors) about their
-    centers."""
+    `centers`."""
     turned = jaxlie.SO3.exp(twists[:, 3:]) @ jaxlie.SO3(keyframe.turned)
     return Keyframe(jax.vmap(carry)(keyframe.points, twists, centers), turned.normalize().wxyz)

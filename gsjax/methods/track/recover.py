@@ -1,10 +1,11 @@
-"""Relocation of a lost group: the best of many guesses are aligned, and the one where most of the group shows
-is kept.
+"""Relocation of a lost group: the best of many guesses are aligned, and the one at which most of the group is
+seen is kept.
 
-Residuals cannot choose among guesses, because they count as disagreement what hides a group or lies outside
-the images. So `group_confidence` chooses, from the Gaussians of the first frame that would face each camera.
-The result is again a guess, from which the next frame continues, until enough of the group shows there for it
-to be found, in two frames unless surely: among many guesses one may agree by chance.
+Residuals cannot rank guesses, because they count occluded points, and those outside the images, as
+disagreement. So `group_confidence` ranks them, by the Gaussians of the first frame that would face each
+camera. The result is itself a guess, from which the next frame continues until enough of the group is seen
+there for it to be found: in two frames unless agreement is high, because among many guesses one may agree by
+chance.
 """
 
 from functools import partial
@@ -31,14 +32,14 @@ from gsjax.methods.track.reference import ReferencePoints, points_facing
 from gsjax.optim.compiler import in_memory
 
 _LARGEST_TURN = 2.0  # radians; beyond it, the points that were visible seldom still face the camera
-_NEAR_TURN = 0.3  # radians; standard deviation of turns near the last guess, per axis
+_NEAR_TURN = 0.3  # radians; standard deviation of rotations near the last guess, per axis
 _AT_PIXELS = 4  # guesses at unexplained pixels for each coarse shift
 _STARTS = (6, 18, 14)  # guesses of each kind that are aligned, with a quarter of the points
-_ROUNDS = 2  # of turns that are tried from the best of them
+_ROUNDS = 2  # of rotations that are tried from the best of them
 
 
 def relative_twists(twists: Float[Array, "*k 6"], moved: Float[Array, "*k 6"]) -> Float[Array, "*k 6"]:
-    """The twists that lead from the places after `moved` to those after `twists`, about the same centres."""
+    """The twists that lead from the poses after `moved` to those after `twists`, about the same centres."""
     turns = jaxlie.SO3.exp(twists[..., 3:]) @ jaxlie.SO3.exp(moved[..., 3:]).inverse()
     return jnp.concatenate([twists[..., :3] - moved[..., :3], turns.log()], axis=-1)
 
@@ -48,11 +49,11 @@ class Relocation(NamedTuple):
 
     twists: Float[Array, "*k 6"]  # from where it is believed to be
     confidence: Confidence
-    guess_confidence: Confidence  # in the last frame's guess, aligned: agreement by chance does not recur
+    guess_confidence: Confidence  # at the last frame's guess, aligned: agreement by chance does not recur
 
 
 class SearchContext(NamedTuple):
-    """The images in which a lost group is searched for, and what hides it there."""
+    """The images in which a lost group is searched for, and what may occlude it there."""
 
     images: ToneImages
     background: Float[Array, "c h w"] | None  # its depth, metres, 0 if unknown
@@ -69,7 +70,7 @@ def recover(
     config: AlignConfig,
     gap: float,
 ) -> Relocation:
-    """The place where most of one lost group shows.
+    """The place where most of one lost group is seen.
 
     Args:
         key: random key of the guesses.
@@ -87,7 +88,7 @@ def recover(
         return group_confidence(points, images, gap, context.background, context.others)
 
     def places(twists, by: ReferencePoints, how) -> tuple[Float[Array, "n 6"], Confidence]:
-        """The twists as they are, and then aligned by these points; all points tell how much shows there."""
+        """The twists as they are, then aligned with the points `by`; and the confidence in each, from all."""
 
         def aligned(twist):
             faces = points_facing(by, twist, center, images).seen
@@ -121,7 +122,7 @@ def recover(
         return jnp.concatenate([twists, jnp.broadcast_to(guess, (count - len(twists), 6))])
 
     def one_round(_, tried):
-        """The best of what was tried, and what they become when they turn."""
+        """The best of the twists tried so far, and rotations of these."""
         twists, confidence = places(tried, few, partial(align, widen=config.widen))
         best = best_distinct(beam, twists, evidence(confidence), config)
         turned = [turn_hypotheses(twist, axes, turns) if turns else twist[None] for twist in best]
@@ -150,13 +151,13 @@ def best_distinct(
 
 
 def evidence(confidence: Confidence) -> Float[Array, "*k"]:
-    """Evidence that a group is in a place: much of it shows there, and agrees."""
+    """Evidence that a group is in a place: much of it is seen there, and agrees."""
     return jnp.where(confidence.conclusive, confidence.agreement * confidence.coverage, 0.0)
 
 
 def depths_of_others(shown: Shown, doubtful: Bool[Array, "k"]) -> Float[Array, "c h w"]:
     """Depth of the groups that are not in doubt, where they were last seen; else 0. A pixel that shows one of
-    these shows no group that is searched for. A doubtful group may be elsewhere itself, so it has none."""
+    these shows no group that is searched for. Doubtful groups are omitted: they may be elsewhere."""
     sound = (shown.labels > 0) & ~doubtful[shown.labels - 1]
     return jnp.where(sound, shown.depths, 0.0)
 
@@ -164,10 +165,10 @@ def depths_of_others(shown: Shown, doubtful: Bool[Array, "k"]) -> Float[Array, "
 def unexplained_pixels(
     shown: Shown, images: ToneImages, gap: float, config: AlignConfig, coarseness: int
 ) -> Points:
-    """Pixels of a frame that are nearer than what the scene shows there: something has come to them.
+    """Pixels of a frame that are nearer than what the scene shows there: something has moved in front of it.
 
     Args:
-        shown: what the scene shows, of every n-th pixel.
+        shown: what the scene shows, in every n-th pixel.
         images: the frame, with depths.
         gap: the background does not explain depth that is nearer by more than this, metres.
         config: a group does not explain depth that is nearer by more than its `max_thickness`.
@@ -184,8 +185,8 @@ def unexplained_pixels(
 def guesses_near(
     key: Key[Array, ""], shifts: Float[Array, "n 6"], guess: Float[Array, "6"], config: AlignConfig
 ) -> Float[Array, "n 6"]:
-    """Places near the last guess, where a lost group may be: shifted by half of `shifts`, and slightly turned
-    at random by `key` unless `config.max_turn` is 0."""
+    """Places near the last guess, where a lost group may be: shifted by half of `shifts`, and rotated
+    slightly at random (`key`) unless `config.max_turn` is 0."""
     turns = _NEAR_TURN * jax.random.normal(key, (len(shifts), 3)) * (config.max_turn > 0)
     nearby = jnp.concatenate([shifts[:, :3] / 2, turns], axis=1)
     return compose(nearby, jnp.broadcast_to(guess, nearby.shape))
@@ -199,16 +200,16 @@ def guesses_at(
     unexplained: Points,
     config: AlignConfig,
 ) -> Float[Array, "n 6"]:
-    """Random places where a lost group may be, turned at random: around where it is believed to be and, four
-    times as many, at unexplained pixels, if there are any.
+    """Places where a lost group may be, rotated at random: around where it is believed to be and, four times
+    as many, at random unexplained pixels, if there are any.
 
     Args:
         key: random key.
         shifts: shifts of the places around.
-        reference: reference points of the group. One of a similar colour is brought to an unexplained pixel.
+        reference: reference points of the group. One of a similar colour is placed at an unexplained pixel.
         center: centroid of the group, metres.
         unexplained: see `unexplained_pixels`.
-        config: nothing is turned if its `max_turn` is 0.
+        config: nothing is rotated if its `max_turn` is 0.
     """
     around, shifts = len(shifts), jnp.tile(shifts[:, :3], (1 + _AT_PIXELS, 1))
     count = len(shifts)
@@ -236,13 +237,13 @@ def guesses_spun(
     guess: Float[Array, "6"],
     config: AlignConfig,
 ) -> Float[Array, "n 6"]:
-    """The guess of the last frame, upright or upside down in any way, and spun about one of its axes by any
-    angle: what looks alike when it is turned, like a can or a box, is often found turned at first.
+    """The guess of the last frame, as it is or flipped about one of its axes, and spun about one by any
+    angle, because objects that look alike when rotated (cans, boxes) are often found rotated at first.
 
     Args:
         key: random key.
         count: n, static.
-        axes: principal axes of the group, one a row.
+        axes: principal axes of the group, one per row.
         reference, center, guess, config: as for `recover`.
     """
     angles = jax.random.uniform(key, (count, 1), minval=-jnp.pi, maxval=jnp.pi)
@@ -257,8 +258,8 @@ def guesses_spun(
 
 
 def middle_of_solid(reference: ReferencePoints) -> Float[Array, "3"]:
-    """The middle of an object of which some sides are known, metres: the point that is as far below all of
-    them as possible, by least squares over the distance and the point. Without normals, their centroid."""
+    """The middle of an object of which some sides are known, metres: the point at the same distance below all
+    of them, by least squares over the point and the distance. Without normals, their centroid."""
     weights = reference.real / jnp.maximum(reference.real.sum(), 1)
     mean, normal = reference.means @ weights, reference.normals @ weights
     away, tilt = reference.means - mean[:, None], reference.normals - normal[:, None]

@@ -1,6 +1,6 @@
-"""Reference points: the Gaussians that the first mask labelled, carried along with their groups.
+"""Reference points: the Gaussians labelled by the first mask, carried along with their groups.
 
-They define what a group has to look like. Gaussians that joined it later may belong to a neighbour.
+They alone define what a group looks like, because Gaussians that joined it later may belong to a neighbour.
 """
 
 from typing import NamedTuple
@@ -20,7 +20,7 @@ from gsjax.methods.track.scene import TrackedScene
 
 
 class ReferencePoints(NamedTuple):
-    """Up to p reference points of each group, where it is believed to be."""
+    """Up to p reference points of each group, at its estimated pose."""
 
     means: Float[Array, "*k 3 p"]
     normals: Float[Array, "*k 3 p"]  # outward; 0 if both sides are visible
@@ -30,7 +30,7 @@ class ReferencePoints(NamedTuple):
 
 def reference_points(scene: TrackedScene, pose: Pose, config: AlignConfig) -> ReferencePoints:
     """The reference points of every group, up to `config.centers`."""
-    # Gaussians that join have no normal. Nor do known shapes, but nothing joins those.
+    # Gaussians that joined later have no normal. Neither have known shapes, but nothing joins those.
     with_normal = jnp.any(scene.normals != 0, axis=-1)
     named = jnp.where(with_normal | ~with_normal.any(), scene.groups, 0)
     rows, real = first_members(named, scene.num_objects, min(config.centers, scene.num_moving))
@@ -66,13 +66,13 @@ def points_facing(
     reference: ReferencePoints, twist: Float[Array, "6"], center: Float[Array, "3"], images: ToneImages
 ) -> Points:
     """The reference points of one group after a twist (translation, metres, and rotation vector) about its
-    center, with weight 1 in the cameras that they face: whatever hides the group where it is believed to be
-    need not hide it elsewhere.
+    centre, with weight 1 in the cameras that they face. Occlusion is ignored: what occludes the group where
+    it is believed to be need not occlude it elsewhere.
 
     Args:
         reference: reference points of the group.
         twist, center: as for `carry`.
-        images: their cameras.
+        images: the frame, whose cameras are used.
     """
     moved = carry(Points(reference.means, reference.tones, reference.real), twist, center)
     normals = rotated(matrix_of(twist[3:]), reference.normals)

@@ -55,7 +55,7 @@ def refine_loss(
         batch: see `RefineBatch`.
         step, key: not used; they belong to the signature of a loss.
         config: limits and weights.
-        extra_losses: added to the loss (`gsjax.losses.extra`); their scene is the `TrackedScene` after the
+        extra_losses: custom losses to add (`gsjax.losses.extra`); their scene is the `TrackedScene` after the
             motion.
     """
     scene, frame = batch.scene, batch.frame

@@ -17,8 +17,8 @@ from gsjax.scene.render import Rendered
 def near_background(
     scene: TrackedScene, rendered: Rendered, tiles: Bool[Array, "c rows columns"]
 ) -> Bool[Array, "background"]:
-    """Background Gaussians that reach one of the tiles in some camera, by their bounding boxes, which a
-    summed-area table tests."""
+    """Background Gaussians whose bounding box reaches one of the tiles in some camera, tested with a
+    summed-area table."""
     rows, columns = tiles.shape[1:]
     still = scene.num_moving
 
@@ -38,7 +38,7 @@ def near_background(
 
 @partial(jax.jit, static_argnums=2, inline=True)
 def near_scene(scene: TrackedScene, near: Bool[Array, "background"], num_near: int) -> TrackedScene:
-    """The scene with only the near Gaussians of the background, in `num_near` rows, of which surplus ones are
+    """The scene with only the near Gaussians of the background, in `num_near` rows; surplus rows are
     invisible."""
     rows = jnp.nonzero(near, size=num_near, fill_value=0)[0] + scene.num_moving
     background = emptied(take(scene.gaussians, rows), jnp.arange(num_near) >= near.sum())

@@ -19,7 +19,7 @@ from gsjax.scene.initialize import estimate_normals, gaussians_from_points, poin
 from gsjax.scene.labels import inherit_labels, lift_labels
 
 EMPTY = -30.0
-"""Opacity logit of a Gaussian that is invisible, such as that of an empty slot."""
+"""Opacity logit of an invisible Gaussian, such as an empty slot."""
 
 
 class TrackedScene(eqx.Module):
@@ -27,7 +27,7 @@ class TrackedScene(eqx.Module):
 
     Attributes:
         gaussians: the scene at the first frame.
-        normals: outward normals of the moving ones in their own axes; zero if both sides are visible.
+        normals: outward normals of the moving Gaussians in their own axes; zero if both sides are visible.
         labels: group of each Gaussian: 0 is the background, 1..K the objects in the order of `label_ids`.
         label_ids: mask value of each group, background first (static). The parts of a large object are
             separate groups with the same value.
@@ -131,7 +131,7 @@ def _bodies(cloud: Cloud, config: StartConfig) -> list[tuple[int, np.ndarray]]:
     for value in sorted(set(np.unique(cloud.labels).tolist()) - {0}):
         rows = np.flatnonzero(cloud.labels == value)
         points = cloud.points[rows]
-        # Quantiles, so that a few flying pixels, as depth cameras have at edges, do not count.
+        # Quantiles exclude the few flying pixels that depth cameras produce at edges.
         extent = float(np.ptp(np.quantile(points, (0.01, 0.99), axis=0), axis=0).max())
         parts = np.zeros(len(rows), int)
         if extent > config.max_extent:
@@ -146,7 +146,7 @@ def _bodies(cloud: Cloud, config: StartConfig) -> list[tuple[int, np.ndarray]]:
 
 
 def scene_from_cloud(cloud: Cloud, config: StartConfig) -> TrackedScene:
-    """Thin the cloud, objects less than the background, and make each point a disc on its surface."""
+    """Thin the cloud, objects less than the background, and turn each point into a disc on its surface."""
     parts, labels, towards, label_ids = [], [], [], [0]
     for value, chosen in _bodies(cloud, config):
         kept = _thin(cloud, chosen, config.object_pixels if value else config.background_pixels)

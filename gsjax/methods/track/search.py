@@ -1,8 +1,9 @@
-"""Search for where each group has gone: several starts are aligned with the images, and the best is kept.
+"""Search for where each group has gone: it is aligned with the images from several starts, and the best is
+kept.
 
-Every group continues from the best of its starts. A group that jumps or changes its spin is missed by all of
-them and then agrees worse than usual. So the groups that do are shifted to all sides, and those that agree
-worst after that are turned to all sides, as many as the time allows.
+Every group continues from the best of its starts. If it jumps or changes its spin, all of them miss it, and
+it agrees worse than usual. For such groups, shifts in all directions are tried and, for those that agree
+worst after that, rotations about all axes: for as many as time allows.
 """
 
 from collections.abc import Callable
@@ -29,14 +30,14 @@ from gsjax.methods.track.points import Points, ToneImages
 from gsjax.methods.track.recover import Relocation
 from gsjax.methods.track.watch import JUMPED_FACTOR, MOVED_FACTOR, Estimate, SearchResult, Watch
 
-_SHIFTS = 3  # groups that are shifted for each that is turned, which takes twice as long
+_SHIFTS = 3  # groups that are shifted for each that is rotated, which takes twice as long
 _DOUBT_WEIGHT = 0.5  # urgency of being in doubt, relative to a residual at its usual value
 _WAIT_WEIGHT = 0.05  # urgency of each frame of waiting, relative to a residual at its usual value
-_FIRST_WEIGHT = 1e3  # urgency of what must not wait, likewise
-_RELOCATION_COST = 2  # a relocation takes as long as two to three turns
+_FIRST_WEIGHT = 1e3  # urgency of groups that must not wait, likewise
+_RELOCATION_COST = 2  # a relocation takes as long as trying the rotations of two to three groups
 _DISTINCT_TURN = 0.14  # radians; orientations further apart than this are distinct
 _IMPROVED = 0.9  # a search found a better place if it lowered the residual by this factor
-_MAX_OWN_RESIDUAL = 0.5  # above this a group is hidden or elsewhere, and its orientation is not known
+_MAX_OWN_RESIDUAL = 0.5  # above this a group is occluded or elsewhere, and its orientation is not known
 
 
 align_groups = jax.vmap(align_from_afar, in_axes=(0, 0, 0, None, None))
@@ -46,7 +47,7 @@ disagreements = jax.vmap(disagreement, in_axes=(0, 0, 0, None, None))
 
 
 def best_of(residuals: Float[Array, "h *k"], twists: Float[Array, "h *k 6"]) -> Estimate:
-    """The hypothesis with the least residual, for each group; the first wins ties."""
+    """The hypothesis with the smallest residual, for each group; the first wins ties."""
     residuals = jnp.where(jnp.isfinite(residuals), residuals, jnp.inf)
     best = jnp.argmin(residuals, axis=0, keepdims=True)
     take = jnp.take_along_axis
@@ -59,12 +60,12 @@ def _every(step: int, points: Points) -> Points:
 
 
 def _judged(twists: Float[Array, "h 6"], *where, widen: float = 1.0) -> Float[Array, "h"]:
-    """`disagreement` of one group after each of many twists; `where` as there."""
+    """`disagreement` of one group after each of many twists; `where` has its other arguments."""
     return jax.vmap(lambda twist: disagreement(twist, *where, widen))(twists)
 
 
 def _better(known: Estimate, twist: Float[Array, "6"], *where) -> Estimate:
-    """`known` or, if that agrees better, the estimate after `twist`; `where` as for `disagreement`."""
+    """`known` or, if that agrees better, the estimate after `twist`; `where` as for `_judged`."""
     residuals = jnp.stack([known.residuals, disagreement(twist, *where)])
     return best_of(residuals, jnp.stack([known.twists, twist]))
 
@@ -78,9 +79,9 @@ def search_shifts(
     config: AlignConfig,
     shifts: Float[Array, "n 6"],
 ) -> Estimate:
-    """`known` of one group, or a better estimate from shifts of its starts to all sides.
+    """The estimate `known` of one group, or a better one from its starts shifted in all directions.
 
-    A quarter of the points chooses the best shift of each start and aligns it; all points decide in the end.
+    A quarter of the points selects the best shift of each start and aligns it; all points decide in the end.
 
     Args:
         known: the estimate so far.
@@ -89,7 +90,7 @@ def search_shifts(
         center: centroid of the group, metres.
         images: the new frame.
         config: configuration of the alignment.
-        shifts: twists that are added to the starts; they are distributed over them.
+        shifts: twists to add to the starts, among which they are distributed.
     """
     few, count = _every(4, points), len(starts)
     shifted = [starts[i] + shifts[i::count] for i in range(count)]
@@ -110,13 +111,15 @@ def search_turns(
     images: ToneImages,
     config: AlignConfig,
 ) -> tuple[Estimate, Float[Array, ""]]:
-    """`known` of one group or a better estimate, and its lead: how much worse other orientations agree.
+    """The estimate `known` of one group or a better one, and its lead: how much worse other orientations
+    agree.
 
-    Every start is aligned. Then turns to all sides are tried from the best result, because a knock changes a
-    spin from one frame to the next, and a round object may roll without changing its shape. Half the points
-    choose among these hypotheses; all points make the final decision. If another orientation agrees nearly as
-    well, the images do not determine the orientation. The lead is a fraction of the agreement, because hidden
-    points agree with no orientation: 1 if all hypotheses end at the same one, and infinite if little agrees.
+    Every start is aligned. Then rotations about all axes are tried from the best result, because a knock
+    changes a spin from one frame to the next, and a round object may roll without changing its shape. Half
+    the points choose among these hypotheses; all points make the final decision. If another orientation
+    agrees nearly as well, the images do not determine the orientation. The lead is relative to the agreement,
+    because occluded points agree with no orientation; it is 1 if all hypotheses end at the same orientation,
+    and infinite if little agrees.
 
     Args:
         known: the estimate so far.
@@ -152,8 +155,8 @@ class Followed(NamedTuple):
 
     estimate: Estimate
     aligned: Float[Array, "k"]  # residuals before any shift
-    shifted: Bool[Array, "k"]  # groups that agreed worse than usual then, and were shifted to all sides
-    missed: Bool[Array, "k"]  # those of them that agree nowhere near nevertheless: turn them, then relocate
+    shifted: Bool[Array, "k"]  # groups that agreed worse than usual then, for which shifts were tried
+    missed: Bool[Array, "k"]  # those of them that are still far off: try rotations, then relocation
 
 
 def follow(
@@ -166,8 +169,8 @@ def follow(
     visible: Bool[Array, "k"],
     everywhere: Int[Array, ""],
 ) -> Followed:
-    """Each group aligned from the best of its starts, and from shifts of them if it agrees worse than usual:
-    three times as many as `everywhere`, the worst first. Arguments as for `search`."""
+    """Each group aligned from the best of its starts and, if it then agrees worse than usual, from shifts of
+    them: for up to three times as many groups as `everywhere`, the worst first. Arguments as for `search`."""
     over_starts = jax.vmap(disagreements, in_axes=(0, None, None, None, None))
     best = best_of(over_starts(starts, points, centers, images, config), starts)
     aligned = align_groups(best.twists, points, centers, images, config)
@@ -206,7 +209,7 @@ def search(
     suspects: Bool[Array, "k"] | None = None,
     relocate: Callable[[Int[Array, ""]], Relocation] | None = None,
 ) -> SearchResult:
-    """The twist of each group that agrees best with the images, no worse than where it was followed to.
+    """The twist of each group that agrees best with the images, never worse than that of `follow`.
 
     Args:
         followed: result of `follow`.
@@ -217,13 +220,13 @@ def search(
         config: configuration of the alignment.
         watch: record of how the groups have been followed.
         visible: groups that some camera sees. Others are searched for only if lost.
-        everywhere: number of groups that are turned; one that is searched for elsewhere counts as two. First
-            come those that were glimpsed elsewhere, then lost ones that have waited, then those that agree
-            worst relative to their usual residual or have waited longest. One more is searched for elsewhere
-            if several of the first two kinds wait. With 0, `follow` shifts none either.
-        suspects: groups that are lost or may be. They are relocated where others are turned, unless they are
-            neither lost nor missed and have just moved; None: no group.
-        relocate: index of a suspect -> where it may be instead.
+        everywhere: number of groups for which rotations are tried; a relocation counts as two. First come
+            those that were glimpsed elsewhere, then lost ones that have waited, then those that agree worst
+            relative to their usual residual or have waited longest. One more is relocated if several of the
+            first two kinds are waiting. With 0, `follow` tries no shifts either.
+        suspects: groups that are lost or may be. Relocation is tried for them instead of rotations, unless
+            they are neither lost nor missed and have just moved; None: no group.
+        relocate: function from the index of a suspect to where it may be instead.
     """
     estimate = followed.estimate
     moved = followed.aligned >= MOVED_FACTOR * watch.usual

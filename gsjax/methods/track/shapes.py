@@ -1,7 +1,7 @@
-"""Start without depth: from shapes known as Gaussians, with poses and colours fitted to the first images.
+"""Initialisation without depth: known shapes, given as Gaussians, are fitted to the first images.
 
-A shape with a pose (the ground) is placed as it is. One without is placed on its plane where the images look
-like it: position and heading are searched for, scored by the colours of the pixels that its centres project
+A shape with a pose (the ground) is placed as it is. One without is placed on its plane where it matches the
+images: position and heading are searched for, scored by the colours of the pixels that its centres project
 to, and then refined against rendered images. Finally all colours are sampled from the images, and the scene
 is optimised photometrically, like a scene from depth: shapes too wide for their images become narrower.
 """
@@ -145,7 +145,7 @@ def find_pose(shape: Shape, frame: Frame, extent: np.ndarray | None) -> Float[np
     """The pose on its plane at which the centres of a shape project to pixels of their colours.
 
     Args:
-        shape: a shape with a plane, on which it rests either side up.
+        shape: a shape with a plane, on which it rests with either side up.
         frame: the first frame.
         extent: points of the background [N, 3], whose bounding box bounds the search.
 
@@ -169,7 +169,7 @@ def find_pose(shape: Shape, frame: Frame, extent: np.ndarray | None) -> Float[np
         standing = shape.means @ base.as_matrix().T
         lift = -offset - np.quantile(standing @ normal, 0.02)
         center = standing.mean(0)
-        ends = np.maximum(high, low + _GRID_STEP)  # at least one place, on a background of one Gaussian too
+        ends = np.maximum(high, low + _GRID_STEP)  # at least one place, even on a single Gaussian
         x, y = np.meshgrid(np.arange(low[0], ends[0], _GRID_STEP), np.arange(low[1], ends[1], _GRID_STEP))
         places = np.stack([x.ravel(), y.ravel()], axis=-1)
         headings = np.linspace(0, 2 * np.pi, _HEADINGS, endpoint=False)
@@ -250,8 +250,8 @@ def _recolored(scene: TrackedScene, frame: Frame) -> TrackedScene:
     """The scene in which each Gaussian has the median of its colours in the cameras.
 
     The background ignores pixels that an object may cover, and objects ignore colours unlike the rest of
-    their group, because something hides them there. A Gaussian without colours left takes that of its
-    nearest neighbour in its group.
+    their group, because they are occluded there. A Gaussian without colours left takes that of its nearest
+    neighbour in its group.
     """
     colors, inside, covered = (np.asarray(a) for a in _observed_colors(scene, frame))
     group = np.asarray(scene.labels)

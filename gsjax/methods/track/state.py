@@ -54,7 +54,7 @@ class TrackState(NamedTuple):
     """The state that the tracker carries from frame to frame.
 
     Attributes:
-        motion: motion of the last frame: the start of delta, and the constant-velocity hypothesis.
+        motion: motion of the last frame: the initial delta, and the constant-velocity hypothesis.
         pixels: pixels that showed each group in the last frame.
         keyframe: pixels that showed it in an earlier frame.
         relocation_guesses: for groups that may be elsewhere, the twist from where they are believed to be:
@@ -62,7 +62,7 @@ class TrackState(NamedTuple):
         watch: record of how each group has been followed.
         count: number of frames after the first one; -1 before that.
         shown: what the scene showed in the last frame; None if the whole scene is redrawn.
-        backdrop: the background in `shown`; None likewise.
+        backdrop: the background over which `shown` was drawn; None if the whole scene is redrawn.
         images: images of the last frame if templates are taken from them; else None.
     """
 
@@ -88,7 +88,7 @@ class TrackBatch(NamedTuple):
     Attributes:
         frame: the frame of all cameras.
         plan: capacities for rendering.
-        everywhere: number of groups to turn or search for; None: as configured.
+        everywhere: number of groups for which rotations or other places are tried; None: as configured.
     """
 
     frame: Frame
@@ -100,7 +100,7 @@ class TrackBatch(NamedTuple):
 def blank_state(params: Tracked, config: TrackConfig, shape: FrameShape) -> TrackState:
     """The state of a tracker that has seen no frame yet: no pixel shows any group, and nothing was drawn.
 
-    An update from here changes no parameters: the scene shows that frame, and the state stores what it saw.
+    An update from here, to the frame that the scene shows, changes no parameters: it only stores what it saw.
     `params` is the scene and the pose of its objects, `shape` that of the frames to come.
     """
     scene, pose = params

@@ -29,7 +29,7 @@ def track_step(
 
     params: `Tracked`, a scene with `config.grow.slots` slots (see `with_slots`) and the pose of its objects.
     state: `TrackState`; that of `init` has seen no frame yet, so the first update, with the frame that the
-    scene shows, only looks: it changes no parameters. batch: `TrackBatch`, with the frame of all cameras.
+    scene shows, only observes: it changes no parameters. batch: `TrackBatch`, with the frame of all cameras.
     `key` is used to relocate lost groups; `step` is not used.
 
     A frame passes through six stages (`gsjax.methods.track.stages`):
@@ -37,8 +37,8 @@ def track_step(
     1. determine what the last scene shows of each object;
     2. collect hypotheses of the motion: none, the same as in the last frame and, with `config.matching`, that
        of template matching;
-    3. align each object with the images from there and keep what agrees best; shift those that agree worse
-       than usual to all sides, turn those that agree worst, and search elsewhere for those that may be lost;
+    3. align each object with the images from the best of these; try shifts of those that agree worse than
+       usual, rotations of those that agree worst, and other places for those that may be lost;
     4. with `config.refine.iterations`, refine D_k and delta_i photometrically, and keep the improvements;
     5. detect lost objects, and move those that were found again;
     6. draw what the scene shows now, from which the next frame continues. With `config.redraw` "moving", only
@@ -48,16 +48,17 @@ def track_step(
     sees stay where they are. If a plan overflows, no pixel of the frame or not all of its cameras are finite,
     or a new pose is not finite, the update changes nothing.
 
-    Beside what every step reports, `info` has `residual`, `visible`, `agrees`, `lost`, `turn_known` and
-    `looked_for` (turned or searched for) of each group; `motion` and `centers`; `found` and `score` of
-    template matching; `joined`, the number of Gaussians that have joined; `broken_pixels`; and the info of
-    the refinement. `loss` is the mean residual of the visible groups, and `needed` is for `TrackPlan.grown`.
+    Besides what every step reports, `info` has `residual`, `visible`, `agrees`, `lost`, `turn_known` and
+    `looked_for` (rotations or other places were tried) of each group; `motion` and `centers`; `found` and
+    `score` of template matching; `joined`, the number of Gaussians that have joined; `broken_pixels`; and the
+    info of the refinement. `loss` is the mean residual of the visible groups, and `needed` is for
+    `TrackPlan.grown`.
 
     Args:
         config: see `TrackConfig`.
         shape: shape of all frames, before `prepared`.
         reduction: factor by which images shrink for template matching (objects larger than the template).
-        extra_losses: custom losses (`gsjax.losses.extra`) beside that of the refinement. Their scene is a
+        extra_losses: custom losses (`gsjax.losses.extra`) added to that of the refinement. Their scene is a
             `TrackedScene` of the moving Gaussians and the background near them, with labels. Their result is
             always kept, because they may use information that is not in the images; `info["extra"]` has
             their values.
@@ -78,7 +79,7 @@ def track_step(
         if everywhere is None:
             most = config.align.everywhere
             everywhere = jnp.int32(scene.num_objects if most is None else most)
-        with jax.default_matmul_precision("highest"):  # poses compound: no TF32 on GPUs that have it
+        with jax.default_matmul_precision("highest"):  # errors of poses add up: no TF32 on GPUs that have it
             centers = group_means(pose.means, scene.groups, scene.num_objects)
             images = tone_images(frame, config.align.shading)
             reference = reference_points(scene, pose, config.align)

@@ -1,5 +1,5 @@
-"""The record of how each group has been followed: which are lost, which were found, and what is usual for
-them."""
+"""The record of how each group has been followed: its usual residual, and whether it is lost or has been
+found again."""
 
 from typing import NamedTuple
 
@@ -26,32 +26,32 @@ JUMPED_FACTOR = 1.5
 MOVED_FACTOR = 2.0
 """The same above which it has just moved."""
 _CALM_FACTOR = 1.25  # the same below which it agrees as usual
-_FAR_OFF_FACTOR, _FAR_OFF = 4.0, 0.3  # the same, and the residual itself, above which it is nowhere near
+_FAR_OFF_FACTOR, _FAR_OFF = 4.0, 0.3  # the same, and the residual itself, above which it is far off
 TURN_KNOWN = 0.045
 """Lead above which a group's orientation is known; docs/results-hard-cases.md has leads of both kinds."""
-_FOUND_TURN_AGREEMENT = 0.65  # agreement above which a group that is found again has its first orientation
+_FOUND_TURN_AGREEMENT = 0.65  # agreement above which the orientation of a group that was found is trusted
 
 
 class Estimate(NamedTuple):
-    """Where each group is, as far as is known."""
+    """The estimated motion of each group."""
 
     twists: Float[Array, "*k 6"]  # translation, metres, and rotation vector, radians
-    residuals: Float[Array, "*k"]  # disagreement with the images: 0 perfect, 1 not at all
+    residuals: Float[Array, "*k"]  # disagreement with the images: 0 if perfect, 1 if nothing agrees
 
 
 class SearchResult(NamedTuple):
     """The result of a search."""
 
     estimate: Estimate
-    searched: Bool[Array, "k"]  # groups that were turned or searched for elsewhere
-    confirmed: Bool[Array, "k"]  # groups for which shifts or turns found no better place
+    searched: Bool[Array, "k"]  # groups for which rotations or other places were tried
+    confirmed: Bool[Array, "k"]  # groups for which shifts or rotations found no better place
     relocation: Relocation  # where each group may be instead, valid only where it was tried
     relocation_tried: Bool[Array, "k"]
     leads: Float[Array, "k"]  # see `search_turns`; infinite if unknown
 
 
 class Watch(NamedTuple):
-    """Record of how each group has been followed, which decides where to search first, and what is lost."""
+    """Record of how each group has been followed; it decides where to search first, and which are lost."""
 
     usual: Float[Array, "k"]  # running mean of the residual
     waited: Float[Array, "k"]  # frames since the group was last `SearchResult.searched`
@@ -86,21 +86,21 @@ class Watch(NamedTuple):
     ) -> "Watch":
         """The record one frame later.
 
-        The usual residual rises only where a search found no better place, or a group that lags would soon be
-        taken to agree as usual. A group is lost below a threshold of its agreement, or if its agreement drops
-        within one frame while its residual rises. It is found if most of it agrees, or enough in several
-        frames in a row. Then it is on probation: one that looks alike must not be found elsewhere in several
-        searches, and then a search has to tell its turn.
+        The usual residual rises only where a search found no better place; otherwise a group that lags would
+        soon appear to agree as usual. A group is lost if its agreement is below a threshold, or drops within
+        one frame while its residual rises. It is found if most of it agrees, or enough of it in several
+        frames in a row. Then it is on probation, in case another object only looks alike: several searches
+        elsewhere must find no better place, and then a search has to determine its orientation.
 
         Args:
             residuals: as in `Estimate`, where each group was aligned.
             result: result of the search.
             counts: number of pixels that showed each group.
             confidence: confidence that each group is where it is believed to be.
-            elsewhere: groups of which more shows in another place than in their own.
+            elsewhere: groups with stronger evidence in another place than in their own.
             relocated: those of them that were moved there.
-            searches: number of searches elsewhere that a group on probation has to pass; 0 where none is
-                possible, so that it passes once its turn is known.
+            searches: number of searches elsewhere that a group on probation has to pass; 0 if none is
+                possible, so that it passes once its orientation is known.
         """
         agreement, conclusive = confidence.agreement, confidence.conclusive
         there = is_found(confidence, self.showed)

@@ -3,7 +3,7 @@
 Each is a pure function of the `UpdateContext` that all of them share, and of the results of earlier stages.
 
     context.py  what all stages share
-    shown.py    what a scene shows of each group, and what there is to see of it
+    shown.py    what a scene shows in the cameras of a frame, and what the next frame needs of it
     follow.py   look_back         what the last scene shows of each group
                 starting_points   hypotheses of where each group has gone
                 align_and_search  alignment with the images, wider searches, and relocation

@@ -27,9 +27,9 @@ class UpdateContext(NamedTuple):
     state: TrackState  # after the last frame
     frame: Frame  # the new one, of the tracked cameras
     plan: TrackPlan
-    images: ToneImages  # the new frame in the form that points are compared with
-    centers: Float[Array, "k 3"]  # centroids of the groups, about which they turn, metres
-    reference: ReferencePoints  # what each group has to look like
+    images: ToneImages  # the new frame as tones and depth, for comparison with points
+    centers: Float[Array, "k 3"]  # centroids of the groups, about which they rotate, metres
+    reference: ReferencePoints  # what each group looks like, from the first frame
 
 
 class Past(NamedTuple):
@@ -40,7 +40,7 @@ class Past(NamedTuple):
     template: Template | None  # None without template matching
     rendered: Rendered | None  # the whole scene, if it is redrawn; else None
     backdrop: Backdrop | None  # the background in the new cameras; None if the whole scene is redrawn
-    background: Float[Array, "c h w"] | None  # its depth, metres, 0 where it does not cover; None likewise
+    background: Float[Array, "c h w"] | None  # its depth, metres, 0 where it has none; None without one
     needed: Int[Array, ""]  # capacity that drawing the background needed
     counts: Float[Array, "k"]  # number of pixels that show each group
     visible: Bool[Array, "k"]  # groups that enough pixels show
@@ -61,8 +61,8 @@ class Alignment(NamedTuple):
     search: SearchResult
     points: Points  # the points that were aligned
     reference: Points  # the reference points among them, as the last frame saw them
-    suspects: Bool[Array, "k"]  # groups that are lost, or may be and whose turn it was to be relocated
-    missed: Bool[Array, "k"]  # those of them that have just jumped and agree nowhere near
+    suspects: Bool[Array, "k"]  # groups that are lost, or may be and are due for relocation
+    missed: Bool[Array, "k"]  # those of them that have just jumped and are still far off after shifts
     other_depths: Float[Array, "c h w"]  # depth of the groups that are not in doubt, metres; else 0
     needed: Int[Array, ""]  # capacity that drawing the last scene in the new cameras needed
 
@@ -71,7 +71,7 @@ class Refined(NamedTuple):
     """The motion after refinement, or as aligned without it."""
 
     motion: Motion
-    residuals: Float[Array, "k"]  # disagreement with the images: 0 perfect, 1 not at all
+    residuals: Float[Array, "k"]  # disagreement with the images: 0 if perfect, 1 if nothing agrees
     scene: TrackedScene  # with the background as refined
     shifts: Float[Array, "b 3"] | None  # of each Gaussian of the background; None if that is frozen
     needed: Needed  # by the refinement
@@ -83,6 +83,6 @@ class Settled(NamedTuple):
 
     motion: Motion
     confidence: Confidence  # that each group is where it is believed to be
-    elsewhere: Bool[Array, "k"]  # groups of which more shows in another place than in their own
+    elsewhere: Bool[Array, "k"]  # groups with stronger evidence in another place than in their own
     relocated: Bool[Array, "k"]  # those of them that are moved there
     guesses: Float[Array, "k 6"]  # twists from the place in the last frame to where each may be instead

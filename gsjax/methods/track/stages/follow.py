@@ -31,8 +31,8 @@ from gsjax.methods.track.stages.shown import show
 from gsjax.scene.region import tiles_to_pixels, touched_tiles
 from gsjax.scene.render import Rendered
 
-# Fewer pixels than this cannot decide six numbers, so the group is not moved. For small groups, this share of
-# the pixels that they once had is enough.
+# Fewer pixels than this do not determine a rigid motion, so the group is not moved. For small groups, this
+# fraction of the most pixels that they ever had is enough.
 _ENOUGH_PIXELS, _MIN_SHARE = 200, 0.2
 
 
@@ -66,8 +66,8 @@ def look_back(now: UpdateContext, config: TrackConfig) -> Past:
 
 
 def starting_points(now: UpdateContext, past: Past, config: TrackConfig, reduction: int) -> Starts:
-    """Second stage: hypotheses of the motion up to now: none, the same as in the last frame, and that of
-    template matching, for which `reduction` is the factor by which images shrink."""
+    """Second stage: hypotheses of the motion from the last frame until now: none, the same as before, and
+    that of template matching, for which `reduction` is the factor by which images shrink."""
     before, num_objects = now.state.motion, now.scene.num_objects
     still, delta = jnp.zeros_like(before.twists), jnp.zeros_like(before.delta)
     starts = [still]
@@ -94,12 +94,12 @@ def align_and_search(
     key: Key[Array, ""],
     config: TrackConfig,
 ) -> Alignment:
-    """Third stage: each group is aligned with the images and, if it agrees worse than usual, shifted. Those
-    that agree worst then are turned, or searched for elsewhere if they may be lost.
+    """Third stage: each group is aligned with the images; if it agrees worse than usual, shifts are tried.
+    For those that agree worst after that, rotations are tried or, if they may be lost, other places.
 
     Args:
         now, past, starts: from the earlier stages.
-        everywhere: number of groups that are turned or searched for.
+        everywhere: number of groups for which rotations or other places are tried.
         key: random key of the relocation.
     """
     state, gap = now.state, config.start.depth_gap
@@ -132,7 +132,8 @@ def _relocation(
     key: Key[Array, ""],
     config: TrackConfig,
 ) -> Callable[[Int[Array, ""]], Relocation]:
-    """index of a group -> where it may be instead; what all groups share is prepared only if `wanted`."""
+    """A function from the index of a group to where it may be instead; the input that groups share is
+    prepared only if `wanted`."""
     gap = config.start.depth_gap
     how = (config.grow.min_gap, config.align, config.coarseness)
     found = partial(unexplained_pixels, shown, now.images, *how)
@@ -149,7 +150,7 @@ def _relocation(
 
 def in_search_round(count: Int[Array, ""], num_objects: int) -> Bool[Array, "k"]:
     """Groups that are searched for elsewhere in this frame if in doubt: each in two frames of four, because
-    relocation takes two, and followed in the other two. Odd and even ones alternate, so that no update
+    relocation takes two, and is followed in the other two. Odd and even ones alternate, so that no update
     searches for all."""
     return (count + 2 * jnp.arange(num_objects)) % 4 < 2
 
@@ -175,8 +176,8 @@ def refine_motion(
         if shifts is not None:
             shifts = jnp.where(now.state.is_blank, 0.0, shifts)
             scene = shift_background(scene, shifts)
-        # Points do not capture outlines, which rendered images do, so they veto the refinement only if it
-        # went clearly wrong; without depth they are hardly more reliable at all.
+        # Points, unlike rendered images, do not capture outlines, so they veto the refinement only if it
+        # clearly went wrong; without depth they are hardly more reliable than it.
         lead = 0.1 if now.frame.depths is None else 0.01
         of_refined = disagreements(refined.twists, alignment.points, now.centers, now.images, config.align)
         better = of_refined - lead <= residuals
@@ -191,7 +192,7 @@ def refine_motion(
 def _show_again(
     now: UpdateContext, past: Past, wanted: Bool[Array, ""], config: TrackConfig
 ) -> tuple[Shown, Int[Array, ""]]:
-    """What the last scene shows in the new cameras, if that is wanted, and the capacity needed."""
+    """What the last scene shows, in the new cameras if that is `wanted`, and the capacity needed."""
     backdrop, before = past.backdrop, (past.shown, jnp.int32(0))
     if backdrop is None or now.frame.depths is None:
         return before

@@ -18,8 +18,8 @@ from gsjax.methods.track.stages.shown import memory_of, show
 from gsjax.methods.track.state import TrackState
 from gsjax.methods.track.watch import first_watch
 
-# A group is moved elsewhere only if the evidence for it is stronger by the first of these factors; one that
-# was just found, by the second.
+# A group is moved elsewhere only if the evidence for the other place is stronger by the first of these
+# factors or, if the group was just found, by the second.
 _BETTER, _STILL_BETTER = 1.3, 1.1
 
 
@@ -30,15 +30,15 @@ def detect_lost(
     found instead. Arguments `now`, `past` and others from the earlier stages."""
     state, gap, kept = now.state, config.start.depth_gap, refined.motion
     lost, showed, background = state.watch.lost, state.watch.showed, past.background
-    if background is not None:  # what shows at first is all that will ever show, wherever it is
+    if background is not None:  # all that is seen at first counts, even in the surface of the background
         background = jnp.where(state.is_blank, 0.0, background)
     tried, relocation = alignment.search.relocation_tried, alignment.search.relocation
     carried = jax.vmap(carry)(alignment.reference, kept.twists, now.centers)
     confidence = group_confidence(carried, now.images, gap, background)
 
     def by_all_facing() -> Confidence:
-        """From all points that face the cameras: a lost group is not where it was last seen, and at first
-        nothing has been seen."""
+        """Confidence from all points that face the cameras: a lost group is not where it was last seen, and
+        at first nothing has been seen yet."""
         points = all_points_facing(now.reference, kept.twists, now.centers, now.images)
         return group_confidence(points, now.images, gap, background, alignment.other_depths)
 
@@ -50,8 +50,8 @@ def detect_lost(
     found = is_found(relocation.confidence, showed)
     twice = found & is_found(relocation.guess_confidence, showed)
     surely = found & (relocation.confidence.agreement > SURELY_FOUND)
-    # A group that is not lost is seen where it is. If it is only turned there, it is in no other place; but
-    # one that was just found may be turned wrongly.
+    # A group that is not lost is seen where it is, so a guess that only rotates it is no other place; but one
+    # that was just found may have the wrong orientation.
     away = jnp.linalg.norm(relocation.twists[:, :3], axis=-1) > radii(now.reference, now.centers)
     elsewhere = tried & better & (astray | away | on_probation)
     # Among many guesses one may agree by chance, but not twice.
@@ -105,7 +105,7 @@ def remember(
     guesses = where_groups(
         watch.doubtful & ~relocated, relative_twists(settled.guesses, motion.twists), still
     )
-    # A relocation is no velocity, unless the group was in its place one frame ago.
+    # A relocation does not give a velocity, unless the group was in its place one frame ago.
     no_velocity = relocated & ~alignment.missed
     velocity = select_motion(no_velocity, jax.tree.map(jnp.zeros_like, motion), motion, groups)
     memory = memory_of(shown, past.backdrop, now.frame, config)
