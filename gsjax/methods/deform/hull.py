@@ -44,8 +44,8 @@ def hull_gaussians(
     """Gaussians at random positions in the visual hull, coloured by the mean of the pixels that show them.
 
     A cell of a cube around the focus, as wide as the view there, is in the hull if it projects to something
-    other than the background in 0.6 times as many views as the best cell, or more. Without a background, every
-    pixel shows something.
+    other than the background in 0.6 times as many views as the best cell, or more. Without a background,
+    every pixel shows something.
 
     Args:
         frames: frames of one camera over time; pixels outside their masks may show anything.
