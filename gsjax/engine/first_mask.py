@@ -51,7 +51,7 @@ def first_mask(tracked: Sequence, camera: int | None, source: str | Path, scale:
         camera: id of the mask's camera; None takes the first that has masks.
         source: "files", "segment", or "auto": files, else the shapes of the recording, else the segmenter; or
             the path of a picture of labels.
-        scale: size of the tracked pictures relative to the originals; a picture of labels may have either size.
+        scale: size of the tracked pictures relative to the originals; labels may have either size.
 
     Raises:
         ValueError: the camera is not tracked, or has no mask; or the picture does not fit.

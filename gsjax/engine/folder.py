@@ -276,8 +276,8 @@ class RunFolder:
         return flattened(read_values(self.config, parse_yaml)).get(name)
 
     def check_config(self, config: Any, *, but: tuple[str, ...]) -> None:
-        """Raises ValueError if config.yml differs from `config`, except in the settings `but` and in those that
-        the version that wrote it did not have."""
+        """Raises ValueError if config.yml differs from `config` in settings other than `but`; those that the
+        version that wrote it did not have are ignored."""
         stored = flattened(read_values(self.config, parse_yaml))
         given = flattened(plain(dataclasses.asdict(config)))
         names = [name for name in stored if name.split(".")[0] not in but]

@@ -215,7 +215,7 @@ def _acquire(file: int, folder: Path, path: Path, writer: Writer) -> bool:
             return free is not None
         if others:
             break
-        time.sleep(_BETWEEN_S * (attempt + 1 < _ATTEMPTS))  # the holder has not listed itself yet, or is ending
+        time.sleep(_BETWEEN_S * (attempt + 1 < _ATTEMPTS))  # the holder is not listed yet, or is ending
     who = str(others[-1]) if others else "another process, which writes there"
     gone = "" if free is not None else f"; if it is gone, remove {path}"
     raise BlockingIOError(

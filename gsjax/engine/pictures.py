@@ -26,7 +26,7 @@ MIN_VIDEO_HZ = 1.0
 MARK = (255, 70, 160)
 """RGB colour of the outline around what a query found."""
 MOST = 0.5
-"""Share of a pixel's colour above which the pixel shows what a query found."""
+"""A pixel shows what was found if more than this share of its light comes from there."""
 _VIDEO_HEIGHT = 480  # smaller pictures are enlarged
 
 

@@ -79,7 +79,7 @@ def run_cell(
 
 
 def _check_result(result: Any, cell: Cell) -> None:
-    """Raises a TypeError unless the result is a dict that JSON can hold, by names that are not reserved."""
+    """Raises a TypeError unless the result is a dict that JSON can hold, without reserved names."""
     if not isinstance(result, Mapping):
         raise TypeError(f"run() returned {type(result).__name__}, expected a dict of named figures")
     for key, value in result.items():
