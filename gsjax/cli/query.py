@@ -129,7 +129,7 @@ def run(options: Options) -> int:
     expect_folder(options.run)
     _expect_place(options.out)
     console, field = Console(stderr=True, highlight=False), field_of(options.run)
-    # A tracked run answers over time, but not the queries that need a field.
+    # A tracked run is queried over time, but cannot answer queries that need a field.
     tracked = (options.run / "trajectory.npz").is_file()
     needs_field = _given(options.gaussians, options.field)
     try:

@@ -1,7 +1,7 @@
 """The optimisation loop of all methods but the tracker. It takes care of compiler options, buffer donation,
-overflow of capacities, compile time, random keys, headroom, the guard against divergence, and when Ctrl-C may
-interrupt. The tracker gets a new frame at every step, donates nothing and keeps to a time budget, so it has a
-loop of its own, built from the same components (`gsjax.engine.track.tracking`).
+capacity overflow, compile time, random keys, headroom, the guard against divergence, and when Ctrl-C may
+interrupt. The tracker gets a new frame at every step, donates nothing and can keep to a time budget, so it
+has a loop of its own, built from the same components (`gsjax.engine.track.tracking`).
 
     ticks = drive(method, problem, run)
     for now in ticks:
@@ -48,7 +48,7 @@ class Tick:
 
     Attributes:
         method: the method, with its configuration; for the tracker, an object with `config` and `result`.
-        problem: the data, which no step changes; None after `gsjax.load`.
+        problem: the fixed inputs of all steps; None after `gsjax.load`.
         run: the state to continue from. The next step donates its arrays: copy any that you keep.
         info: losses and diagnostics of this step by name, on the device; see `gsjax.optim.step`.
         seconds: wall-clock time of the step, without compiling.

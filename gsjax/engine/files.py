@@ -51,7 +51,7 @@ def read_arrays(file: Path, wanted: Sequence[str], again: str) -> dict[str, np.n
 def _expect_arrays(file: Path, arrays: Mapping[str, np.ndarray], wanted: Iterable[str], again: str) -> None:
     missing = [name for name in wanted if name not in arrays]
     if missing:
-        found = brief(", ".join(arrays)) or "an array without a name"  # which is what an .npy file holds
+        found = brief(", ".join(arrays)) or "an array without a name"  # as in an .npy file
         raise ValueError(f"{file}: expected an array {missing[0]}, found {found}; {again}")
 
 
@@ -187,7 +187,7 @@ def read_scene(
 
 
 def about_scene(recording: Recording, origin: Float[np.ndarray, "3"] | None) -> Recording:
-    """A recording relative to the origin of its scene."""
+    """The recording with coordinates relative to the origin of its scene."""
     tracked, judged = (relative_to_origin(each, origin) for each in (recording.tracked, recording.judged))
     return replace(recording, tracked=tracked, judged=judged)
 
@@ -220,7 +220,7 @@ def reopen(
         if not isinstance(scale, int | float):
             raise TypeError(f"scale: {scale!r}")
         dataset, cameras, frames = (settings[name] for name in _SETTINGS)
-        held_out = settings.get("eval_cameras") or ()  # which not all commands have
+        held_out = settings.get("eval_cameras") or ()  # not all commands have this option
         return open_recording(dataset, cameras, held_out, frames, read, float(scale), opened), wanted
     except (KeyError, TypeError, AttributeError) as error:
         listed = ", ".join(_SETTINGS)

@@ -20,7 +20,7 @@ from gsjax.io.parsed import parse_json, parse_yaml
 from gsjax.io.scenes import is_scene
 from gsjax.io.sequences import scenes_in_words, scenes_within
 
-DEFORMATION = "deformation.npz"  # the scene of a run of `gsjax deform`, over time
+DEFORMATION = "deformation.npz"  # the scene of a run of `gsjax deform` over time
 _WRITTEN = (
     *("config.yml", "metrics.json", "metrics.jsonl", "report.html", "trajectory.npz", "scene.ply"),
     *("cameras.npz", "poses.npz", "parts.npz", "field.npz", DEFORMATION, "video_*.mp4", ".*.partial*"),
@@ -35,11 +35,11 @@ _RESUMED = ("resume/*", "canonical/resume/*", "canonical/scene.ply")
 OF_QUERY = ("query.json", "selection.npz", "over_time.npz", "masks", "frames", "video.mp4", "overview.png")
 OF_QUERY += ("object.ply", "without.ply", "recolored.ply", "moved.ply", f"*{ENDING}")
 """The files that `gsjax query` writes."""
-SCRIPT = "edit.yaml"  # the edits of a film of `gsjax edit`, whose folder it marks
+SCRIPT = "edit.yaml"  # the edits of a film of `gsjax edit`; it marks the film's folder
 _NOBODYS = (LOCK, ".*.partial*", ".DS_Store", "._*", ".nfs*", ".directory")
 """Hidden files that may be deleted: of killed commands, and of file managers and file systems."""
 _ANEW = "restore it, or replace the run with --overwrite"
-SIGNATURE = "# gsjax run"  # the first line of config.yml: other programs write files of that name too
+SIGNATURE = "# gsjax run"  # the first line of config.yml, because other programs write files of that name too
 
 
 def read_values(file: Path, parse: Callable[[str], Any]) -> dict[str, Any]:

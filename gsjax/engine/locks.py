@@ -101,7 +101,7 @@ def releasing_locks() -> Iterator[None]:
 
 
 def lock(folder: Path, *, shared: bool = False) -> None:
-    """Lock a folder until the end of the `releasing_locks` block, or without one of the process.
+    """Lock a folder until the end of the `releasing_locks` block or, outside one, of the process.
 
     Args, raises: as for `locked`.
     """
@@ -281,7 +281,7 @@ def _list_writers(file: int, writers: list[Writer]) -> None:
 
 def _release(path: Path, held: _Held) -> None:
     """Release a lock; its file is removed unless others share it."""
-    with suppress(OSError):  # such as of a file system that is gone
+    with suppress(OSError):  # the file system may be gone
         others = _others(held.file, held.writer)
         alone = _flock(held.file, shared=False)  # so that nobody joins before the file is removed
         if alone or (alone is None and not others):

@@ -13,7 +13,7 @@ from gsjax.engine.messages import counted
 from gsjax.engine.messages import describe as describe_error
 from gsjax.optim.compiler import has_avx512
 
-_ASKED = ("JAX_PLATFORMS", "JAX_PLATFORM_NAME")  # variables of the environment that name a backend
+_ASKED = ("JAX_PLATFORMS", "JAX_PLATFORM_NAME")  # environment variables that name a backend
 
 
 def describe() -> dict[str, Any]:

@@ -32,7 +32,7 @@ class Recording:
     """The chosen frames of a recording.
 
     Attributes:
-        tracked: the cameras that methods see; they do not even open the others.
+        tracked: the cameras that methods see; the others' files are not even opened for them.
         judged: the same frames, with the held-out cameras after the tracked ones.
         frames_in_data: number of frames in the data.
         simulated: whether pictures are rendered on demand, which is slower than reading them, and cached.

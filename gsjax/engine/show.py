@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 else:
     Viewable = Any  # slow to import, like everything that shows a scene
 
-_STEP = 1 / 15  # seconds that a frame is shown
+_STEP = 1 / 15  # seconds per frame
 
 
 @dataclass(frozen=True)

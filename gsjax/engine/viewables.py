@@ -241,7 +241,7 @@ def _of_track(path: Path, notes: Notes, now: Whereabouts) -> Viewable:
     try:
         saved = open_run(path)
     except ValueError as error:
-        tracking, origin = read_tracking(path)  # if that is damaged, it is an error
+        tracking, origin = read_tracking(path)  # an error if that is damaged too
         notes.warn(f"its recording is not shown: {error}")
     else:
         tracking, names = saved.tracking, saved.names

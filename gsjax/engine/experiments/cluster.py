@@ -275,7 +275,7 @@ def _client(scheduler: str, workers: int | None) -> Iterator[Any]:
             )
         elif scheduler == SLURM:
             place = stack.enter_context(slurm_cluster())
-            place.adapt(minimum_jobs=workers, maximum_jobs=workers)  # starts another for one that ended
+            place.adapt(minimum_jobs=workers, maximum_jobs=workers)  # replaces jobs that ended
         try:
             client = distributed.Client(place, timeout=CONNECT_S)
         except OSError as error:

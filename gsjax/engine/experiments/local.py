@@ -70,7 +70,7 @@ def run_cell(
         result, error = None, f"{kind}: {describe(failure)}".removesuffix(f": {kind}")
         trace = traceback.format_exc().splitlines()
     outcome = {"result": result, "traceback": trace, "seconds": perf_counter() - begun}
-    # The machine is described after the script ran, which may configure JAX first.
+    # The machine is described after the script ran, because the script may configure JAX.
     record = experiment.new_record(cell, error, **outcome, machine=machine.describe())
     write_json(path, record | {"gsjax": made_with})
     with contextlib.suppress(OSError):  # the script has left files in it

@@ -1,4 +1,4 @@
-"""A run of `gsjax experiment`: runs or resumes the sweep that supports a claim, and collects its results."""
+"""`gsjax experiment`: runs or resumes the sweep that supports a claim, and collects its results."""
 
 import contextlib
 import json
