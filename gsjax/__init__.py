@@ -1,6 +1,6 @@
 """gsjax: moving scenes from 3D Gaussians, in pure JAX.
 
-verbs       fit, track, parts, distill, deform: data in, a tick a step, `now.result` at the end
+verbs       fit, track, parts, distill, deform: data in, a tick per step, `now.result` at the end
 settings    FitConfig, TrackConfig, PartsConfig, DistillConfig, DeformConfig
 data        open_photographs, open_sequence, Photographs, Sequence
 tracking    start_scene, scene_from_shapes

@@ -45,22 +45,24 @@ GROUPS = {
     },
 }
 COMMANDS = {name: entry for group in GROUPS.values() for name, entry in group.items()}
-"""Each command's module. It has `Options`, a dataclass or a union of them (subcommands), `run(options)`,
-which returns the exit code, perhaps `HELP`, a further description, and perhaps `options_for(arguments)`: the
-options, if defaults depend on the arguments, and the arguments to parse."""
+"""Each command's module and description. The module has `Options`, a dataclass or a union of them
+(subcommands), and `run(options)`, which returns the exit code; optionally `HELP`, a further description; and
+optionally `options_for(arguments)`, for defaults that depend on the arguments, which returns the class of
+options and the arguments to parse."""
 
 
 def entry() -> None:
-    """The program. After Ctrl-C or an error it exits without waiting for XLA, which may still be compiling in
-    a thread and would crash as Python shuts down. Output that nobody can receive (`gsjax fit ... | head`)
-    neither ends a run nor changes its exit code; that of a full disk is missed aloud."""
-    # JAX's traces are many objects that live on: looking through them again and again, and once more at the
+    """The entry point of the program. After Ctrl-C or an error it exits without waiting for XLA, which may
+    still be compiling in a thread and would crash as Python shuts down. Output that nobody can receive
+    (`gsjax fit ... | head`) neither ends a run nor changes its exit code; output lost to a full disk causes a
+    warning."""
+    # JAX's traces are many long-lived objects: to scan them for garbage again and again, and once more at
     # exit, takes a second of a short run.
     gc.set_threshold(100_000, 50, 50)
-    # What is wrong with a picture or a video is said by gsjax, which knows the file.
+    # gsjax itself reports what is wrong with a picture or a video, because it knows the file.
     os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # FFmpeg's quiet
-    # XLA's alarm of a slow compilation asks for a bug report; that it compiles is said by gsjax.
+    # XLA's alarm about slow compilation asks for a bug report; gsjax itself says when it compiles.
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
     keep_streams_open()
     try:

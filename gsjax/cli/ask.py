@@ -83,7 +83,7 @@ def run(options: Options) -> int:
 
 
 def _used(asked: Question, facts: SceneFacts) -> dict[str, Any]:
-    """The facts on which an answer rests."""
+    """The facts on which an answer is based."""
     steps = zip(range(len(facts.frames)), range(1, len(facts.frames)), strict=False)
     return {
         "unit": facts.unit,

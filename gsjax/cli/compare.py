@@ -36,7 +36,7 @@ def run(options: Options) -> int:
     """Compare, print the tables and write the folder; returns the exit code.
 
     Raises:
-        ValueError, OSError: a folder is none of a run, runs are of different commands, or the folder for the
+        ValueError, OSError: a folder is not a run's, runs are of different commands, or the folder for the
             comparison holds something else.
     """
     if len(options.runs) < 2:
@@ -54,7 +54,7 @@ def run(options: Options) -> int:
 
 
 def _check_folder(out: Path) -> None:
-    """Locks the folder; raises FileExistsError where it holds something that is no comparison."""
+    """Locks the folder; raises FileExistsError if it holds something other than a comparison."""
     lock(out)
     if holds_something(out) and (is_run(out) or not (out / _JSON).is_file()):
         what = "a run" if is_run(out) else "other files"

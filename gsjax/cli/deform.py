@@ -1,4 +1,4 @@
-"""`gsjax deform`: a scene that deforms, seen by one moving camera, and what is what in it."""
+"""`gsjax deform`: reconstruct a deforming scene seen by one moving camera, and learn what is what in it."""
 
 from dataclasses import field, fields, make_dataclass
 from typing import Annotated
@@ -23,7 +23,7 @@ __all__ = ["HELP", "Options", "options_for", "run"]
 
 def options_for(arguments: list[str]) -> tuple[type[Options], list[str]]:
     """The options, with the defaults of the preset named in the arguments, and the arguments themselves: if
-    none is named, the recording decides, and they are read again."""
+    none is named, the recording determines the preset, and they are parsed again."""
     kind, arguments = preset_options(Options, arguments, "deform", PRESETS)
     words = field(default=tuple(arguments), kw_only=True)
     hidden = ("words", Annotated[tuple[str, ...], tyro.conf.Suppress], words)

@@ -56,8 +56,8 @@ class Options(Common, Overwriting):
 
 @releasing_locks()
 def run(options: Options) -> int:
-    """Edit a run, and film the result; returns the exit code. A film that Ctrl-C stops can be watched so far.
-    Without edits, say which parts there are.
+    """Edit a run, and film the result; returns the exit code. A film stopped by Ctrl-C can be watched up to
+    there. Without edits, list the parts.
 
     Raises:
         ValueError, OSError: there is no such run or part, or the edits cannot be read or applied.
@@ -94,7 +94,7 @@ def run(options: Options) -> int:
 
 
 def _list_parts(run: Path) -> int:
-    """Say which parts there are to edit."""
+    """Print the parts that can be edited."""
     with Notes(Console(stderr=True, highlight=False)):
         saved = open_parts_run(run)
     found = parse_json((run / "metrics.json").read_text(encoding="utf-8"))

@@ -1,4 +1,4 @@
-"""`gsjax eval`: scores a scene that `gsjax fit` left, again or in more ways."""
+"""`gsjax eval`: scores the scene of a run of `gsjax fit` again, or with more metrics."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -70,9 +70,9 @@ class Chosen(NamedTuple):
     """Photographs to score.
 
     Attributes:
-        photographs: in the size in which they were fitted.
-        indices: which of them.
-        held_out: whether each of these was.
+        photographs: all photographs, at the size at which they were fitted.
+        indices: those to score.
+        held_out: whether each of these was held out.
     """
 
     photographs: Photographs
@@ -129,13 +129,14 @@ def run(options: Options) -> int:
 
 
 def scores(seen: Compared, weights: LpipsWeights | None, exposed: bool = False) -> dict[str, float | None]:
-    """How a view is seen, by the keys of `COLUMNS`; None where the picture is too small for a score, or the
-    photographs or the user lack what it takes.
+    """The scores of a view, by the keys of `COLUMNS`; None where the picture is too small for a score, or
+    where the depth or the weights that it requires are missing.
 
     Args:
         seen: the view.
         weights: of LPIPS.
-        exposed: the fit learned an exposure for each photograph, so PSNR is taken with colours matched too.
+        exposed: whether the fit learned an exposure for each photograph, so that PSNR is also taken with
+            colours matched.
     """
     pair, side = (seen.image, seen.truth, seen.mask), min(seen.covered.shape)
     perceived = weights is not None and side >= weights.least_side
@@ -193,7 +194,7 @@ def _choose(options: Options, record: Record) -> Chosen:
 def _compared(
     record: Record, gaussians: Gaussians, frames: list[Frame], behind: Color | None
 ) -> Iterator[Compared]:
-    """Each view as it is drawn; those of one size share a plan."""
+    """Each rendered view and its photograph; views of the same size share a plan."""
     fit = record.config["fit"]
     background = {"data": behind, "white": (1.0, 1.0, 1.0)}.get(fit.get("background", "data"))
     config = FitConfig(antialiased=bool(fit.get("antialiased", False)))

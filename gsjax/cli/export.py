@@ -75,7 +75,7 @@ def run(options: Options) -> int:
         look: dict[str, Any] = {"antialiased": scene.antialiased, "origin": scene.origin}
         look["labels"] = None if scene.labels is None else np.asarray(scene.labels)
         if "up" in written.options:
-            shown = rows[:1] if numbered else rows  # a page for each frame shows that alone
+            shown = rows[:1] if numbered else rows  # one page per frame shows only that frame
             look |= page_options(scene, shown, options.path)
             if options.up != "auto":
                 look["up"] = UP[options.up].tolist()

@@ -1,4 +1,4 @@
-"""`gsjax live`: follow objects while frames arrive, at the rate at which they do."""
+"""`gsjax live`: track objects while frames arrive, at the rate at which they arrive."""
 
 from gsjax.engine.track.live import Options, run
 

@@ -62,11 +62,11 @@ class FieldOptions:
     """Level to look on, in a field that was distilled with --level each: small for parts, large for things.
     auto: the level that the query fits best; for --point, small."""
     within: Annotated[str | None, tyro.conf.arg(metavar="TEXT")] = None
-    """Find only what is part of what this text finds, on the level that it fits best: `handle --within
+    """Restrict the search to what this text finds, on the level that it fits best: `handle --within
     drawer`."""
     film: bool = True
-    """Film what was found, over all frames, where the field is that of a run of `gsjax track`; its places in
-    all frames are written all the same."""
+    """For the field of a run of `gsjax track`: film what was found over all frames; its positions in all
+    frames are written in any case."""
     scene: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """Present path of the scene's file, if it was moved (default: its first path, or next to the field)."""
     images: Annotated[str | None, tyro.conf.arg(metavar="FOLDER")] = None
@@ -104,7 +104,7 @@ class Options(Common):
     """Camera (or photograph) to show the result from, and that --point refers to. Default: for a tracked run
     the first held-out camera or, without one, the first; for a field, all."""
     out: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
-    """Folder of the answer, in place of an earlier one (default: query/ in RUN)."""
+    """Folder of the answer, which replaces an earlier one (default: query/ in RUN)."""
     pictures: bool = True
     """Draw what was found, in pictures and films, which takes most of the time."""
     weights: Path | None = None
@@ -129,7 +129,7 @@ def run(options: Options) -> int:
     expect_folder(options.run)
     _expect_place(options.out)
     console, field = Console(stderr=True, highlight=False), field_of(options.run)
-    # A tracked run answers over time, but not the queries that need a field.
+    # A tracked run is queried over time, but cannot answer queries that need a field.
     tracked = (options.run / "trajectory.npz").is_file()
     needs_field = _given(options.gaussians, options.field)
     try:
@@ -157,7 +157,7 @@ def _folder(options: Options) -> Path:
 
 
 def _expect_place(out: Path | None) -> None:
-    """Raises a ValueError where an answer must not be written, as another folder would be lost."""
+    """Raises a ValueError if writing an answer there would destroy something else."""
     if out is None or not out.exists():
         return
     if out.resolve() in (here := Path.cwd().resolve(), *here.parents):
@@ -172,13 +172,13 @@ def _expect_place(out: Path | None) -> None:
 
 
 def _given(*groups: Any) -> list[str]:
-    """The options of some groups that are given."""
+    """The names of the options in these groups that are given."""
     options = [(field, getattr(group, field.name)) for group in groups for field in fields(group)]
     return [field.name.replace("_", "-") for field, value in options if value != field.default]
 
 
 def _expect_none_of(reason: str, *groups: Any) -> None:
-    """Raises a ValueError with the reason where an option of some groups is given."""
+    """Raises a ValueError with the reason if an option in these groups is given."""
     if given := _given(*groups):
         raise ValueError(f"--{given[0]}: {reason}")
 
@@ -202,7 +202,7 @@ def _expect_track(path: Path) -> None:
 
 def _query_field(options: Options, path: Path, console: Console) -> None:
     """Query a field."""
-    # Each kind of run imports what it needs alone: all together they are slow to import.
+    # Each kind of run imports only what it needs: all together are slow to import.
     from gsjax.engine.distill.query import QueryableField
 
     begun, folder = perf_counter(), _folder(options)
@@ -274,7 +274,7 @@ def _query_deformation(options: Options, console: Console) -> None:
 
 
 def _print(question: Question, unit: str, seen_in: str, info: dict[str, Any], seconds: float) -> None:
-    """What was found, in a few lines."""
+    """Print what was found, in a few lines."""
     meant = f", {info['meant']!r}" if info["meant"] and info["meant"] != info["text"] else ""
     meant += f", on level {info['level']}" if info["level"] else ""
     against = f", against {', '.join(info['against'][:_LISTED])}" if info["against"] else ""
@@ -301,7 +301,7 @@ def _print(question: Question, unit: str, seen_in: str, info: dict[str, Any], se
 
 
 def _place(center: Float[np.ndarray, "3"], unit: str, frame: int | None) -> str:
-    """A place in words, and the frame in which it is one."""
+    """A position as text, with the frame that it is in."""
     return ", ".join(f"{x:.3f}" for x in center) + unit + ("" if frame is None else f" in frame {frame}")
 
 
@@ -331,7 +331,7 @@ def _numbers(option: str, text: str | None, wanted: str) -> Any:
     """Numbers with commas between them, as many as `wanted` ("X,Y") names; None without a text.
 
     Raises:
-        ValueError: it is none of these.
+        ValueError: the text is not of this form.
     """
     if text is None:
         return None

@@ -1,4 +1,4 @@
-"""Queries of a run for the viewer's page."""
+"""Queries of a run from the viewer's page."""
 
 import re
 import threading
@@ -13,11 +13,11 @@ from gsjax.io.atomic import write_new
 from gsjax.methods.query import Prompt
 from gsjax.viz.viewer import Answer, Asking
 
-_EXTRACTED = "extracted"  # folder of parts that the viewer saved, in that of the run
+_EXTRACTED = "extracted"  # folder, within the run's, of the parts that the viewer saved
 
 
 def asking_of(run: Queryable) -> Asking:
-    """Queries of a run for the viewer's page, which saves to `extracted/` in the run's folder."""
+    """The queries that the viewer's page offers for a run; it saves to `extracted/` in the run's folder."""
     one_by_one = threading.Lock()
 
     def answered(words: str, question: Question, frame: int, prompt: Prompt) -> Answer:

@@ -21,8 +21,8 @@ class Options(Common):
     """Only these workloads: a name, its part before the first hyphen (garden), or a pattern (ball-1e6*). With
     --starts, only these commands."""
     starts: bool = False
-    """Measure instead how long each command takes until its first update and in all: without and with
-    compiled programs from before. It takes ten minutes or so."""
+    """Instead, measure how long each command takes until its first update and in total, without and with
+    previously compiled programs. It takes about ten minutes."""
     quick: bool = False
     """Use small scenes and few calls of each: under two minutes."""
     repeats: int | None = None
@@ -50,5 +50,5 @@ def run(options: Options) -> int:
     folder = str(Path.cwd())
     if folder not in sys.path:  # a console script does not search the working directory
         sys.path.insert(0, folder)
-    import_module("gsjax.viz")  # with it, the suite may import matplotlib whatever MPLBACKEND says
+    import_module("gsjax.viz")  # then the suite can import matplotlib whatever MPLBACKEND says
     return import_module("benchmarks.starts" if options.starts else "benchmarks.suite").run(options)

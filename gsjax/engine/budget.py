@@ -1,4 +1,4 @@
-"""The time that a command was given by --minutes: for its steps, then for scores, pictures and the report."""
+"""The time budget of a command (--minutes): for its steps, then for scores, pictures and the report."""
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from time import perf_counter
@@ -12,33 +12,33 @@ from gsjax.engine.messages import Notes
 Item = TypeVar("Item")
 REPORT_S = 3.0
 """Seconds for the last files and the report."""
-_REST = 0.15  # of the time, at most, that is kept for what follows the steps
-_LEAST = 0.25  # of the time, at least, that steps are given
-_LOADING_S = 2.5  # in which a program starts, before it knows its arguments
+_REST = 0.15  # largest share of the time that is kept for what follows the steps
+_LEAST = 0.25  # smallest share of the time that steps are given
+_LOADING_S = 2.5  # in which the program starts, before it has parsed its arguments
 
 
 class Budget:
     """The minutes of a command, from its beginning to its end.
 
     Attributes:
-        minutes: for all of it; None for no limit.
-        rest_s: the most seconds there are for what follows the steps (15 % of all) -> those that it will
-            take, as far as is known.
-        hurried: whether only what is necessary is still to be done, as after Ctrl-C.
+        minutes: for the whole command; None for no limit.
+        rest_s: the most seconds available for what follows the steps (15 % of all) -> the seconds that it is
+            expected to take.
+        hurried: whether only what is necessary should still be done, as after Ctrl-C.
     """
 
     def __init__(self, minutes: float | None, begun: float):
         """
         Args:
-            minutes: for all of the command; None for no limit.
-            begun: its beginning, by `time.perf_counter`.
+            minutes: for the whole command; None for no limit.
+            begun: its start time, by `time.perf_counter`.
         """
         self.minutes, self.hurried = minutes, False
         self.rest_s: Callable[[float], float] = lambda most: most
         self._begun, self._steps, self._most = begun - _LOADING_S, begun, 0.0
 
     def expect_more_than(self, earlier: float) -> None:
-        """Raises ValueError if the steps of the run to resume, in seconds, took all the time."""
+        """Raises ValueError if the `earlier` seconds of steps, of the run to resume, used up all the time."""
         if self.minutes is not None and earlier >= 60 * self.minutes:
             raise ValueError(
                 f"--minutes {self.minutes:g}: the steps of the run to resume took {_clock(earlier)} already; "
@@ -46,11 +46,11 @@ class Budget:
             )
 
     def begin_steps(self, earlier: float, console: Console) -> None:
-        """The steps begin now, and what they may take is said.
+        """Start the time for steps, and print how the time is divided.
 
         Args:
             earlier: seconds of steps in the run that is resumed; they count.
-            console: to say it on.
+            console: where to print.
         """
         self._begun -= earlier
         self._steps = perf_counter() - earlier
@@ -69,12 +69,12 @@ class Budget:
 
     @property
     def left(self) -> float:
-        """Seconds until the command is to end."""
+        """Seconds until the command has to end."""
         return float("inf") if self.minutes is None else 60 * self.minutes - self.used
 
     @property
     def share(self) -> float:
-        """The share of the time for steps that is used, which never falls; 0 without a limit."""
+        """The used share of the time for steps, which never decreases; 0 without a limit."""
         if self.minutes is not None:
             self._most = max(self._most, (perf_counter() - self._steps) / self._given_s())
         return self._most
@@ -96,18 +96,18 @@ class Budget:
         return self.share >= 1
 
     def allows(self, seconds: float, keep: float = REPORT_S) -> bool:
-        """Whether there is time for something that is not necessary, with `keep` seconds left after it."""
+        """Whether there is time for an optional task of `seconds`, with `keep` seconds left after it."""
         return not self.hurried and bool(self.left >= seconds + keep)
 
     def guarded(self, items: Iterable[Item], keep: float) -> Iterator[Item]:
-        """The items, all of which are needed.
+        """Yields the items, all of which are needed.
 
         Args:
-            items: what is worked on, one after another.
+            items: what is processed, one after another.
             keep: seconds to be left after them.
 
         Raises:
-            TimeoutError: they take longer than there is time.
+            TimeoutError: the time runs out before all are processed.
         """
         for item in items:
             if self.left < keep:
@@ -115,8 +115,8 @@ class Budget:
             yield item
 
     def affordable(self, items: Sequence[Item]) -> Iterator[Item]:
-        """The items in their order: all, or as many of them, evenly spread, as there is time for before the
-        report, and at least one. The first may take longer than others, as it compiles."""
+        """Yields the items in order: all of them, or as many as there is time for before the report, evenly
+        spread and at least one. The first may take longer than the others, because it compiles."""
         took = 0.0
         for item in items[:2]:
             begun = perf_counter()

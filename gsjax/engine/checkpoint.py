@@ -1,5 +1,5 @@
-"""What was reconstructed, read back: `gsjax.save` and `gsjax.load`, a tick of any method in one file, without
-a template; and `gsjax.open_scene` and `gsjax.open_field`, what commands made."""
+"""Saving and reopening results. `gsjax.save` and `gsjax.load` store a tick of any method in one file and read
+it back without a template; `gsjax.open_scene` and `gsjax.open_field` open what commands wrote."""
 
 import dataclasses
 import os
@@ -15,11 +15,11 @@ if TYPE_CHECKING:
     from gsjax.viz.viewer import Viewable
 else:
     DistillResult = Any
-    Viewable = Any  # slow to import, as all that shows a scene is
+    Viewable = Any  # slow to import, like everything that shows a scene
 
 
 def save(path: str | os.PathLike, now: Tick) -> None:
-    """Write the state of a method, its configuration and its result; atomic.
+    """Write the state of a method, its configuration and its result to a file, atomically.
 
     Args:
         path: the file; `.npz` by convention.
@@ -61,17 +61,17 @@ def load(path: str | os.PathLike) -> Tick:
 
 
 def open_scene(path: str | os.PathLike) -> Viewable:
-    """The scene of a run of the command line over time; or that of a file of Gaussians, or of a folder of
-    numbered ones. `scene.at(frame)` is one frame, for `gsjax.render`, relative to `scene.origin` where
-    the data lie far from 0; `scene.num_frames` counts them, and `scene.labels` has a label of each Gaussian.
-    What is odd is warned of.
+    """The scene, over time, of a run of the command line, of a file of Gaussians, or of a folder of numbered
+    files. `scene.at(frame)` is one frame, for `gsjax.render`, relative to `scene.origin` if the data lie far
+    from 0; `scene.num_frames` is the number of frames, and `scene.labels` has the label of each Gaussian.
+    Problems that do not prevent opening it are issued as warnings.
 
     Args:
         path: the folder of a run, the file, or the folder of files.
 
     Raises:
         FileNotFoundError: there is nothing at `path`, or no scene.
-        ValueError: a file is not as it was written, or holds no Gaussians.
+        ValueError: a file has unexpected contents, or holds no Gaussians.
     """
     from rich.console import Console
 
@@ -86,15 +86,16 @@ def open_scene(path: str | os.PathLike) -> Viewable:
 
 
 def open_field(path: str | os.PathLike, scene: str | os.PathLike | None = None) -> DistillResult:
-    """The field that `gsjax distill` made, with the Gaussians of its scene. What is odd is warned of.
+    """The field that `gsjax distill` made, with the Gaussians of its scene. Problems that do not prevent
+    opening it are issued as warnings.
 
     Args:
-        path: the field's folder, or the run that it is in.
-        scene: present path of the scene's file, if it was moved.
+        path: the field's folder, or that of the run that contains it.
+        scene: current path of the scene's file, if it was moved.
 
     Raises:
         FileNotFoundError: there is no field, or its scene is missing.
-        ValueError: a file has other contents, or the field does not fit the scene.
+        ValueError: a file has unexpected contents, or the field does not fit the scene.
     """
     from rich.console import Console
 

@@ -1,7 +1,7 @@
-"""The loop over steps of four of the methods. It owns compiler options, the donation of buffers, overflow,
-compile time, random keys, headroom, the guard against divergence, and when Ctrl-C may interrupt. The tracker,
-which is given a new frame at every step, donates nothing and keeps to a budget, has a loop of its own with
-the same parts (`gsjax.engine.track.tracking`).
+"""The optimisation loop of all methods but the tracker. It takes care of compiler options, buffer donation,
+capacity overflow, compile time, random keys, headroom, the guard against divergence, and when Ctrl-C may
+interrupt. The tracker gets a new frame at every step, donates nothing and can keep to a time budget, so it
+has a loop of its own, built from the same components (`gsjax.engine.track.tracking`).
 
     ticks = drive(method, problem, run)
     for now in ticks:
@@ -31,27 +31,27 @@ from gsjax.rasterize.plan import HEADROOM
 
 
 class Clock:
-    """Wall time since its creation, with compiling apart."""
+    """Wall-clock time since its creation, with compile time measured separately."""
 
     def __init__(self):
         self._begun, self._compiled = perf_counter(), compile_seconds()
 
     def read(self) -> tuple[float, float]:
-        """Seconds without compiling, and seconds of tracing and compiling."""
+        """Seconds excluding compilation, and seconds of tracing and compiling."""
         compiling = compile_seconds() - self._compiled
         return max(0.0, perf_counter() - self._begun - compiling), compiling
 
 
 @dataclass(frozen=True, eq=False)
 class Tick:
-    """A method after one more step.
+    """The state of a method after one more step.
 
     Attributes:
-        method: the method, with its configuration; of the tracker, an object with `config` and `result`.
-        problem: what does not change; None after `gsjax.load`.
-        run: the state to continue from. The next step donates its arrays: copy what is to be kept.
+        method: the method, with its configuration; for the tracker, an object with `config` and `result`.
+        problem: the fixed inputs of all steps; None after `gsjax.load`.
+        run: the state to continue from. The next step donates its arrays: copy any that you keep.
         info: losses and diagnostics of this step by name, on the device; see `gsjax.optim.step`.
-        seconds: wall time of the step, without compiling.
+        seconds: wall-clock time of the step, without compiling.
         compile_seconds: time of tracing and compiling.
         progress: progress of the schedule before this step, 0 to 1.
     """
@@ -84,18 +84,18 @@ class Tick:
         return self.method.result(self.problem, self.run)
 
 
-_SKIPPED = 10  # steps in a row, after which custom losses are suspected
+_SKIPPED = 10  # consecutive skipped steps after which custom losses are suspected
 
 UPDATE = "/gsjax/update"
-"""Event of `jax.monitoring` after each tick, with its seconds, for those who listen."""
+"""`jax.monitoring` event recorded after each tick, with its duration in seconds."""
 
 
 COMPILING = "/gsjax/compiling"
-"""Event of `jax.monitoring` as a step begins to compile: the first, and those with arrays of other shapes."""
+"""`jax.monitoring` event recorded when a step begins to compile: the first, and any with new array shapes."""
 
 
 def announced(tick: Tick) -> Tick:
-    """The tick, after its event."""
+    """Record the event of a tick, and return the tick."""
     jax.monitoring.record_event_duration_secs(UPDATE, tick.seconds)
     return tick
 
@@ -123,7 +123,7 @@ class Drive(Iterator[Tick]):
         self._headroom = headroom
         self._losses: ExtraLosses = getattr(method, "extra_losses", ())
         self._advance = UpToDate(self._losses, partial(_compiled, method))
-        self._skipped = 0  # steps in a row
+        self._skipped = 0  # consecutive steps
         self._key = jax.random.key(method.config.seed)
 
     def __iter__(self) -> "Drive":
@@ -137,12 +137,12 @@ class Drive(Iterator[Tick]):
 
     @property
     def result(self) -> Any:
-        """The present result, also before the first step."""
+        """The current result, available before the first step too."""
         return self.method.result(self.problem, self.run) if self.tick is None else self.tick.result
 
     def settle(self) -> None:
-        """End at the best parameters, if the latest are worse. The last of all steps does so by itself; a
-        run that ends earlier has to be told to."""
+        """Return to the best parameters if the latest are worse. The last step of all does so itself; call
+        this if a run ends earlier."""
         guard = self.run.guard
         if guard is None:
             return
@@ -186,23 +186,23 @@ def drive(
     progress: Callable[[int], float] | None = None,
     headroom: float = HEADROOM,
 ) -> Drive:
-    """Run a method step by step. The same run, problem and progress give the same bits, also if the run is
-    resumed.
+    """Run a method step by step. The same run, problem and progress give bitwise identical results, even if
+    the run is resumed.
 
     Args:
         method: the method.
         problem: from the method's `start`.
-        run: from `start`, or of an earlier tick. Its arrays are donated to the first step.
-        progress: step -> progress of the schedule before that step, 0 to 1; it ends at 1 (default: the
-            fraction of the method's steps).
+        run: from `start`, or from an earlier tick. Its arrays are donated to the first step.
+        progress: step -> progress of the schedule before that step, 0 to 1; the loop ends at 1 (default:
+            the fraction of the method's steps).
         headroom: capacity of a plan after an overflow, relative to what was needed.
     """
     return Drive(method, problem, run, progress, headroom)
 
 
 def _guard_of(before: Run, run: Run) -> Guard:
-    """The guard of the next step. It begins anew where losses can no longer be compared: with other
-    parameters or constants, or where `between` dropped it. One that rests goes on to rest."""
+    """The guard for the next step. It starts afresh when losses are no longer comparable: when parameters or
+    constants were replaced, or `between` dropped it. A resting guard keeps resting."""
     if run.guard is not None and run.guard.is_resting:
         return run.guard
     old, new = (jax.tree.leaves((one.params, one.kept)) for one in (before, run))
@@ -211,7 +211,7 @@ def _guard_of(before: Run, run: Run) -> Guard:
 
 
 def warn_of_lost(after: Tick, extra_losses: ExtraLosses) -> None:
-    """Warn if a run that goes on was trained with custom losses that it is not given now."""
+    """Warn if a continued run was trained with custom losses that are not given now."""
     lost = sorted({*(after.info.get("extra") or ())} - {*named_losses(extra_losses)})
     if lost:
         warnings.warn(
@@ -236,8 +236,8 @@ def _warn_of_skipped(info: dict[str, Any]) -> None:
 
 @lru_cache(maxsize=4)
 def _compiled(method: Method, outside: tuple) -> Callable:
-    """The jitted update of a method, cached so that a second problem like the first starts at once. What its
-    custom losses take from `outside` is compiled in."""
+    """The jitted update of a method, cached so that a similar second problem starts at once. What the custom
+    losses capture from `outside` is compiled in as constants."""
     update = method.step.update
 
     def advance(params, state, share, batch, step, key):

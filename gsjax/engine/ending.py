@@ -1,4 +1,4 @@
-"""How a run ends: what metrics.json says of that, its last files, its last lines, the program's exit code."""
+"""The end of a run: its status in metrics.json, its last files, the printed summary, and the exit code."""
 
 from collections.abc import Callable
 from typing import Any
@@ -11,11 +11,11 @@ from gsjax.engine.terminal import print_summary
 
 
 def ended(stopped: BaseException | None, *, report: bool = True) -> dict[str, Any]:
-    """The part of metrics.json that says whether a run came to its end.
+    """The part of metrics.json that says whether a run was completed.
 
     Args:
         stopped: what ended it early, or None.
-        report: whether it writes a report last, without which it is not finished.
+        report: whether it writes a report last; it is unfinished without one.
     """
     why = None if stopped is None else reason(stopped)
     return {"complete": stopped is None, "report": report, "stopped": why}
@@ -24,12 +24,12 @@ def ended(stopped: BaseException | None, *, report: bool = True) -> dict[str, An
 def finish(
     folder: RunFolder, found: dict[str, Any], summarize: Callable[[RunFolder, dict[str, Any]], Summary]
 ) -> None:
-    """Write metrics.json, then the report, by which a run is finished, and print the summary. A run that is
-    complete keeps nothing to resume from.
+    """Write metrics.json, then the report, which marks the run as finished, and print the summary. A complete
+    run keeps nothing to resume from.
 
     Args:
         folder: of the run.
-        found: what metrics.json holds.
+        found: the contents of metrics.json.
         summarize: folder, metrics -> the summary; it may draw plots into the folder.
     """
     folder.write_metrics(found)

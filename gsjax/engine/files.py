@@ -1,5 +1,5 @@
-"""Files of a run read back, whichever command made it: arrays, the scene, the recording. `again` is the
-advice of error messages if a file is not as it was written."""
+"""Reading back the files of a run, whichever command made it: arrays, the scene, the recording. `again` is
+the advice that error messages give if a file has unexpected contents."""
 
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -51,7 +51,7 @@ def read_arrays(file: Path, wanted: Sequence[str], again: str) -> dict[str, np.n
 def _expect_arrays(file: Path, arrays: Mapping[str, np.ndarray], wanted: Iterable[str], again: str) -> None:
     missing = [name for name in wanted if name not in arrays]
     if missing:
-        found = brief(", ".join(arrays)) or "an array without a name"  # which is what an .npy file holds
+        found = brief(", ".join(arrays)) or "an array without a name"  # as in an .npy file
         raise ValueError(f"{file}: expected an array {missing[0]}, found {found}; {again}")
 
 
@@ -63,7 +63,7 @@ def check_arrays(
     Args:
         file: their file, for the error.
         arrays: the arrays by name.
-        shapes: shape of each array to check. A letter stands for one size throughout, at least 1.
+        shapes: shape of each array to check. A letter stands for the same size throughout, at least 1.
         again: what to do if one is wrong, for the error.
 
     Returns:
@@ -102,12 +102,12 @@ def write_scene(
     origin: Float[np.ndarray, "3"] | None = None,
     antialiased: bool = False,
 ) -> None:
-    """Write Gaussians as a PLY that any viewer of 3DGS reads: without their features.
+    """Write Gaussians, without their features, as a PLY that any 3DGS viewer reads.
 
     Args:
         path: the file.
         gaussians: the Gaussians.
-        labels: their labels, for a file beside it.
+        labels: their labels, written to a file beside it.
         origin, antialiased: as for `write_ply`.
     """
     if gaussians.features is not None:
@@ -129,15 +129,15 @@ def read_drawable(file: Path) -> tuple[Gaussians, SceneReport]:
 
 
 def read_frames(files: Sequence[Path]) -> Iterator[tuple[Gaussians, SceneReport]]:
-    """The Gaussians of each file of a scene that moves, and what else it held. What is said of an origin is
-    said of the first file alone.
+    """Yields the Gaussians of each file of a moving scene, and what else it held. The warning about an origin
+    is given for the first file only.
 
     Args:
-        files: of its frames, in their order.
+        files: the files of its frames, in order.
 
     Raises:
         FileNotFoundError, SceneError: as for `read_gaussians`.
-        ValueError: a file holds none, or other numbers of Gaussians or harmonics than the first.
+        ValueError: a file holds none, or not as many Gaussians or harmonics as the first.
     """
     if missing := missing_numbers(files):
         some = shortened(map(str, missing), 5)
@@ -187,7 +187,7 @@ def read_scene(
 
 
 def about_scene(recording: Recording, origin: Float[np.ndarray, "3"] | None) -> Recording:
-    """A recording relative to the origin of its scene."""
+    """The recording with coordinates relative to the origin of its scene."""
     tracked, judged = (relative_to_origin(each, origin) for each in (recording.tracked, recording.judged))
     return replace(recording, tracked=tracked, judged=judged)
 
@@ -198,7 +198,7 @@ def reopen(
     also: Callable[[Mapping[str, Any]], Any] = lambda settings: None,
     opened: Opener | None = None,
 ) -> tuple[Recording, Any]:
-    """The recording of a run, by its config.yml, and something else of its settings.
+    """The recording of a run, opened as its config.yml says, and something else from its settings.
 
     Args:
         config: the file.
@@ -220,7 +220,7 @@ def reopen(
         if not isinstance(scale, int | float):
             raise TypeError(f"scale: {scale!r}")
         dataset, cameras, frames = (settings[name] for name in _SETTINGS)
-        held_out = settings.get("eval_cameras") or ()  # which not all commands have
+        held_out = settings.get("eval_cameras") or ()  # not all commands have this option
         return open_recording(dataset, cameras, held_out, frames, read, float(scale), opened), wanted
     except (KeyError, TypeError, AttributeError) as error:
         listed = ", ".join(_SETTINGS)

@@ -1,4 +1,4 @@
-"""The mask of the first frame, which names the objects that are followed."""
+"""The mask of the first frame, which defines the objects to track."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -17,15 +17,15 @@ from gsjax.engine.messages import Notes
 from gsjax.engine.recording import Recording
 
 KEPT_MASK = "mask.png"
-"""Where a run keeps the picture that named its objects."""
+"""File in which a run keeps the picture that defined its objects."""
 
 PICTURE = "picture"
-OWN_MASKS = ("files", "shapes")  # sources whose values are the recording's
-_MOST_OBJECTS, _LEAST_PIXELS = 100, 10  # of a picture
+OWN_MASKS = ("files", "shapes")  # sources whose values are the recording's own
+_MOST_OBJECTS, _LEAST_PIXELS = 100, 10  # in a picture of labels
 
 
 class FirstMask(NamedTuple):
-    """Labels of one camera's first image, the only ones that a tracker is given.
+    """Labels of one camera's first image, the only ones that the tracker is given.
 
     Attributes:
         labels: [H, W]; 0 is background. None if objects are given as shapes.
@@ -51,7 +51,7 @@ def first_mask(tracked: Sequence, camera: int | None, source: str | Path, scale:
         camera: id of the mask's camera; None takes the first that has masks.
         source: "files", "segment", or "auto": files, else the shapes of the recording, else the segmenter; or
             the path of a picture of labels.
-        scale: size of the tracked pictures relative to the original, which a picture of labels may have.
+        scale: size of the tracked pictures relative to the originals; labels may have either size.
 
     Raises:
         ValueError: the camera is not tracked, or has no mask; or the picture does not fit.
@@ -88,12 +88,12 @@ def first_mask(tracked: Sequence, camera: int | None, source: str | Path, scale:
 
 
 def placed(masks: str | Path) -> str | Path:
-    """The source of a first mask, as it is found from any directory."""
+    """The source of a first mask, with an absolute path if it is a picture."""
     return masks.expanduser().resolve() if isinstance(masks, Path) else masks
 
 
 def without_truth(recording: Recording) -> Recording:
-    """A recording whose objects are those of a picture: what it knows of its own is left out."""
+    """The recording without its own masks, ground truth and label names: a picture defines the objects."""
     tracked, judged = (
         replace(sequence, load_mask=None, truth=None, label_names={})
         for sequence in (recording.tracked, recording.judged)
@@ -102,7 +102,7 @@ def without_truth(recording: Recording) -> Recording:
 
 
 def _from_picture(tracked: Sequence, camera: int | None, path: Path, scale: float) -> FirstMask:
-    """What a user gives: labels of the pictures' size, or of their original one."""
+    """The first mask from a user's picture of labels, of the size of the tracked or original pictures."""
     if not (path.is_file() and is_picture(path)):
         what = f"the folder {path}" if path.is_dir() else f"{'' if path.exists() else 'no '}{path}"
         raise ValueError(f"--masks: expected auto, files, segment or a picture of labels (PNG), found {what}")
@@ -154,8 +154,8 @@ def label_names(recording: Recording, source: str) -> dict[int, str]:
 
 
 def warn_of_missing(recording: Recording, mask: FirstMask, scene_ids: tuple[int, ...], notes: Notes) -> None:
-    """Warn of objects that will not be tracked: true objects without a label in the mask, and labels without
-    Gaussians.
+    """Warn about objects that will not be tracked: true objects without a label in the mask, and labels
+    without Gaussians.
 
     Args:
         recording: the recording, with or without ground truth.

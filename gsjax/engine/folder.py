@@ -1,4 +1,4 @@
-"""The folder of a run: its files, and when it may be written over."""
+"""The folder of a run: its files, and when it may be overwritten."""
 
 import dataclasses
 import enum
@@ -20,34 +20,34 @@ from gsjax.io.parsed import parse_json, parse_yaml
 from gsjax.io.scenes import is_scene
 from gsjax.io.sequences import scenes_in_words, scenes_within
 
-DEFORMATION = "deformation.npz"  # the scene of a run of `gsjax deform`, over time
+DEFORMATION = "deformation.npz"  # the scene of a run of `gsjax deform` over time
 _WRITTEN = (
     *("config.yml", "metrics.json", "metrics.jsonl", "report.html", "trajectory.npz", "scene.ply"),
     *("cameras.npz", "poses.npz", "parts.npz", "field.npz", DEFORMATION, "video_*.mp4", ".*.partial*"),
     *("canonical", "renders", "plots", "query", "grasp", "eval", "edit", "field", "tensorboard", "test"),
     *("scene_labels.npz", "mask.png", "resume"),
 )
-"""All that a run, and what is made from it, writes into its folder; `screenshots` are kept."""
+"""All that a run, and commands that use the run, write into its folder; `screenshots` are kept."""
 _VALUABLE = ("metrics.json", "trajectory.npz", "scene.ply", "canonical/scene.ply", "field.npz", DEFORMATION)
 """Results that make an unfinished run worth keeping."""
 _RESUMED = ("resume/*", "canonical/resume/*", "canonical/scene.ply")
-"""What a run resumes from; `gsjax parts` contains a fit, which may be all that is there."""
+"""What a run resumes from; a run of `gsjax parts` contains a fit, which may be all that is there."""
 OF_QUERY = ("query.json", "selection.npz", "over_time.npz", "masks", "frames", "video.mp4", "overview.png")
 OF_QUERY += ("object.ply", "without.ply", "recolored.ply", "moved.ply", f"*{ENDING}")
 """The files that `gsjax query` writes."""
-SCRIPT = "edit.yaml"  # the edits of a film of `gsjax edit`, whose folder it marks
+SCRIPT = "edit.yaml"  # the edits of a film of `gsjax edit`; it marks the film's folder
 _NOBODYS = (LOCK, ".*.partial*", ".DS_Store", "._*", ".nfs*", ".directory")
-"""Hidden files that no one misses: of a command that was killed, and of file managers and file systems."""
+"""Hidden files that may be deleted: of killed commands, and of file managers and file systems."""
 _ANEW = "restore it, or replace the run with --overwrite"
-SIGNATURE = "# gsjax run"  # the first line of config.yml: other programs write files of that name too
+SIGNATURE = "# gsjax run"  # the first line of config.yml, because other programs write files of that name too
 
 
 def read_values(file: Path, parse: Callable[[str], Any]) -> dict[str, Any]:
-    """What a run stored, by name.
+    """Read a file in which a run stored named values.
 
     Args:
         file: the file.
-        parse: its text, `parse_json` or `parse_yaml`.
+        parse: parser of its text, `parse_json` or `parse_yaml`.
 
     Raises:
         ValueError: the file holds something else.
@@ -73,7 +73,7 @@ def is_of_run(file: Path) -> bool:
 
 
 def is_finished(folder: Path) -> bool:
-    """Whether a run that was not stopped has written everything: its report comes last."""
+    """Whether a run was not stopped and has written everything: its report comes last."""
     metrics = folder / "metrics.json"
     if not metrics.is_file():
         return False
@@ -83,7 +83,7 @@ def is_finished(folder: Path) -> bool:
 
 
 def is_resumable(folder: Path) -> bool:
-    """Whether a run has left what it can be resumed from."""
+    """Whether a run left anything to resume from."""
     return any(any(folder.glob(pattern)) for pattern in _RESUMED)
 
 
@@ -124,7 +124,7 @@ def expect_dataset(path: str) -> None:
 
 
 class RunFolder:
-    """A run on disk. Files are replaced whole, so a run that was stopped is as readable as a finished one.
+    """A run on disk. Files are replaced atomically, so a stopped run is as readable as a finished one.
 
         RUN/
           config.yml              the settings, written first; its first line marks the folder as a run's
@@ -162,12 +162,12 @@ class RunFolder:
     """
 
     def __init__(self, path: str | Path, *, overwrite: bool = False, resume: bool | None = False):
-        """Claim the folder. Only when this run writes its settings is the folder made, and what an earlier
-        run left in it removed.
+        """Claim the folder. It is created, and what an earlier run left in it is removed, only when this run
+        writes its settings.
 
         Args:
             path: a folder that does not exist, is empty, or holds an earlier run.
-            overwrite: replace an earlier run although it is finished, or could be resumed. Files that no run
+            overwrite: replace an earlier run even if it is finished or could be resumed. Files that no run
                 writes are kept.
             resume: keep an unfinished run. None for commands that cannot resume.
 
@@ -195,8 +195,8 @@ class RunFolder:
 
     @classmethod
     def locked(cls, path: Path, *, overwrite: bool = False, resume: bool | None = False) -> "RunFolder":
-        """Claim the folder while no other process writes into it, until the command ends
-        (`gsjax.engine.locks`). A run around it, as around a field, is not replaced meanwhile.
+        """Claim the folder, and lock it against other writers until the command ends (`gsjax.engine.locks`).
+        If it lies within another run, as a field does, that run cannot be replaced meanwhile.
 
         Args:
             path, overwrite, resume: as for `RunFolder`.
@@ -211,7 +211,7 @@ class RunFolder:
         return cls(path, overwrite=overwrite, resume=resume)
 
     def _claim(self, overwrite: bool, resume: bool | None) -> None:
-        # config.yml is written first, so a folder without it is no run's: delete nothing there.
+        # config.yml is written first, so a folder without it is not a run: delete nothing there.
         if not is_run(self.path):
             raise FileExistsError(
                 f"{self.path}: expected a new folder, an empty one or one of a run (whose config.yml begins "
@@ -267,7 +267,7 @@ class RunFolder:
             self.path.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise type(error)(f"{self.path}: cannot make this folder ({error.strerror})") from error
-        self.report.unlink(missing_ok=True)  # of an incomplete run: it is finished when it has its own
+        self.report.unlink(missing_ok=True)  # of an incomplete run: a report marks a run as finished
         with atomic_write(self.config) as temporary:
             temporary.write_text(f"{SIGNATURE}\n{text}", encoding="utf-8")
 
@@ -276,8 +276,8 @@ class RunFolder:
         return flattened(read_values(self.config, parse_yaml)).get(name)
 
     def check_config(self, config: Any, *, but: tuple[str, ...]) -> None:
-        """Raises ValueError if config.yml differs from `config` in settings other than `but`, or those that
-        an earlier version did not have."""
+        """Raises ValueError if config.yml differs from `config` in settings other than `but`; those that the
+        version that wrote it did not have are ignored."""
         stored = flattened(read_values(self.config, parse_yaml))
         given = flattened(plain(dataclasses.asdict(config)))
         names = [name for name in stored if name.split(".")[0] not in but]
@@ -300,9 +300,9 @@ class RunFolder:
 
 @contextmanager
 def replaced_folder(path: Path, written: Sequence[str]) -> Iterator[Path]:
-    """A new folder to write into, which replaces what gsjax left at `path` earlier when the block succeeds.
-    Until then, and after an exception (Ctrl-C too), the earlier folder stays as it was. Meanwhile no other
-    process may write a folder of that name, or replace the run that it is in.
+    """A new folder to write into. If the block succeeds, it replaces what gsjax left at `path` earlier; until
+    then, and after an exception (Ctrl-C too), the earlier folder stays as it was. Meanwhile no other process
+    can write a folder of that name, or replace the run that contains it.
 
     Args:
         path: the folder.
@@ -356,12 +356,12 @@ def expect_ours(path: Path, written: Sequence[str]) -> Path:
 
 
 def holds_something(folder: Path) -> bool:
-    """Whether there is more in a folder than the lock of a command that writes there, or was killed."""
+    """Whether a folder holds anything but the lock of a command that is running or was killed."""
     return any(entry.name != LOCK for entry in folder.iterdir())
 
 
 def flattened(settings: Mapping[str, Any], within: str = "") -> dict[str, Any]:
-    """Nested settings by the names of their options on the command line: fit.start.count."""
+    """Nested settings, keyed by their option names on the command line: fit.start.count."""
     flat: dict[str, Any] = {}
     for name, value in settings.items():
         flat |= flattened(value, f"{within}{name}.") if isinstance(value, Mapping) else {within + name: value}

@@ -1,4 +1,4 @@
-"""What a dataset, a run or a file of Gaussians holds, as `gsjax info` prints it."""
+"""The contents of a dataset, a run or a file of Gaussians, as printed by `gsjax info`."""
 
 from collections import Counter
 from collections.abc import Callable, Iterable
@@ -49,7 +49,7 @@ class Options(Common, Reading):
 
 
 def run(options: Options) -> int:
-    """Print what a dataset, a run or a file of Gaussians holds.
+    """Print the contents of a dataset, a run or a file of Gaussians.
 
     Raises:
         DataError, ValueError: it cannot be read, or a picture cannot be written in that format.
@@ -96,10 +96,10 @@ def run(options: Options) -> int:
 
 
 def _scene_at(path: Path) -> Callable[[], dict[str, str]] | None:
-    """Describes the run, the frames or the file of Gaussians at a path; None for a dataset.
+    """A function that describes the run, the frames or the file of Gaussians at a path; None for a dataset.
 
     Raises:
-        FileNotFoundError: there is nothing.
+        FileNotFoundError: nothing is there.
         ValueError: it is a file of a run.
     """
     if is_of_run(path) and not is_scene(path):
@@ -152,7 +152,7 @@ def describe_photographs(photographs: Photographs) -> dict[str, str]:
 
 
 def first_masks(sequence: Sequence) -> dict[int, np.ndarray]:
-    """The first mask of each camera that has one, by camera id; cameras without are left out."""
+    """The first mask of each camera that has one, by camera id; cameras without one are left out."""
     masks = {}
     for c, camera in enumerate(sequence.camera_ids):
         with suppress(MissingFile):

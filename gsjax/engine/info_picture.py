@@ -12,7 +12,7 @@ from gsjax.engine.photographs import split
 from gsjax.io.atomic import atomic_write
 from gsjax.scene.initialize import points_from_rgbd
 
-_DEPTHS, _PIXELS = 12, 3000  # depth images from which points are made, if there are none, and points of each
+_DEPTHS, _PIXELS = 12, 3000  # if the data have no points: depth images to use, and points from each
 _MOST_COLORS = 8
 _OTHERS = "not used"
 
@@ -21,7 +21,7 @@ Groups = Mapping[str, np.ndarray]
 
 
 def by_split(photographs: Photographs) -> Groups:
-    """The use of each photograph in `gsjax fit`, by default."""
+    """Photographs by the use that `gsjax fit` makes of them by default."""
     fitted, held_out = split(photographs, HeldOutFrames.test_every)
     others = np.setdiff1d(np.arange(photographs.num), np.concatenate([fitted, held_out]))
     groups = {"fitted": fitted, "held out": held_out, _OTHERS: others}

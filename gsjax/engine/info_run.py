@@ -1,4 +1,4 @@
-"""What a run or a film came to, as `gsjax info` prints it."""
+"""The outcome of a run or a film, as printed by `gsjax info`."""
 
 import warnings
 from pathlib import Path
@@ -13,7 +13,7 @@ from gsjax.io.parsed import parse_json
 
 
 def describe_run(path: Path) -> dict[str, str]:
-    """Facts about a run: how it ended, its data, its scores, and its scene; what is odd is warned of.
+    """Facts about a run: how it ended, its data, its scores, and its scene; problems become warnings.
 
     Raises:
         ValueError, OSError: its settings or scores cannot be read.
@@ -40,7 +40,7 @@ def describe_run(path: Path) -> dict[str, str]:
 
 
 def _facts_of_stream(path: Path) -> dict[str, str]:
-    """How a run of `gsjax live` kept up."""
+    """Facts about a run of `gsjax live`: how well it kept up."""
     metrics = path / "metrics.json"
     if not is_of_live(path):
         return {"run": f"of a command whose scores are not listed here; they are in {metrics}"}

@@ -1,4 +1,4 @@
-"""What a file of Gaussians holds, as `gsjax info` prints it."""
+"""The contents of a file of Gaussians, as printed by `gsjax info`."""
 
 import warnings
 from collections.abc import Sequence
@@ -16,11 +16,11 @@ from gsjax.io.scenes import read_gaussians
 from gsjax.scene.gaussians import Gaussians
 from gsjax.scene.origin import in_numbers, in_world
 
-_MOST_LABELS = 8  # that are listed
+_MOST_LABELS = 8  # to list
 
 
 def describe_scene(file: Path) -> dict[str, str]:
-    """Facts about the Gaussians of a file; what cannot be drawn is warned of.
+    """Facts about the Gaussians of a file; warns about those that cannot be drawn.
 
     Raises:
         SceneError: it holds no Gaussians.
@@ -55,11 +55,10 @@ def _facts_of(file: Path, gaussians: Gaussians, report: SceneReport) -> dict[str
 
 
 def describe_frames(files: Sequence[Path]) -> dict[str, str]:
-    """Facts about a scene that moves: its first frame is described, and what is wrong with others is warned
-    of.
+    """Facts about a moving scene: describes its first frame, and warns about what is wrong with the others.
 
     Args:
-        files: of its frames.
+        files: the files of its frames.
 
     Raises:
         ValueError, OSError: the first cannot be read.
@@ -80,7 +79,7 @@ def origin_fact(origin: Float[np.ndarray, "3"] | None) -> dict[str, str]:
     """The fact about data that lie far from 0; none for others.
 
     Args:
-        origin: what was taken off; None for data near 0.
+        origin: what was subtracted from positions; None for data near 0.
     """
     return {} if origin is None else {"origin": in_numbers(origin)}
 

@@ -1,9 +1,9 @@
-"""Ctrl-C that is not lost, and signals that end a run as Ctrl-C does.
+"""Makes sure that Ctrl-C is not lost, and that other signals end a run as Ctrl-C does.
 
 Python raises KeyboardInterrupt wherever it happens to be. In a finalizer, or a callback of the garbage
 collector (JAX has one) or of a weak reference, the exception is printed and dropped, and the program goes on.
-Here Ctrl-C is raised again until it gets through. So are SIGTERM, which schedulers and `kill` send, and
-SIGHUP, of a terminal that is closed: what was computed is written.
+Here Ctrl-C is raised again until it gets through. SIGTERM, sent by schedulers and `kill`, and SIGHUP, sent by
+a closing terminal, are treated the same way, so that results computed so far are written.
 """
 
 import signal
@@ -22,7 +22,7 @@ _waiting = threading.Event()  # one per process, as signals are
 _newest = ["SIGINT"]
 
 
-@no_type_check  # a wrapper that checks types could be interrupted between the call's end and its own
+@no_type_check  # a type-checking wrapper could be interrupted after the call has ended
 def shielded(call: Callable[..., Any], *arguments: Any) -> Any:
     """The result of `call`. Ctrl-C waits until it has returned, and is raised by `raise_if_interrupted` at
     the latest. It is for steps that donate the buffers they replace: an interrupt in the middle of one would
@@ -31,8 +31,8 @@ def shielded(call: Callable[..., Any], *arguments: Any) -> Any:
 
 
 def raise_if_interrupted() -> None:
-    """Raises KeyboardInterrupt if Ctrl-C is pending: between shielded calls, the timer has too little
-    time."""
+    """Raises KeyboardInterrupt if Ctrl-C is pending: the gaps between shielded calls are too short for the
+    timer."""
     if _waiting.is_set():
         _forget()
         raise KeyboardInterrupt(*_newest)
@@ -55,10 +55,11 @@ def is_uninterruptible(frame: FrameType | None) -> bool:
 
 @contextmanager
 def heard_interrupts() -> Iterator[None]:
-    """While the block runs, Ctrl-C, SIGTERM and SIGHUP raise KeyboardInterrupt, with the signal's name, where
-    it gets through, perhaps a little later.
+    """While the block runs, Ctrl-C, SIGTERM and SIGHUP raise KeyboardInterrupt with the signal's name, if
+    necessary delayed until it gets through.
 
-    A signal that is ignored (`nohup`) or handled by something else stays so. Without timers nothing changes.
+    A signal that is ignored (`nohup`) or handled by something else stays so. On systems without timers,
+    nothing changes.
     """
     heard = [signal.Signals[name] for name in _HEARD if name in signal.Signals.__members__]
     usual = (signal.default_int_handler, signal.SIG_DFL)

@@ -1,10 +1,10 @@
-"""One writer at a time in a folder.
+"""Locks that admit one writer at a time to a folder.
 
 A writer locks a file in the folder, RUN/.gsjax.lock, with `flock`. The system releases the lock when the
-process ends, however it ends: a run that was killed is free for the next writer, and nobody is misled by a
-process number that is used again. Network file systems with locks (NFS 4, SMB, Lustre mounted with `flock`)
-share them between machines. Where a file system has none, the writers that the file lists decide: those of
-this machine as long as their processes live, and those of other machines until the file is removed.
+process ends, however it ends: the folder of a killed run is free for the next writer, and a reused process id
+misleads nobody. Network file systems with locks (NFS 4, SMB, Lustre mounted with `flock`) share them between
+machines. Where a file system has none, the writers listed in the file count as holders: those on this machine
+as long as their processes live, and those on other machines until the file is removed.
 
 Commands that only add to a run, such as a query, share its lock: they keep out a run that would replace it,
 but not each other.
@@ -32,22 +32,22 @@ except ImportError:  # Windows: the list of writers decides
     fcntl = None
 
 LOCK = ".gsjax.lock"
-"""The file of a folder's lock: there while somebody writes into the folder, and after a writer was killed."""
+"""A folder's lock file: present while a process writes into the folder, and after a writer was killed."""
 _NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP, errno.EINVAL)
 _ATTEMPTS, _BETWEEN_S = 5, 0.1
 _MOST_BYTES = 2**16  # of a list of writers
-_QUOTED = 80  # characters of a name or a time in it
+_QUOTED = 80  # characters of a name or a time from it
 
 
 @dataclass(frozen=True)
 class Writer:
-    """A process that writes into a folder, as the file of the lock lists it.
+    """A process that writes into a folder, as listed in the lock file.
 
     Attributes:
-        pid: the number of the process.
+        pid: its process id.
         host: the name of its machine.
         since: the local time at which it began.
-        shared: whether others may write beside it.
+        shared: whether others may write at the same time.
     """
 
     pid: int = field(default_factory=os.getpid)
@@ -61,7 +61,7 @@ class Writer:
 
     @property
     def may_live(self) -> bool:
-        """Whether the process may be there still; nobody can tell that of another machine's."""
+        """Whether the process may still be alive; True if that cannot be checked, as on another machine."""
         if self.host != socket.gethostname() or os.name != "posix":
             return True
         try:
@@ -75,7 +75,7 @@ class Writer:
 
 @dataclass
 class _Held:
-    """A lock that this process holds, `times` over: its open file, and the folders that were made for it."""
+    """A lock that this process has taken `times` times: its open file, and the folders created for it."""
 
     file: int
     made: list[Path]
@@ -91,7 +91,7 @@ _scope: ContextVar[ExitStack] = ContextVar("the locks of a command", default=_of
 
 @contextmanager
 def releasing_locks() -> Iterator[None]:
-    """What `lock` locks in the block is released at its end; also a decorator."""
+    """Release what `lock` locks in the block when the block ends; also a decorator."""
     with ExitStack() as stack:
         token = _scope.set(stack)
         try:
@@ -101,7 +101,7 @@ def releasing_locks() -> Iterator[None]:
 
 
 def lock(folder: Path, *, shared: bool = False) -> None:
-    """Lock a folder until the end of the block of `releasing_locks`, or else of the process.
+    """Lock a folder until the end of the `releasing_locks` block or, outside one, of the process.
 
     Args, raises: as for `locked`.
     """
@@ -110,11 +110,11 @@ def lock(folder: Path, *, shared: bool = False) -> None:
 
 @contextmanager
 def locked(folder: Path, part: str = "", *, shared: bool = False) -> Iterator[None]:
-    """Lock a folder, or a part of it, while the block runs. A process may lock the same twice.
+    """Lock a folder, or a part of it, while the block runs. A process may take the same lock twice.
 
     Args:
-        folder: the folder. It is made if it is not there, and removed again if it is still empty at the end.
-        part: the part of the folder (default: all of it). The lock of a part is one of its own.
+        folder: the folder. It is created if missing, and removed again if it is still empty at the end.
+        part: the part of the folder (default: all of it). Each part has its own lock.
         shared: whether other processes may share the lock. Then a folder without write access is no error,
             and is not locked.
 
@@ -134,7 +134,7 @@ def locked(folder: Path, part: str = "", *, shared: bool = False) -> Iterator[No
         try:
             _claim(held.file, folder, path, alone)
         except BlockingIOError:
-            _flock(held.file, shared=True)  # a refused exchange has given up the shared lock
+            _flock(held.file, shared=True)  # the failed upgrade has released the shared lock
             raise
         held.writer = alone
     if held is not None:
@@ -150,7 +150,7 @@ def locked(folder: Path, part: str = "", *, shared: bool = False) -> Iterator[No
 
 
 def _taken(folder: Path, path: Path, shared: bool) -> _Held | None:
-    """The lock, which is now this process's; None where a shared one cannot be written."""
+    """Acquire the lock for this process; None if a shared one cannot be written."""
     writer, made = Writer(shared=shared), []
     while True:
         made += [place for place in path.parents if not place.exists()]
@@ -166,7 +166,7 @@ def _taken(folder: Path, path: Path, shared: bool) -> _Held | None:
         except BaseException:
             os.close(file)
             raise
-        os.close(file)  # whoever had it has removed the file meanwhile
+        os.close(file)  # its previous holder has removed the file meanwhile
     _held[path] = _Held(file, made, writer)
     return _held[path]
 
@@ -181,7 +181,7 @@ def _claim(file: int, folder: Path, path: Path, writer: Writer) -> bool:
     if not _is_at(file, path):
         return False
     _enter(file, writer)
-    if not sure:  # of two that began at one instant, the one that listed itself last has it
+    if not sure:  # of two that began at once, the one that listed itself last wins
         time.sleep(_BETWEEN_S * (1 + random.random()))
         _acquire(file, folder, path, writer)
         _enter(file, writer)
@@ -189,7 +189,7 @@ def _claim(file: int, folder: Path, path: Path, writer: Writer) -> bool:
 
 
 def _opened(folder: Path, path: Path) -> int:
-    """The opened file of a lock; it is made if it was not there."""
+    """Open the file of a lock, creating it if necessary."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -203,7 +203,7 @@ def _opened(folder: Path, path: Path) -> int:
 
 
 def _acquire(file: int, folder: Path, path: Path, writer: Writer) -> bool:
-    """Lock an open file; returns whether the file system has locks, so that it is this process's alone.
+    """Lock an open file; returns whether the file system has locks, so that the outcome is certain.
 
     Raises:
         BlockingIOError: others have locked it.
@@ -215,7 +215,7 @@ def _acquire(file: int, folder: Path, path: Path, writer: Writer) -> bool:
             return free is not None
         if others:
             break
-        time.sleep(_BETWEEN_S * (attempt + 1 < _ATTEMPTS))  # it has not listed itself yet, or is ending
+        time.sleep(_BETWEEN_S * (attempt + 1 < _ATTEMPTS))  # the holder is not listed yet, or is ending
     who = str(others[-1]) if others else "another process, which writes there"
     gone = "" if free is not None else f"; if it is gone, remove {path}"
     raise BlockingIOError(
@@ -259,7 +259,7 @@ def _others(file: int, writer: Writer) -> list[Writer]:
 
 
 def _listed(line: bytes) -> Writer:
-    """A line of the list; raises ValueError or TypeError if it is none that a writer wrote."""
+    """The writer in a line of the list; raises ValueError or TypeError if no writer wrote the line."""
     writer = Writer(**parse_json(line))
     if [type(value) for value in astuple(writer)] != [int, str, str, bool] or writer.pid < 1:
         raise ValueError("another value")
@@ -267,7 +267,7 @@ def _listed(line: bytes) -> Writer:
 
 
 def _enter(file: int, writer: Writer) -> None:
-    """List a writer, beside those with whom it shares the lock."""
+    """List a writer, along with those that share the lock with it."""
     _list_writers(file, [*(_others(file, writer) if writer.shared else []), writer])
 
 
@@ -281,7 +281,7 @@ def _list_writers(file: int, writers: list[Writer]) -> None:
 
 def _release(path: Path, held: _Held) -> None:
     """Release a lock; its file is removed unless others share it."""
-    with suppress(OSError):  # of a file system that is gone, say
+    with suppress(OSError):  # the file system may be gone
         others = _others(held.file, held.writer)
         alone = _flock(held.file, shared=False)  # so that nobody joins before the file is removed
         if alone or (alone is None and not others):

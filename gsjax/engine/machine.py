@@ -13,7 +13,7 @@ from gsjax.engine.messages import counted
 from gsjax.engine.messages import describe as describe_error
 from gsjax.optim.compiler import has_avx512
 
-_ASKED = ("JAX_PLATFORMS", "JAX_PLATFORM_NAME")  # variables of the environment that name a backend
+_ASKED = ("JAX_PLATFORMS", "JAX_PLATFORM_NAME")  # environment variables that name a backend
 
 
 def describe() -> dict[str, Any]:
@@ -33,7 +33,7 @@ def describe() -> dict[str, Any]:
 
 
 def compute_on_host() -> None:
-    """Let JAX use the CPU alone, whatever the environment asks for. Call it before JAX computes anything."""
+    """Make JAX use only the CPU, whatever the environment asks for. Call it before JAX computes anything."""
     jax.config.update("jax_platforms", "cpu")
     jax.config.update("jax_platform_name", "cpu")
 
@@ -42,7 +42,7 @@ def missing_device() -> str | None:
     """Why JAX has no device to compute on, and what to do, in a sentence; None if it has one."""
     try:
         jax.devices()
-    except (RuntimeError, AssertionError) as error:  # by JAX, where the backend is not there or has no device
+    except (RuntimeError, AssertionError) as error:  # from JAX, if the backend is missing or has no device
         asked = next((f"{name}={value}" for name in _ASKED if (value := os.environ.get(name))), "JAX")
         why = f" ({describe_error(error)})" if str(error) else ""
         return (
@@ -88,7 +88,7 @@ def keep_to(cores: Iterable[int]) -> None:
 
 
 def resident_mb() -> float:
-    """Memory of this process, MB; on systems that only report its peak, that."""
+    """Resident memory of this process, MB; its peak on systems that report only that."""
     return _size_mb("/proc/self/status", "VmRSS") or _largest_mb()
 
 
@@ -108,13 +108,13 @@ def available_mb() -> float:
 
 
 def _size_mb(file: str, name: str) -> float | None:
-    """A size in one of Linux's tables, MB; None if it is not there."""
+    """A size from a file in Linux's /proc, MB; None if it is not there."""
     lines = Path(file).read_text().splitlines() if Path(file).exists() else []
     return next((int(line.split()[1]) / 1e3 for line in lines if line.startswith(f"{name}:")), None)
 
 
 def _largest_mb() -> float:
-    """The peak memory of this process by POSIX, MB."""
+    """The peak memory of this process as POSIX reports it, MB."""
     import resource
 
     unit = 1e6 if platform.system() == "Darwin" else 1e3  # macOS counts bytes

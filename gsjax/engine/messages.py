@@ -23,7 +23,7 @@ _PACKAGE = Path(__file__).parents[1]
 
 @contextmanager
 def stage(console: Console, words: str) -> Iterator[None]:
-    """Announce what takes a while: a spinner in a terminal, a line in a log."""
+    """Announce work that takes a while: a spinner in a terminal, a line in a log."""
     if console.is_terminal:
         with console.status(words):
             yield
@@ -36,7 +36,7 @@ def describe(error: BaseException) -> str:
     """The message of an exception as one paragraph; errors of files begin with the path."""
     if isinstance(error, OSError) and error.filename is not None and error.strerror:
         return f"{brief(error.filename, _LONGEST)}: {error.strerror[0].lower()}{error.strerror[1:]}"
-    if isinstance(error, FileNotFoundError) and error.errno is not None:  # without a name: of `os.getcwd`
+    if isinstance(error, FileNotFoundError) and error.errno is not None:  # without a name: from `os.getcwd`
         return "the working directory: expected a folder, found that it was removed; change into another (cd)"
     return " ".join(str(error).split()) or type(error).__name__
 
@@ -48,7 +48,7 @@ def counted(count: int, noun: str) -> str:
 
 def reason(stopped: BaseException) -> str:
     """The reason why a run was stopped."""
-    if isinstance(stopped, KeyboardInterrupt):  # with the name of its signal, or of Python's own
+    if isinstance(stopped, KeyboardInterrupt):  # raised with the name of its signal, or by Python itself
         return "Ctrl-C" if str(stopped) in ("", "SIGINT") else str(stopped)
     return describe(stopped)
 

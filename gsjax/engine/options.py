@@ -96,7 +96,7 @@ class HeldOut:
 
 @dataclass(frozen=True, kw_only=True)
 class HeldOutFrames(HeldOut):
-    """The same, where frames or photographs may be held out too."""
+    """As `HeldOut`, where frames or photographs may be held out too."""
 
     test_every: int = 8
     """Hold out every N-th photograph or frame for evaluation, if the data has no split; 0 holds out none."""
@@ -104,7 +104,7 @@ class HeldOutFrames(HeldOut):
 
 @dataclass(frozen=True, kw_only=True)
 class FirstMasks:
-    """Options of commands that follow the objects of a first mask."""
+    """Options of commands that track the objects of a first mask."""
 
     mask_camera: Annotated[int | None, tyro.conf.arg(metavar="ID")] = None
     """Id of the tracked camera whose first mask names the objects; default: the first that has masks (with a
@@ -133,7 +133,7 @@ class ClipWeights:
 
 @dataclass(frozen=True, kw_only=True)
 class ObjectText:
-    """How a text that means an object of a tracked run is matched."""
+    """How a text is matched to an object of a tracked run."""
 
     encoder: Literal["closed", "clip"] = "closed"
     """Text encoder: a closed vocabulary without weights, or CLIP."""
@@ -162,7 +162,7 @@ class OfDataset(Common, Resuming, Timed, Seeded, HeldOutFrames, Selection, Datas
 
 
 def checked(options: AnyOptions) -> AnyOptions:
-    """The options, with `--seed` in each configuration that has one.
+    """The options, with `--seed` copied into each configuration that has a seed.
 
     Raises:
         ValueError: a shared option is out of range.

@@ -20,7 +20,7 @@ from gsjax.engine.recording import expect_enough_left, in_threads, open_recordin
 from gsjax.scene.frame import Frame
 
 _LARGE = 1600  # pixels, a side, as in 3DGS
-_BYTES_A_PIXEL = 8  # a photograph, as it is and on the device, and a mask
+_BYTES_A_PIXEL = 8  # a photograph on the host and on the device, and a mask
 
 
 def choose_photographs(
@@ -80,7 +80,7 @@ def smaller(photographs: Photographs, scale: float | None) -> Photographs:
 
     Args:
         photographs: of any sizes.
-        scale: of all photographs; None for 1,600 pixels a side at most, as other trainers of 3DGS have it.
+        scale: of all photographs; None for at most 1,600 pixels a side, as in other 3DGS trainers.
 
     Raises:
         ValueError: `scale` is not above 0 and at most 1, or makes one too small.
@@ -135,7 +135,7 @@ def split(photographs: Photographs, every: int) -> tuple[Int[np.ndarray, "a"], I
 
 
 def data_split(splits: tuple[str, ...] | None) -> tuple[Int[np.ndarray, "a"], Int[np.ndarray, "b"]] | None:
-    """Indices of what the data means for training and of what it holds out: "test" or, without it, "val".
+    """Indices of what the data assigns to training and of what it holds out: "test" or, without it, "val".
     None if it holds out nothing.
 
     Args:

@@ -24,9 +24,9 @@ RENDERS = 5
 MAX_VIDEO_HZ = 60.0
 MIN_VIDEO_HZ = 1.0
 MARK = (255, 70, 160)
-"""Colour of the outline of what was found, RGB."""
+"""RGB colour of the outline around what a query found."""
 MOST = 0.5
-"""Share of a pixel's light above which it shows what was found."""
+"""A pixel shows what was found if more than this share of its light comes from there."""
 _VIDEO_HEIGHT = 480  # smaller pictures are enlarged
 
 
@@ -39,19 +39,19 @@ def frame_rate(times: Float[np.ndarray, "t"]) -> float:
 def lit(
     image: Num[np.ndarray, "h w 3"], mask: Bool[np.ndarray, "h w"], color: tuple[int, int, int]
 ) -> UInt8[np.ndarray, "H W 3"]:
-    """The image of a camera with what was found in its colours and the rest dimmed; small pictures are
+    """The image of a camera with what was found in its own colours and the rest dimmed; small images are
     enlarged.
 
     Args:
         image: uint8, or floats 0 to 1.
-        mask: where it is.
+        mask: pixels of what was found.
         color: of its outline, RGB.
     """
     height, width = mask.shape
     factor = max(1, -(-_VIDEO_HEIGHT // height))
     size = (width * factor, height * factor)
     image = cv2.resize(to_uint8(image), size, interpolation=cv2.INTER_CUBIC)
-    # Smooth outlines: a mask's share of each pixel is interpolated, not the mask.
+    # For smooth outlines, interpolate the mask's share of each pixel and threshold that.
     soft = cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_CUBIC)
     return highlight(image, soft > 0.5, color)
 
@@ -65,7 +65,7 @@ class Film:
             folder: of the run.
             recording: the recording.
             num_frames: number of frames that will be added.
-            labels: the label of each group, [K+1], which gives it its colour.
+            labels: the label of each group, [K+1], which determines its colour.
         """
         self._folder, self._frame_ids, self._labels = folder, recording.judged.frame_ids, labels
         self._kept = set(np.linspace(0, num_frames - 1, RENDERS).round().astype(int).tolist())
@@ -85,7 +85,7 @@ class Film:
             write_png(path, to_uint8(view.render))
 
     def score(self, views: Iterable[list[View]], scores: Scores, num_frames: int, console: Console) -> None:
-        """Score and film the views of all frames, while the next frame is rendered, and close the videos.
+        """Score and film the views of all frames, each while the next is rendered, and close the videos.
 
         Args:
             views: those of all cameras, a list per frame.

@@ -83,7 +83,7 @@ def run(options: Options) -> int:
                 folder, names, work, options.place, in_order=of_video, stage=announce
             )
             _write(options, placed, names, work, folder, in_place)
-        photographs = read_colmap(options.out)  # what was written can be read
+        photographs = read_colmap(options.out)  # makes sure that it can be read
         found = _found(options, placed, len(names), perf_counter() - begun) | {"notes": notes.all}
         write_json(options.out / REPORT, found)
         if reference is not None:
@@ -95,8 +95,8 @@ def run(options: Options) -> int:
 
 
 def compare(photographs: Photographs, reference: Photographs) -> dict[str, Any]:
-    """Differences from the cameras of another dataset for photographs of the same name, after the similarity
-    that aligns their centres.
+    """Differences from the cameras of another dataset for photographs of the same name, after aligning their
+    centres by a similarity.
 
     Raises:
         ValueError: fewer than three names agree.
@@ -118,7 +118,7 @@ def compare(photographs: Photographs, reference: Photographs) -> dict[str, Any]:
 
 
 def _in_both(names: Sequence[str], reference: Photographs) -> list[tuple[int, int]]:
-    """Indices of the photographs that both have, by the name of the file."""
+    """Pairs of indices of the photographs that both have, matched by file name."""
     known = {Path(name).name: i for i, name in enumerate(reference.names)}
     both = [(i, known[Path(name).name]) for i, name in enumerate(names) if Path(name).name in known]
     if len(both) < 3:
@@ -147,7 +147,7 @@ def _check_out(out: Path, in_place: bool, overwrite: bool) -> None:
 def _write(
     options: Options, placed: SfmResult, names: list[str], work: Path, folder: Path, in_place: bool
 ) -> None:
-    """Move the results to their place; nothing is replaced before all of them are there."""
+    """Move the results into place; nothing is replaced until all of them exist."""
     sparse = work / "new" / "sparse"
     (sparse / "0").mkdir(parents=True)
     placed.model.write_binary(sparse / "0")

@@ -1,4 +1,4 @@
-"""Running a command: its options are parsed, and a user's mistake becomes one sentence."""
+"""Runs a command: parses its options, and turns a user's mistake into one sentence."""
 
 from dataclasses import fields
 from importlib import import_module
@@ -14,7 +14,7 @@ from gsjax.extras import MissingExtra
 
 # ValueError covers DataError and PlyError, and every check of an argument.
 USER_ERRORS = (ValueError, OSError, MissingExtra)
-_ON_HOST = ("info", "poses", "compare")  # an accelerator would not help them, and need not be there
+_ON_HOST = ("info", "poses", "compare")  # an accelerator would not help them, and is not required
 _FETCHED = ("http", "https", "ftp", "s3", "gs")
 _COMPILE_ANEW = ("bench", "experiment")  # they measure compile time, and may set up JAX themselves
 
@@ -88,7 +88,7 @@ def parse_options(command: str, arguments: list[str], entry: tuple[str, str]) ->
 
 
 def _expect_paths(options: Any) -> None:
-    """Raises a ValueError for an address where a path is wanted."""
+    """Raises a ValueError for a URL where a path is expected."""
     for field in fields(options):
         value = getattr(options, field.name)
         if isinstance(value, Path) or field.name in ("dataset", "path"):

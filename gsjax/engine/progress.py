@@ -1,4 +1,4 @@
-"""The progress of a run of steps: logged rows, time, a progress bar or lines of a log, and checkpoints.
+"""The progress of a run: logged rows, timing, a progress bar or log lines, and checkpoints.
 
 `watch` drives a method to its end for a command; saving, rows and the bar listen to its ticks.
 """
@@ -29,9 +29,9 @@ from gsjax.io.checkpoints import CheckpointError, load_checkpoint, save_checkpoi
 from gsjax.optim.method import Run
 
 KEPT = 2
-"""Number of checkpoints kept: if one is damaged, the one before is left."""
+"""Number of checkpoints kept: if the newest is damaged, the one before it remains."""
 _SHOWN_EVERY_S = 0.2
-_LINES = 10  # of a log
+_LINES = 10  # in a log
 _COMPILING = "compiling"
 
 
@@ -80,8 +80,8 @@ class Progress:
 
     @property
     def mishaps(self) -> dict[str, int | bool]:
-        """What went wrong and was mended, for metrics.json: numbers of skipped steps and of returns, and
-        whether the last steps were undone."""
+        """What went wrong and was recovered from, for metrics.json: the numbers of skipped steps and of
+        returns, and whether the last steps were undone."""
         return {"skipped": self.skipped, "returns": self.returns, "settled": self.is_settled}
 
     def metadata(self) -> dict[str, Any]:
@@ -112,13 +112,13 @@ class Progress:
 
 @dataclass(frozen=True)
 class Schedule:
-    """What is shown and logged of a run.
+    """What is displayed and logged during a run.
 
     Attributes:
         doing: the work, such as "distilling".
         total: total number of steps.
         row: (tick, infos of the steps since the last row, on the host, without skipped ones) -> the row
-            besides step and seconds. See `means_of`.
+            apart from step and seconds. See `means_of`.
         words: row -> text.
         every: steps between rows.
     """
@@ -157,8 +157,8 @@ def watch(
     enough: Callable[[Tick, Mapping[str, Any]], bool] | None = None,
     listeners: tuple[Callable[[Mapping[str, Any]], None], ...] = (),
 ) -> Progress:
-    """Run until all steps are done, the time is up, Ctrl-C or an error. `ticks.run` is then the newest run,
-    or the best if that is worse; where it is enough, the newest.
+    """Run until all steps are done, `enough` is met, the time is up, or Ctrl-C or an error ends the run.
+    `ticks.run` is then the newest run, or the best if the newest is worse; if `enough` was met, the newest.
 
     Args:
         ticks: the method, from `drive`.
@@ -166,7 +166,7 @@ def watch(
         schedule: what is shown and logged.
         folder: of the run.
         console: shows the progress.
-        budget: the time that is given; its steps begin now.
+        budget: the time limit; the time for steps starts now.
         save_every: seconds of work that may be lost when the run is killed.
         evaluate: tick -> additions to its row, or None; a tick with additions gets a row.
         enough: (tick, its row) -> whether to stop there; called after each new row.
@@ -182,7 +182,7 @@ def watch(
     with _Display(console, schedule, progress, ticks, budget) as display:
         try:
             while not budget.is_over and (now := _next(ticks, progress)) is not None:
-                last = now.step == schedule.total or budget.is_over  # before what takes time
+                last = now.step == schedule.total or budget.is_over  # before evaluating, which takes time
                 more = None if evaluate is None else evaluate(now)
                 row = None
                 if now.step % schedule.every == 0 or last or more is not None:
@@ -212,7 +212,7 @@ def watch(
 
 
 def _next(ticks: Drive, progress: Progress) -> Tick | None:
-    """The next step, if any; it is recorded even if Ctrl-C comes next."""
+    """The next step, if any; it is recorded even if Ctrl-C follows."""
     before = ticks.tick
     now = next(ticks, None)
     if now is not None and now is not before:
@@ -227,7 +227,7 @@ def note_if_cut_short(progress: Progress, schedule: Schedule, steps: int, notes:
 
 
 def warn_of_mishaps(progress: Progress, notes: Notes) -> None:
-    """Warn of steps that changed nothing, because a number was not finite, and of returns."""
+    """Warn about steps that changed nothing, because a number was not finite, and about returns."""
     if progress.skipped:
         notes.warn(
             f"{counted(progress.skipped, 'step')} produced non-finite numbers and changed nothing; if they "
@@ -237,7 +237,7 @@ def warn_of_mishaps(progress: Progress, notes: Notes) -> None:
 
 
 def warn_of_returns(progress: Progress, notes: Notes) -> None:
-    """Warn of returns to the best parameters, because the optimisation diverged."""
+    """Warn about returns to the best parameters after the optimisation diverged."""
     if progress.returns:
         notes.warn(
             f"the optimisation diverged {counted(progress.returns, 'time')}, and continued from its best "
@@ -261,7 +261,7 @@ def save_run(folder: Path, run: Run, progress: Progress) -> None:
 
 
 def load_run(folder: Path, run: Run, progress: Progress) -> tuple[Run, Progress]:
-    """The newest intact checkpoint: the run and its progress; the given ones if none was saved.
+    """Load the run and its progress from the newest intact checkpoint; the given ones if none was saved.
 
     Args:
         folder: RUN/resume.
@@ -270,7 +270,7 @@ def load_run(folder: Path, run: Run, progress: Progress) -> tuple[Run, Progress]
 
     Raises:
         CheckpointError: all checkpoints are damaged, or of another version.
-        ValueError: the checkpoint has other inputs.
+        ValueError: the checkpoint is of a run with other inputs.
     """
     wrong, damaged, saved = None, [], _saved(folder)
     if not saved and (other := sorted(folder.glob("*.npz"))):
@@ -366,7 +366,7 @@ class _Display:
             self._console.print(f"{self._reached()}: {words(rows[-1])}", soft_wrap=True)
 
     def _announce(self, event: str, **_: Any) -> None:
-        """Say that a later step compiles, before it does."""
+        """Announce that a later step is about to compile."""
         if event != COMPILING or self._ticks.tick is None:
             return
         self._bar.update(self._task, description=_COMPILING)

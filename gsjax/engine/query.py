@@ -1,6 +1,6 @@
-"""The query of Gaussians, for `gsjax query` and for the viewer: the question, the Gaussians that match, and
-the files about them. A kind of run adds how it is asked and drawn (`Queryable`): a field, or a scene that
-deforms."""
+"""Queries of Gaussians, for `gsjax query` and for the viewer: the question, the Gaussians that match it, and
+the files written about them. Each kind of run, a field or a deforming scene, is a `Queryable`, which defines
+how it is queried and drawn."""
 
 import math
 from abc import ABC, abstractmethod
@@ -33,30 +33,30 @@ _HIGHEST = 1.0  # highest score: a cosine is from -1 to 1, a share against other
 
 @dataclass(frozen=True)
 class Question:
-    """A query: one of text, image, point and box, how it is scored, and the changes to what is found. Without
-    any of the four everything is labelled, where features have names.
+    """A query: a text, image, point or box, how it is scored, and how the matches are changed. Without any of
+    the four, everything is labelled if the features have names.
 
     Attributes:
         text: "red can".
-        image: a picture of the thing; where it has an alpha channel, only what is opaque.
+        image: a picture of the thing; with an alpha channel, only its opaque part.
         point: x, y in pixels of a photograph or frame, at the size used in training.
         box: x0, y0, x1, y1, likewise.
         camera: short name of the photograph of the point, and of the only mask to draw.
         frame: frame number, in the recording, of point and box; its Gaussians are written (default: the
             first).
         frames: frames to draw, as a Python slice (default: the held-out ones).
-        level: of a field's features (default: the one that the query fits best; for a point, the smallest).
-        within: a text; only what that finds can be found: "handle" within "drawer".
+        level: level of a field's features (default: that which fits best; for a point, the smallest).
+        within: a text that restricts the search to what it finds: "handle" within "drawer".
         threshold: score above which a Gaussian is selected (default: by a rule).
         top: number of Gaussians to select, those with the best scores, instead of a threshold.
         negatives: texts to compare with (default: the encoder's own).
-        color: RGB, 0 to 1, of what is found in recolored.ply.
-        move: shift of it in moved.ply, metres; None writes none.
-        pictures: whether what is found is drawn.
+        color: RGB, 0 to 1, of the matches in recolored.ply.
+        move: shift of the matches in moved.ply, in the scene's unit; None writes no such file.
+        pictures: whether the matches are drawn.
 
     Raises:
-        ValueError: no score can be above the threshold, or each is; it is given beside `top`, which is less
-            than 1; a colour or a shift is out of range.
+        ValueError: no score can be above the threshold, or every score is; `top` is less than 1, or given
+            together with a threshold; a colour or a shift is out of range.
     """
 
     text: str | None = None
@@ -121,10 +121,10 @@ class Selection:
         frame: index of the frame whose Gaussians were scored.
         prompt: of the query.
         scores: of all Gaussians.
-        threshold: score above which they are selected, within what the question names.
-        selected: which are.
+        threshold: score above which they are selected, within `place`.
+        selected: whether each Gaussian is.
         seconds: time that it took to score all Gaussians.
-        place: what they are within; None for anywhere.
+        place: the selection that they must lie within; None for anywhere.
     """
 
     question: Question
@@ -145,13 +145,13 @@ class Queryable(ABC):
         path: folder of the run, or of the field.
         kind: the encoder of its features.
         hint: what can be asked for, in words.
-        rows: row of the scene's file of each Gaussian.
+        rows: row of each Gaussian in the scene's file.
         num_rows: number of rows in that file, including Gaussians that cannot be drawn.
         labels: label of each Gaussian; None without.
-        origin: what places are relative to, where the scene lies far from 0.
+        origin: the origin of positions, if the scene lies far from 0.
         antialiased: whether the scene is drawn antialiased.
-        frame_ids: numbers of the frames; None of a scene that stands still.
-        levels: levels of its features; none where there is one alone.
+        frame_ids: numbers of the frames; None for a static scene.
+        levels: levels of its features; empty if there is only one.
     """
 
     path: Path
@@ -167,7 +167,7 @@ class Queryable(ABC):
 
     @abstractmethod
     def frame_of(self, question: Question) -> int:
-        """The index of the frame in question, once all that the question names is there.
+        """The index of the frame in question, after checking that all the question names exists.
 
         Raises:
             ValueError: something does not exist.
@@ -178,8 +178,8 @@ class Queryable(ABC):
         """The scene in a frame."""
 
     def refresh(self) -> None:  # noqa: B027
-        """Read the features again if they have become better meanwhile, as while a field is trained. Others
-        never do."""
+        """Read the features again if they may have improved meanwhile, as while a field is being trained.
+        Does nothing by default."""
 
     @abstractmethod
     def prompt(self, question: Question, frame: int) -> Prompt:
@@ -195,7 +195,7 @@ class Queryable(ABC):
         """The prompt for what is similar to a Gaussian.
 
         Args:
-            row: of the Gaussian.
+            row: index of the Gaussian.
             frame: index of the frame.
             level: of its features (default: the smallest).
         """
@@ -206,11 +206,11 @@ class Queryable(ABC):
 
     @abstractmethod
     def about(self, question: Question, frame: int) -> dict[str, Any]:
-        """Entries of query.json that this kind of run has beside those of `answer`."""
+        """Entries of query.json that this kind of run adds to those of `answer`."""
 
     @abstractmethod
     def draw(self, folder: Path, found: Selection, notes: Notes, console: Console) -> dict[str, int] | None:
-        """Write pictures of a selection, if wanted; returns the number of pixels in each mask, None of none.
+        """Write pictures of a selection, if wanted; returns the number of pixels in each mask, if any.
 
         Args:
             folder: for the pictures.
@@ -230,8 +230,7 @@ def select(run: Queryable, question: Question, frame: int, prompt: Prompt | None
         prompt: of the query (default: that of the question).
 
     Raises:
-        ValueError, FileNotFoundError: as for `Queryable.prompt`; or nothing is found that the rest is to be
-            within.
+        ValueError, FileNotFoundError: as for `Queryable.prompt`; or nothing is found to search within.
     """
     prompt = run.prompt(question, frame) if prompt is None else prompt
     score = run.scorer(prompt, frame)
@@ -255,7 +254,7 @@ def select(run: Queryable, question: Question, frame: int, prompt: Prompt | None
 
 
 def _place(run: Queryable, question: Question, frame: int) -> Selection:
-    """What a question is to be answered within, on the level that fits it best."""
+    """The selection to answer a question within, on the level that fits it best."""
     place = select(run, Question(text=question.within, negatives=question.negatives), frame)
     if not place.selected.any():
         raise ValueError(f"--within {question.within!r}: expected something to look within, found none of it")
@@ -284,7 +283,7 @@ def answer(
 
     Raises:
         ValueError: the query cannot be answered, or selects nothing of the scene.
-        FileExistsError: the folder holds something else than a result of a query.
+        FileExistsError: the folder holds something other than the result of a query.
     """
     frame = run.frame_of(question)
     gaussians = run.at(frame)

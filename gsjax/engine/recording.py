@@ -1,4 +1,4 @@
-"""The part of a recording that is used, what is held out of it, and the objects that its masks name."""
+"""The part of a recording that a run uses, and the cameras that it holds out."""
 
 import itertools
 import os
@@ -32,10 +32,10 @@ class Recording:
     """The chosen frames of a recording.
 
     Attributes:
-        tracked: the cameras that methods see; the others are not even opened meanwhile.
-        judged: the same frames with the held-out cameras behind the tracked ones.
+        tracked: the cameras that methods see; the others' files are not even opened for them.
+        judged: the same frames, with the held-out cameras after the tracked ones.
         frames_in_data: number of frames in the data.
-        simulated: whether pictures are drawn on demand, which takes longer than reading them, and then kept.
+        simulated: whether pictures are rendered on demand, which is slower than reading them, and cached.
     """
 
     tracked: Sequence
@@ -163,7 +163,7 @@ def parse_frames(text: str) -> slice:
 
 
 def remembered(sequence: Sequence) -> Sequence:
-    """The same sequence, with what was loaded kept in memory: simulated pictures are slow to draw."""
+    """The same sequence, with loaded pictures cached in memory: simulated ones are slow to render."""
 
     def kept(loader: Callable | None) -> Callable | None:
         return None if loader is None else cache(loader)
@@ -172,7 +172,7 @@ def remembered(sequence: Sequence) -> Sequence:
 
 
 def draw_ahead(recording: Recording, console: Console) -> None:
-    """Draw the tracked pictures of a simulated recording, so that updates need not share the processor."""
+    """Render the tracked pictures of a simulated recording, so that updates need not share the processor."""
     if views := _views_to_draw(recording):
         draw = recording.tracked.image
         in_threads(lambda view: draw(*view), views, "drawing the simulated scene", console)
@@ -180,7 +180,7 @@ def draw_ahead(recording: Recording, console: Console) -> None:
 
 @contextmanager
 def drawing_ahead(recording: Recording) -> Iterator[None]:
-    """While this context lasts, another thread draws for `draw_ahead`."""
+    """While this context lasts, another thread renders the pictures that `draw_ahead` will need."""
     executor = ThreadPoolExecutor(1, thread_name_prefix="drawing")
     for view in _views_to_draw(recording):
         executor.submit(recording.tracked.image, *view)
@@ -191,7 +191,7 @@ def drawing_ahead(recording: Recording) -> Iterator[None]:
 
 
 def _views_to_draw(recording: Recording) -> list[tuple[int, int]]:
-    """Frame and camera of each tracked picture of a simulated recording; nothing for others."""
+    """Frame and camera of each tracked picture of a simulated recording; empty for others."""
     sequence = recording.tracked
     pairs = itertools.product(range(sequence.num_frames), range(sequence.num_cameras))
     return list(pairs) if recording.simulated else []
@@ -200,7 +200,8 @@ def _views_to_draw(recording: Recording) -> list[tuple[int, int]]:
 def in_threads(
     load: Callable[[Any], Loaded], items: Iterable[Any], words: str, console: Console
 ) -> list[Loaded]:
-    """`load` of each item, by two threads, with a progress bar. An exception or Ctrl-C cancels the rest.
+    """The result of `load` for each item, by two threads, with a progress bar. An exception or Ctrl-C cancels
+    the rest.
 
     Args:
         load: item -> result.

@@ -38,8 +38,8 @@ class Record:
         kind: the command that made it.
         config: the contents of config.yml.
         metrics: the contents of metrics.json; None while the run is in progress, or if it was killed.
-        curve: the rows of metrics.jsonl, of a fit.
-        evaluation: the scores of `gsjax eval` for the present scene; None without any.
+        curve: the rows of metrics.jsonl, for a fit.
+        evaluation: the scores of `gsjax eval` for the current scene; None if there are none.
         notes: what was ignored, and why.
     """
 

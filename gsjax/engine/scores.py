@@ -1,4 +1,4 @@
-"""Scores of views, added up one by one so that memory stays flat, and the metrics computed from them."""
+"""Scores of views, accumulated one by one so that memory stays flat, and the metrics computed from them."""
 
 from collections import defaultdict
 from collections.abc import Iterable
@@ -47,13 +47,13 @@ def mean_scores(rows: list[dict[str, Any]], names: Iterable[str]) -> dict[str, f
 
 @dataclass
 class CameraScores:
-    """Scores of one camera, one entry a frame; NaN where there was nothing to compare."""
+    """Scores of one camera, one entry per frame; NaN where there was nothing to compare."""
 
     held_out: bool
     values: dict[str, list[float]] = field(default_factory=lambda: defaultdict(list))
 
     def mean(self, name: str) -> float | None:
-        """The mean over frames of those that are finite; None without any."""
+        """The mean over the frames with a finite score; None if there are none."""
         values = np.asarray(self.values.get(name, []), np.float64)
         values = values[np.isfinite(values)]
         return float(values.mean()) if len(values) else None
@@ -63,7 +63,7 @@ class Scores:
     """Scores of rendered pictures, depth and labels against what the cameras saw.
 
     Args:
-        values: the mask value that each group of the scene stands for, [K+1]; None: labels are not scored.
+        values: the mask value that each group of the scene stands for, [K+1]; None if labels are not scored.
         robot: the robot's mask value, or None.
     """
 
@@ -72,7 +72,7 @@ class Scores:
         self.cameras: dict[int, CameraScores] = {}
         self.overlaps = {False: LabelOverlap(), True: LabelOverlap()}
         self.num_frames = 0
-        self.later_masks = {False: 0, True: 0}  # those of frames after the first, which may be the input
+        self.later_masks = {False: 0, True: 0}  # masks after the first frame, whose own may be input
 
     def add(self, view: View) -> None:
         """Score one view."""
@@ -101,7 +101,7 @@ class Scores:
 
 
 def camera_metrics(scores: Scores) -> dict[str, Any]:
-    """Each score's mean over frames, by camera, and over the cameras of each kind."""
+    """Each score's mean over frames, per camera, and over the tracked and the held-out cameras."""
     cameras = {
         str(camera): {"tracked": not found.held_out} | {name: found.mean(name) for name in CAMERA_SCORES}
         for camera, found in scores.cameras.items()
@@ -130,7 +130,7 @@ def camera_rows(found: dict[str, Any], seen: str = "tracked") -> list[dict[str, 
 
 
 def motion_metrics(score: ObjectScore | None) -> dict[str, Any]:
-    """The errors of one object for metrics.json; None each where it was not scored."""
+    """The errors of one object for metrics.json; all None if it was not scored."""
     fields = ("centroid_error_mm", "point_error_mm", "median_point_error_mm", "moved_mm", "turned_deg")
     scored = {name: getattr(score, name, None) for name in fields}
     return scored | {"gaussians_scored": 0 if score is None else score.num_scored}
@@ -139,7 +139,7 @@ def motion_metrics(score: ObjectScore | None) -> dict[str, Any]:
 def true_labels_at(
     sequence: Sequence, t: int, points: Float[np.ndarray, "N 3"]
 ) -> Int[np.ndarray, "N"] | None:
-    """The true label of each point, by the cameras that have a mask and depth of frame t; -1 where unknown.
+    """The true label of each point, from the cameras that have a mask and depth of frame t; -1 where unknown.
     None if no camera has both.
 
     Args:

@@ -1,4 +1,4 @@
-"""A scene in the cell of a notebook: `gsjax.show`."""
+"""Showing a scene in a notebook cell: `gsjax.show`."""
 
 import html
 import os
@@ -17,18 +17,18 @@ from gsjax.scene.gaussians import Gaussians
 if TYPE_CHECKING:
     from gsjax.viz.viewer import Viewable
 else:
-    Viewable = Any  # slow to import, as all that shows a scene is
+    Viewable = Any  # slow to import, like everything that shows a scene
 
-_STEP = 1 / 15  # seconds that a frame is shown
+_STEP = 1 / 15  # seconds per frame
 
 
 @dataclass(frozen=True)
 class Shown:
-    """A page that shows or plays a scene. As the last value of a notebook's cell, it is shown there.
+    """A page that shows or plays a scene. A notebook displays it as the last value of a cell.
 
     Attributes:
-        page: the HTML text, which needs neither a network nor a program beside it.
-        height: of the cell's frame, pixels.
+        page: the HTML text, which needs neither a network nor a server.
+        height: height of the page in the cell, pixels.
     """
 
     page: str = field(repr=False)
@@ -40,25 +40,25 @@ class Shown:
 
 
 def show(scene: Any, *, up: str | Sequence[float] | None = None, height: int = 480) -> Shown:
-    """A scene to look at in a notebook's cell: drag to turn, scroll to come closer, play if it moves.
+    """Show a scene in a notebook cell: drag to rotate, scroll to zoom, play if it moves.
 
-    The page holds the scene, without view-dependent colour, in colours of its first moment: 43 bytes for each
-    Gaussian, and for each that moves 21 to 32 more in each moment, before these are compressed. A notebook
-    keeps it when it is saved: of millions of Gaussians better write a page, `gsjax.write_gaussians`.
+    The page contains the scene, without view-dependent colour, in the colours of its first moment: 43 bytes
+    per Gaussian, and 21 to 32 more per moment for each that moves, before compression. A saved notebook keeps
+    the page: for millions of Gaussians, write one with `gsjax.write_gaussians` instead.
 
     Args:
         scene: Gaussians, or a list of them, one for each moment, with the same Gaussian in the same row; the
             result of `gsjax.track`, `parts` or `deform`; a film of edited parts, layers in a tuple; what
-            `gsjax.open_scene` opened, or the path that it takes.
+            `gsjax.open_scene` opened, or a path as for it.
         up: the up direction, [3], or by its name: "z", "-y" (default: that of a run's photographs; for a path
             of files -y, as in most; else +z).
-        height: of the cell's frame, pixels.
+        height: height of the page in the cell, pixels.
 
     Raises:
         FileNotFoundError: there is no scene at the path.
         TypeError: it is none of these.
-        ValueError: there is no Gaussian, one holds a number that is not finite, moments differ in their
-            number, or `up` is no direction.
+        ValueError: there are no Gaussians, one has a number that is not finite, moments differ in their
+            number of Gaussians, or `up` is not a direction.
     """
     opened, path = _opened(scene)
     options = page_options(opened, range(opened.num_frames), path)
@@ -71,12 +71,12 @@ def show(scene: Any, *, up: str | Sequence[float] | None = None, height: int = 4
 
 
 def page_options(scene: Viewable, frames: range, path: Path | None) -> dict[str, Any]:
-    """How a page shows a scene: what `gsjax.io.page.write_page` takes beside the Gaussians.
+    """How a page shows a scene: the arguments of `gsjax.io.page.write_page` besides the Gaussians.
 
     Args:
         scene: the scene.
-        frames: those that it plays, if it moves in them.
-        path: where it was read; None if it was not.
+        frames: the frames to play, if the scene moves in them.
+        path: where the scene was read from; None if it was not.
     """
     from gsjax.io.page import Film
     from gsjax.viz.viewer.cameras import first_pose, scene_up
@@ -88,7 +88,7 @@ def page_options(scene: Viewable, frames: range, path: Path | None) -> dict[str,
         "up": [0.0, -1.0, 0.0] if of_files else scene_up(scene).tolist(),
         "background": scene.background,
     }
-    if scene.shots is not None:  # a fit in the open has Gaussians far beyond what was photographed
+    if scene.shots is not None:  # outdoor fits have Gaussians far beyond what was photographed
         options["view"] = tuple(place.tolist() for place in first_pose(scene)[:2])
         options["near"] = scene.shots.near
     if len(frames) > 1 and scene.num_moving > 0:
@@ -112,7 +112,7 @@ def files_of(path: Path) -> set[Path]:
 
 
 def _opened(scene: Any) -> tuple[Viewable, Path | None]:
-    """The scene to look at, and where it was read."""
+    """The scene to show, and the path it was read from, if any."""
     from gsjax.engine.checkpoint import open_scene
     from gsjax.viz.viewer import Viewable as Scene
 
@@ -172,7 +172,7 @@ def _playing(moments: list[Gaussians]) -> Viewable:
 
 
 def _direction(up: str | Sequence[float]) -> list[float]:
-    """A direction of length 1."""
+    """The up direction as a unit vector."""
     from gsjax.engine.viewables import UP
 
     if isinstance(up, str) and up not in UP:

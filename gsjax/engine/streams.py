@@ -1,4 +1,4 @@
-"""Standard streams that never end a run: what nobody can receive is dropped.
+"""Standard streams whose errors never end a run: output that cannot be delivered is dropped.
 
 Output may be closed (`>&-`), its reader may go away (`| head`), its disk may be full, its terminal may be
 gone, and its encoding may lack a character.
@@ -19,7 +19,7 @@ _NOBODY_READS = (errno.EPIPE, errno.EBADF, errno.EIO)
 
 
 class _Output(io.FileIO):
-    """The file of a stream. `lost` is the first error because of which something was dropped, or None."""
+    """The file of a stream. `lost` is the first error that made it drop output, or None."""
 
     lost: OSError | None = None
 
@@ -36,10 +36,10 @@ class _Output(io.FileIO):
 
 
 def keep_streams_open() -> None:
-    """Replace stdout and stderr of this process by ones whose errors are dropped.
+    """Replace stdout and stderr of this process by streams that ignore errors.
 
-    The numbers of closed streams are taken too: a file that is opened later would get one, and whatever a
-    library prints would end up in it.
+    File descriptors of closed streams are occupied too: otherwise a file opened later would get one, and
+    whatever a library prints would end up in that file.
     """
     for number in range(3):
         try:
@@ -50,7 +50,7 @@ def keep_streams_open() -> None:
 
 
 def lost_output() -> str | None:
-    """Why a part of stdout is lost, in words; None if all was written, or if nobody reads it."""
+    """Why a part of stdout was lost, in words; None if all was written, or if nobody reads it."""
     sys.stdout.flush()
     raw = getattr(getattr(sys.stdout, "buffer", None), "raw", None)
     lost = raw.lost if isinstance(raw, _Output) else None

@@ -1,4 +1,4 @@
-"""The outcome of a run as one value, which the terminal, report.html and `gsjax compare` all draw."""
+"""The outcome of a run as one value, which the terminal, report.html and `gsjax compare` all display."""
 
 import math
 import re
@@ -21,10 +21,10 @@ class Column(NamedTuple):
 
     Attributes:
         head: its heading.
-        key: of the rows' values that stand in it.
+        key: key of its values in the rows.
         unit: shown small below the heading.
-        decimals: digits behind the point of its fractions; None for three digits in all.
-        wide: a terminal of 80 columns has no room for it.
+        decimals: digits after the decimal point of fractions; None for three significant digits.
+        wide: whether only wide terminals show it (80 columns have no room for it).
         better: which of two values is better; None if neither.
     """
 
@@ -46,8 +46,8 @@ class Score(NamedTuple):
     Attributes:
         head, key, unit, decimals, better: of its column.
         value: metrics.json -> the number; None where there is none.
-        of: what two runs must share for it to be compared: the data, the held-out views too, or the machine
-            too.
+        of: what two runs must share for it to be comparable: the data, also the held-out views, or also the
+            machine.
     """
 
     head: str
@@ -65,7 +65,7 @@ class Score(NamedTuple):
 
 
 class Card(NamedTuple):
-    """A headline figure: its name, the value, the unit, and digits behind the point."""
+    """A headline figure: its name, the value, the unit, and digits after the decimal point."""
 
     head: str
     value: Any
@@ -84,13 +84,13 @@ class Table:
 
     Attributes:
         title: stands above it.
-        columns: all that there may be; those in which nothing stands are not drawn.
-        rows: values of each row by the columns' keys; what is missing or None is drawn as a dash.
+        columns: all possible columns; those without any value are not shown.
+        rows: values of each row by the columns' keys; a missing value or None is shown as a dash.
         note: a line below the table.
         means: closing rows, which stand out.
         best: (index of a row, key) of cells that stand out.
-        colors: one a row, RGB 0 to 255: that in which videos show what the row is about; none if empty.
-        brief: the terminal shows it too.
+        colors: one per row, RGB 0 to 255: the colour of the row's subject in videos; empty for none.
+        brief: whether the terminal shows it too.
     """
 
     title: str
@@ -112,7 +112,7 @@ class Table:
 
     @property
     def shown(self) -> list[Column]:
-        """The columns in which something stands."""
+        """The columns in which some row has a value."""
         return [c for c in self.columns if any(row.get(c.key) is not None for row in self.rows)]
 
     def is_numeric(self, column: Column) -> bool:
@@ -130,20 +130,20 @@ class Media(NamedTuple):
 
 @dataclass(frozen=True)
 class Summary:
-    """What a run, or a comparison of runs, came to.
+    """The outcome of a run, or of a comparison of runs.
 
     Attributes:
-        title: what was made of which data.
+        title: what was made from which data.
         subtitle: how, and with how much.
         cards: headline figures.
-        tables: figures in detail; those without rows are not drawn.
+        tables: figures in detail; those without rows are not shown.
         videos, plots, images: media, by kind.
         strips: images of several pictures side by side, one below the other.
         notes: what was not scored and why, and warnings.
-        machine: metrics.json's description of the machine, the last of the notes; None for none.
+        machine: description of the machine from metrics.json, shown as the last note; None for none.
         hints: (label, command): what to do next.
         complete: False for a run that was stopped.
-        resumable: False for a stopped run that saved nothing to go on from.
+        resumable: False for a stopped run that saved nothing to resume from.
     """
 
     title: str
@@ -173,7 +173,7 @@ def cards_of(scores: Iterable[Score], found: Metrics) -> list[Card]:
 
 
 def at(*names: str) -> Callable[[Metrics], Any]:
-    """The value of a score that stands at a path in metrics.json; None if there is none."""
+    """A `Score.value` that reads the value at a path in metrics.json; None if there is none."""
 
     def value(found: Metrics) -> Any:
         node: Any = found
@@ -185,7 +185,7 @@ def at(*names: str) -> Callable[[Metrics], Any]:
 
 
 def minutes(stage: str = "steps") -> Callable[[Metrics], float]:
-    """Minutes of a stage that repeats a step, compiling included."""
+    """A `Score.value`: minutes of a stage that repeats a step, compilation included."""
 
     def value(found: Metrics) -> float:
         return (found["seconds"][stage] + found["seconds"]["compile"]) / 60
@@ -212,7 +212,7 @@ def time_table(times: Mapping[str, str], seconds: Mapping[str, float]) -> Table:
 def format_number(value: Any, decimals: int | None = None) -> str:
     """The text of a cell: three digits for fractions, thin spaces between thousands, a dash for nothing.
 
-    With `decimals`, fractions have that many digits behind the point, so that a column lines up.
+    With `decimals`, fractions have that many digits after the decimal point, so that a column lines up.
     """
     if value is None:
         return "–"

@@ -63,7 +63,7 @@ def print_facts(facts: Mapping[str, str], title: str = "") -> None:
 
 
 def in_bytes(size: int) -> str:
-    """A size in bytes, as it is said: "12.3 MB"."""
+    """A size in bytes as text: "12.3 MB"."""
     return f"{size / 1e6:.1f} MB" if size >= 1e5 else f"{size / 1e3:.1f} kB"
 
 

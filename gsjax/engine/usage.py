@@ -1,4 +1,4 @@
-"""How the options of commands are shown by `--help`, and what is said of one that does not exist."""
+"""How `--help` shows the options of commands, and the error message for an option that does not exist."""
 
 import re
 from collections.abc import Callable, Iterator, Sequence
@@ -18,7 +18,7 @@ _UNSAID = (None, False, ())  # defaults that the help text explains, or that mea
 
 
 def plain_help() -> ConstructorRegistry:
-    """Rules for tyro by which help texts are wrapped once, and defaults that say nothing are left out."""
+    """Rules that make tyro wrap help texts only once, and leave out defaults that say nothing."""
     registry, within = ConstructorRegistry(), []
 
     @registry.struct_rule
@@ -46,7 +46,7 @@ def expect_known(kind: Any, command: str, arguments: Sequence[str]) -> None:
         arguments: the arguments after the name.
 
     Raises:
-        ValueError: one does not exist; the message names those that may be meant.
+        ValueError: one does not exist; the message suggests similar ones.
     """
     known = _options(kind)
     for before, argument in pairwise(("", *takewhile(lambda argument: argument != "--", arguments))):
@@ -64,17 +64,17 @@ def expect_known(kind: Any, command: str, arguments: Sequence[str]) -> None:
 
 
 def _plain(field: StructFieldSpec) -> StructFieldSpec:
-    """A field whose help text has no line breaks of the source, and no default that says nothing."""
+    """The field without the source's line breaks in its help text, or a default that says nothing."""
     kind, unsaid = field.type, any(field.default is value for value in _UNSAID)
     if unsaid:
         kind = Annotated[kind, tyro.conf.arg(help_behavior_hint="")]
-    if field.default is None:  # what is not given is None: nobody needs to write it
+    if field.default is None:  # None means not given: nobody needs to write it
         kind = tyro.conf.DisallowNone[kind]
     return replace(field, type=kind, helptext=_one_paragraph(field.helptext))
 
 
 def _one_paragraph(text: str | Callable[[], str | None] | None) -> Callable[[], str | None]:
-    """The text without line breaks, when it is wanted: finding it takes a while."""
+    """A function that returns the text without line breaks, only when it is needed: finding it is slow."""
 
     def joined() -> str | None:
         found = text() if callable(text) else text
@@ -84,7 +84,7 @@ def _one_paragraph(text: str | Callable[[], str | None] | None) -> Callable[[], 
 
 
 def without_commas(kind: Any, arguments: Sequence[str]) -> list[str]:
-    """A command line in which each number of a list is a word of its own, as in `--read.K 525,525,320,240`.
+    """A command line with comma-separated lists of numbers, `--read.K 525,525,320,240`, split into words.
 
     Args:
         kind, arguments: as for `expect_known`.
@@ -124,7 +124,7 @@ def _named(kind: type, prefix: str = "--") -> Iterator[tuple[str, Any]]:
 
 
 def _listed(hint: Any) -> Any:
-    """The tuple of a type that is one, perhaps annotated or optional; else the type."""
+    """The tuple type in a type hint that may be annotated or optional; else the hint."""
     inner = (
         [_listed(each) for each in get_args(hint)]
         if get_origin(hint) in (Annotated, Union, UnionType)

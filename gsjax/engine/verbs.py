@@ -1,6 +1,6 @@
 """The five verbs: `gsjax.fit`, `track`, `parts`, `distill` and `deform`.
 
-Each takes data as it was opened and yields a `Tick` per step (per frame, for `track`), whose `result` is the
+Each takes opened data and yields a `Tick` per step (per frame, for `track`), whose `result` is the
 scene so far:
 
     for now in gsjax.fit(photographs, gsjax.FitConfig(steps=2000)):
@@ -30,7 +30,7 @@ from gsjax.scene.gaussians import Gaussians
 if TYPE_CHECKING:
     from gsjax.engine.teaching.choice import TeacherChoice
 else:
-    TeacherChoice = Any  # slow to import, as all that finds a teacher is
+    TeacherChoice = Any  # slow to import, like everything that finds a teacher
 
 
 def fit(
@@ -76,15 +76,15 @@ def deform(
     after: Tick | None = None,
     extra_losses: ExtraLosses = (),
 ) -> Drive:
-    """Reconstruct a scene that deforms, seen by one camera (SurstSplat, GaussianClin).
+    """Reconstruct a deforming scene seen by one camera (SurstSplat, GaussianClin).
 
     Args:
         sequence: from `gsjax.open_sequence`; trains on all frames of its first camera (see `select`).
             Depth is the camera's own, else from stereo matching with the second camera; without either, the
             scene starts within its visual hull if the camera goes around it, else as a plane.
         config: settings (default: `PRESETS["around"]` of `gsjax.methods.deform` for the hull of an object in
-            transparent pictures, else those of `DeformConfig`).
-        teacher: source of the features learned beside colours: "classes" of masks, "closed", a folder of
+            pictures with transparency, else those of `DeformConfig`).
+        teacher: source of the features learned alongside colours: "classes" of masks, "closed", a folder of
             feature files, "none", or a `TeacherChoice` with weights and masks (default: classes, if there are
             two or more among the pixels that count).
         tools: whether tools, recognised by the names of mask values, are left out ("leave-out") or drawn
@@ -97,8 +97,8 @@ def deform(
         extra_losses: custom losses `loss(scene, rendered, frame)`; see `gsjax.losses.extra`.
 
     Returns:
-        ticks, whose `result` is a `DeformResult`: `at(time)` are the `Gaussians` at a time, 0 to 1, and
-        `query(text)` scores them.
+        ticks, whose `result` is a `DeformResult`: `at(time)` gives the `Gaussians` at a time, 0 to 1,
+        and `query(text)` scores them.
 
     Raises:
         ValueError: as for `gsjax.methods.deform.Deform.start`; the teacher does not fit the recording; or
@@ -122,10 +122,10 @@ def distill(
     rasterize_mode: str = "classic",
     after: Tick | None = None,
 ) -> Drive:
-    """Distil a semantic field for a static scene, which answers queries in 3D (FD-3DGS).
+    """Distil a semantic field, which answers queries in 3D, for a static scene (FD-3DGS).
 
     Args:
-        scene: the Gaussians, from any fit; they do not change.
+        scene: the Gaussians, from any fit; they are not changed.
         photographs: views of the scene, posed in its world; all of them are used (see `select`).
         teacher: features of the photographs' pixels: "classes" of their masks, "closed" for colours and
             outlines of masks, "auto" (classes where there are masks, else closed), a folder of feature files,
@@ -133,7 +133,7 @@ def distill(
             Outputs of encoders and segmenters are cached in the user's cache folder.
         config: settings (default: `PRESETS["field"]` of `gsjax.methods.distill`, which takes a minute or two;
             `DistillConfig()` has the paper's).
-        rasterize_mode: "antialiased" for a scene that was fitted with it.
+        rasterize_mode: "antialiased" for a scene that was fitted that way.
         after: a tick of an earlier distillation of the same scene and photographs, to continue from.
 
     Returns:
@@ -168,13 +168,13 @@ def parts(
     """Find the parts of a moving scene by their motion, without annotation (MotionSplicer).
 
     Args:
-        sequence: from `gsjax.open_sequence`, of synchronised cameras; or two frames with depth, each by
-            cameras of its own, which are two states.
+        sequence: from `gsjax.open_sequence`: synchronised cameras; or two states, which are two frames with
+            depth, each seen by cameras of its own.
         config: settings (default: those of `PartsConfig`).
         eval_cameras: ids of the cameras to hold out.
         anchor: index of the canonical frame (default: the one that differs most from the others).
-        gaussians: the scene at `anchor`, which must then be given (default: it is fitted, which takes
-            minutes).
+        gaussians: the scene at `anchor`, which must then be given too (default: it is fitted, which
+            takes minutes).
         segmenter: divides a picture into pieces (default: one without weights).
         after: a tick of an earlier discovery in the same sequence, to continue from.
         extra_losses: custom losses `loss(scene, rendered, frame)`; see `gsjax.losses.extra`.
@@ -184,7 +184,7 @@ def parts(
 
     Raises:
         ValueError: there are fewer than two cameras or frames, a camera to hold out does not exist, Gaussians
-            are given without an anchor, two states have no depth, or nothing is found that moves.
+            are given without an anchor, two states have no depth, or nothing that moves is found.
         DataError: a picture cannot be read.
     """
     from gsjax.engine.parts.start import FIT, detect_motion, discover, has_two_states
@@ -214,13 +214,13 @@ def parts(
     return drive(method, problem, run, headroom=config.headroom)
 
 
-_TRAINED = {"exposures": "exposure", "twists": "refine_poses"}  # what a setting adds to what is trained
+_TRAINED = {"exposures": "exposure", "twists": "refine_poses"}  # trained parameters: settings that add them
 
 
 def _going_on(after: Tick, method: Method, begun: Run | None = None) -> Run:
-    """A copy of an earlier tick's run, as steps donate its arrays, and one may go on from a tick twice. With
-    other settings or losses, its losses are not compared with those before. What is trained must be what a
-    run that has just begun would train."""
+    """A copy of an earlier tick's run, because steps donate its arrays, and a tick may be continued twice.
+    With other settings or losses, new losses are not compared with earlier ones. The run must have the
+    trained parameters that a new run would have."""
     warn_of_lost(after, getattr(method, "extra_losses", ()))
     run = after.run
     held = run.params, run.state

@@ -1,4 +1,4 @@
-"""The scenes that `gsjax view` opens: a run of any kind, a file of Gaussians or a folder of numbered ones."""
+"""The scenes that `gsjax view` opens: any run, a file of Gaussians or a folder of numbered files."""
 
 from dataclasses import fields, replace
 from pathlib import Path
@@ -43,7 +43,7 @@ from gsjax.viz.viewer import Motion, Shots, Viewable, moved
 Up = Literal["auto", "x", "y", "z", "-x", "-y", "-z"]
 UP = {sign + axis: s * np.eye(3)[i] for sign, s in (("", 1), ("-", -1)) for i, axis in enumerate("xyz")}
 """Directions by their names."""
-_SAME_COLOR = 0.1  # of a coefficient: two steps of the coarsest format
+_SAME_COLOR = 0.1  # of a coefficient: two quantisation steps of the coarsest format
 _AGAIN = "reconstruct it again with this version of gsjax"
 
 
@@ -54,14 +54,14 @@ def open_viewable(
 
     Args:
         path: a run, a field, a film of `gsjax edit`, a file of Gaussians in any format that `read_gaussians`
-            reads, or a folder of numbered ones, the frames of a scene that moves.
+            reads, or a folder of numbered files, the frames of a moving scene.
         notes: collects warnings.
-        now: the present paths of what a field or a fit refers to.
-        photographs: whether those of a fit or of a deforming run are opened, if they are still there.
+        now: the current paths of what a field or a fit refers to.
+        photographs: whether to open those of a fit or of a deforming run, if they are still there.
 
     Raises:
         FileNotFoundError: there is no such file, or the folder is no run with a scene.
-        ValueError: the file holds no Gaussians, or is not as the run wrote it; or a path in `now` does not
+        ValueError: the file holds no Gaussians, or not what the run wrote; or a path in `now` does not
             apply.
     """
     if is_scene(path / "meta.json"):
@@ -109,7 +109,7 @@ def open_viewable(
 
 
 def _of_files(path: Path, files: list[Path], notes: Notes) -> Viewable:
-    """The scene whose frames are files, in their order; in the coordinates of the first."""
+    """The scene whose frames are files, in order, in the coordinates of the first."""
     read = read_frames(files)
     first, report = next(read)
     frames = [first, *(moved_to(there, known.origin, report.origin) for there, known in read)]
@@ -205,8 +205,8 @@ def _of_fit(path: Path, notes: Notes, now: Locations, shown: bool) -> Viewable:
 
 
 def _of_deformation(path: Path, notes: Notes, weights: Path | None, shown: bool) -> Viewable:
-    """The scene of a run of `gsjax deform` over time, with its photographs where its recording still is; it
-    can be queried if its features have a meaning."""
+    """The scene of a run of `gsjax deform` over time, with its photographs if the recording is still there;
+    it can be queried if its features have a meaning."""
     result = read_deformation(path / DEFORMATION)
     kind = None if result.meaning is None else result.meaning.source.kind
     if weights is not None and kind in (None, "classes", "closed"):
@@ -241,7 +241,7 @@ def _of_track(path: Path, notes: Notes, now: Locations) -> Viewable:
     try:
         saved = open_run(path)
     except ValueError as error:
-        tracking, origin = read_tracking(path)  # if that is damaged, it is an error
+        tracking, origin = read_tracking(path)  # an error if that is damaged too
         notes.warn(f"its recording is not shown: {error}")
     else:
         tracking, names = saved.tracking, saved.names

@@ -30,7 +30,7 @@ class View(NamedTuple):
         held_out: whether the camera is held out.
         image, depth, mask: the recording; None if there is no such file.
         render, render_depth: the scene; depth is 0 where nothing is drawn.
-        groups: the group on top in each pixel, 0 for background.
+        groups: the group with the largest share of each pixel, 0 for background.
         covered: whether something is drawn there.
     """
 

@@ -1,8 +1,8 @@
 """Running cells on the workers of a Dask cluster: processes here, those at an address, or SLURM jobs.
 
 A worker has a checkout of its own and gets the options of a cell. It runs the cell in a temporary folder and
-sends back all that the cell left: record and files. So no disk need be shared, and the experiment's folder
-ends up as after a run in this process.
+sends back all that the cell left: its record and files. So no disk need be shared, and the experiment's
+folder ends up as after a run in this process.
 """
 
 import io
@@ -93,7 +93,7 @@ def run_on_cluster(
                         f"a worker cannot load the code of a cell: {error}; start workers where gsjax "
                         f"{experiment.made_with} is installed, as here"
                     ) from error
-                future.release()  # before its worker can die, for then Dask would compute it again
+                future.release()  # or else Dask would compute it again if its worker died
                 yield cell, record
             if not under_way and suspects:
                 future, cell = suspects.pop(0)
@@ -118,8 +118,8 @@ def _submit(client: Any, experiment: Experiment, cell: Cell, sharing: int | None
     about = (f"{experiment.root}", experiment.name, experiment.fingerprint, experiment.made_with)
     arguments = (*about, cell.options, cell.seed, sharing, debug)
     key = f"{_KEYS}{import_module('dask.base').tokenize(arguments)}"
-    # By its name, and with plain arguments: a worker without this module then reports that it cannot load it,
-    # where unpickling a function of the module would break the worker.
+    # By module name, and with plain arguments: a worker without this module then reports that it cannot load
+    # it, whereas unpickling a function of the module would break the worker.
     module = __name__
     return client.submit(lambda: import_module(module).run_there(*arguments), key=key)
 
@@ -176,7 +176,7 @@ def run_there(
 
 def _wait_until_collected(worker: Any) -> None:
     """Wait until the client has stored what this worker computed before, because the next cell may kill it;
-    not for ever, because the client may have gone."""
+    but not for ever, because the client may be gone."""
     for _ in range(int(_COLLECTED_S / 0.01)):
         if not any(str(key).startswith(_KEYS) for key in list(worker.data)):
             return
@@ -216,7 +216,7 @@ def _keep_to_share(index: int, sharing: int) -> None:
 
 
 def _finished(client: Any, futures: list[Any], say: Callable[[str], Any]) -> list[Any]:
-    """The finished futures, as soon as there is one."""
+    """The finished futures, as soon as there are any."""
     while True:
         with suppress(OSError):  # the client is reconnecting, and gives up after a while
             workers = len(client.nthreads())
@@ -275,7 +275,7 @@ def _client(scheduler: str, workers: int | None) -> Iterator[Any]:
             )
         elif scheduler == SLURM:
             place = stack.enter_context(slurm_cluster())
-            place.adapt(minimum_jobs=workers, maximum_jobs=workers)  # starts another for one that ended
+            place.adapt(minimum_jobs=workers, maximum_jobs=workers)  # replaces jobs that ended
         try:
             client = distributed.Client(place, timeout=CONNECT_S)
         except OSError as error:

@@ -138,7 +138,7 @@ def _write_page(experiment: Experiment, shown: Shown, notes: list[str], drawing:
 
 
 def _aligned(column: tuple[str, ...]) -> list[str]:
-    """Numbers with aligned decimal points, also where a page aligns them at the left."""
+    """Numbers with aligned decimal points, even where a page aligns them to the left."""
     lengths = [len(text.partition(" ")[0]) for text in column]
     spaces = ("\u2007" * (max(lengths) - length) for length in lengths)  # each as wide as a digit
     return [space + text for space, text in zip(spaces, column, strict=True)]

@@ -70,7 +70,7 @@ def run_cell(
         result, error = None, f"{kind}: {describe(failure)}".removesuffix(f": {kind}")
         trace = traceback.format_exc().splitlines()
     outcome = {"result": result, "traceback": trace, "seconds": perf_counter() - begun}
-    # The machine is described after the script ran, which may configure JAX first.
+    # The machine is described after the script ran, because the script may configure JAX.
     record = experiment.new_record(cell, error, **outcome, machine=machine.describe())
     write_json(path, record | {"gsjax": made_with})
     with contextlib.suppress(OSError):  # the script has left files in it
@@ -79,7 +79,7 @@ def run_cell(
 
 
 def _check_result(result: Any, cell: Cell) -> None:
-    """Raises a TypeError unless the result is a dict that JSON can hold, by names that are not reserved."""
+    """Raises a TypeError unless the result is a dict that JSON can hold, without reserved names."""
     if not isinstance(result, Mapping):
         raise TypeError(f"run() returned {type(result).__name__}, expected a dict of named figures")
     for key, value in result.items():

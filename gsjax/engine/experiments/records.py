@@ -1,4 +1,4 @@
-"""Records of cells: a file each in runs/, and the rows of results.json, which are committed."""
+"""Records of cells: one file each in runs/, and the rows of results.json, which are committed."""
 
 from pathlib import Path
 from typing import Any
@@ -23,7 +23,7 @@ def read_record(path: Path) -> dict[str, Any]:
 
 
 def committed_rows(path: Path) -> list[dict[str, Any]]:
-    """The records in a results.json, which holds what all rows share only once; none if there is no such
+    """The records in a results.json, which stores what all rows share only once; none if there is no such
     file.
 
     Raises:

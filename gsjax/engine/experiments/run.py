@@ -1,4 +1,4 @@
-"""A run of `gsjax experiment`: a sweep that supports a claim, resumed where it stopped, and collected."""
+"""`gsjax experiment`: runs or resumes the sweep that supports a claim, and collects its results."""
 
 import contextlib
 import json
@@ -105,7 +105,7 @@ def run_experiment(experiment: Experiment, options: Run) -> int:
     chosen = choose(experiment, options.seeds, options.only)
     script_run, figure = experiment.load()
     _check_executor(options)
-    experiment.committed()  # an error now, if it cannot be read, and not after hours
+    experiment.committed()  # if it cannot be read, fail now and not after hours
     left = [cell for cell in chosen if options.fresh or not experiment.is_done(experiment.own(cell))]
     if len(left) < len(chosen):
         console.print(f"{len(chosen) - len(left)} of {len(chosen)} cells are done; --fresh runs them again")
@@ -174,7 +174,7 @@ def choose(experiment: Experiment, seeds: tuple[int, ...], only: tuple[str, ...]
         key, sign, value = text.partition("=")
         if not sign:
             raise ValueError(f"--only: expected KEY=VALUE, found {text!r}")
-        with contextlib.suppress(ValueError):  # 1e-3 and 0.001 are one
+        with contextlib.suppress(ValueError):  # 1e-3 and 0.001 are the same
             value = in_words(json.loads(value))
         wanted.setdefault(key, set()).add(value)
     words = [cell.words for cell in experiment.cells]

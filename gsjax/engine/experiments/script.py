@@ -39,7 +39,7 @@ def load_script(root: Path, path: Path, text: str, described: bool) -> tuple[Cal
     spec = spec_from_file_location(name, path)
     assert spec is not None
     module = module_from_spec(spec)
-    import_module("gsjax.viz")  # with it, the script may import matplotlib whatever MPLBACKEND says
+    import_module("gsjax.viz")  # then the script can import matplotlib whatever MPLBACKEND says
     sys.modules[name] = module  # where dataclasses, pickle and other scripts look it up
     try:
         exec(compile(text, str(path), "exec"), module.__dict__)
@@ -122,7 +122,7 @@ def _is_figure(node: ast.AST) -> bool:
 
 def _only_imports(node: ast.AST, packages: tuple[str, ...]) -> bool:
     """Whether a statement only imports from these packages, under the original names: with `as`, one thing
-    may replace another without a change where it is used."""
+    could replace another without any change where it is used."""
     if isinstance(node, ast.Import | ast.ImportFrom) and any(alias.asname for alias in node.names):
         return False
     if isinstance(node, ast.ImportFrom):
@@ -149,8 +149,8 @@ def _without(text: str, left_out: Callable[[ast.AST], bool]) -> str:
 
 
 def made_with_of(root: Path) -> str:
-    """Version of gsjax, and a hash of its sources and of shared modules. Rows of one table may come from
-    several, which a remark then says."""
+    """Version of gsjax, and a hash of its sources and of shared modules. If the rows of a table come from
+    several versions, a remark says so."""
     return f"{import_module('gsjax').__version__}+{_hash_of(root.resolve())}"
 
 

@@ -26,7 +26,7 @@ from gsjax.engine.experiments.script import fingerprint_of, load_script, made_wi
 
 RESERVED = ("seed", "seconds")
 """Names that a row uses besides options and figures, so neither may have them."""
-# YAML 1.1 reads these as text, which is not meant in a sweep.
+# YAML 1.1 reads these as text, which a sweep never intends.
 _NUMBER_AS_TEXT = re.compile(r"[-+]?\d+(\.\d*)?[eE][-+]?\d+")
 
 
@@ -118,7 +118,7 @@ class Experiment:
     def records(self) -> list[dict[str, Any]]:
         """All records of the cells, in order: this machine's, else those committed.
 
-        A stale or failed one is replaced by a committed one that is neither: others may have run it since.
+        A stale or failed one gives way to a committed one that is neither: others may have run it since.
         """
         committed, known = self.committed(), []
         for cell in self.cells:
@@ -155,7 +155,7 @@ def read_experiment(root: Path, name: str, out: Path) -> Experiment:
         ValueError: there is none, or its config is invalid.
     """
     names = experiment_names(root)
-    # Shells complete the path of the folder, with a slash at its end.
+    # Shell completion gives the path of the folder, with a trailing slash.
     name = next((n for n in names if Path(name) in (Path(n), root / n)), name)
     below = [n for n in names if n.startswith(name.rstrip("/") + "/")]
     known = ", ".join(below or names) or f"none; create one as {root}/NAME/{CONFIG}"
