@@ -1,8 +1,8 @@
 """What each format preserves of a scene: `python -m benchmarks.formats SCENE [--up UP] [--out TABLE.json]`.
 
-The scene is rendered in eight views on a circle around it, 320 x 240 pixels. A format's figure is the lowest
-PSNR against these of renders of its file, read back by us and by other programs where they are installed
-(tests/io/converters.py); and likewise for files that those programs write and we read.
+The scene is rendered in eight views on a circle around it, 320 x 240 pixels. The figure is the lowest PSNR
+between these renders and those of the file, read back by us and by other programs where they are installed
+(tests/io/converters.py); likewise for the files that those programs write of the scene, read by us.
 """
 
 import argparse

@@ -54,7 +54,7 @@ class Case(NamedTuple):
 
 @contextmanager
 def bounded(seconds: float = SECONDS, gib: float = GIB) -> Iterator[None]:
-    """Raise Overtime after `seconds` of computing, and MemoryError if more than `gib` of memory is added."""
+    """Raise Overtime after `seconds` of computing; needing more than `gib` of new memory is a MemoryError."""
 
     def stop(*_: object) -> None:
         raise Overtime(f"more than {seconds:g} s")

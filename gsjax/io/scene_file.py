@@ -167,7 +167,7 @@ def expect_room(path: Path, size: int, stored: int, what: str) -> None:
 
     Args:
         path: the file, for the error.
-        size: bytes that it says it unpacks to.
+        size: bytes that it claims to unpack to.
         stored: bytes that it takes in the file.
         what: what is unpacked, for the error.
 

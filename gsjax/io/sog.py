@@ -83,7 +83,7 @@ def read_sog(path: Path) -> tuple[Gaussians, SceneReport]:
         path: the file.
 
     Raises:
-        SceneError: it is no SOG of version 2, or cut off; a picture is missing, too small for the Gaussians
+        SceneError: it is not SOG version 2, or is cut off; a picture is missing, too small for the Gaussians
             or far larger than its file allows; or a name leads out of the archive or folder.
     """
     if path.suffix.lower() == ".json":
