@@ -65,7 +65,7 @@ def _of_archive(archive: zipfile.ZipFile, size: int) -> dict[str, np.ndarray]:
 
 
 def _array(file: Any, size: int) -> np.ndarray:
-    """The array in a stream of `size` bytes; its header is checked against it before memory is allocated."""
+    """The array in a stream of `size` bytes, whose header is checked before memory is allocated."""
     version = npy.read_magic(file)
     if version not in _HEADERS:
         raise ValueError(f"version {version} of .npy")

@@ -1,4 +1,4 @@
-"""Writes glTF with KHR_gaussian_splatting as one .glb, without quantisation. The format is not read.
+"""Writes glTF with KHR_gaussian_splatting as one .glb, with Gaussians in float32. The format is not read.
 
 Attributes of one primitive of points: POSITION, rotations x y z w, scales, opacities 0 to 1 and an
 accessor for each coefficient of the harmonics, all float32; and COLOR_0, for programs that lack the extension

@@ -1,4 +1,4 @@
-"""Reads the .ksplat of mkkellogg's GaussianSplats3D: sections of records, little-endian. It is not written.
+"""Reads mkkellogg's .ksplat (GaussianSplats3D): sections of records, little-endian. It is not written.
 
     header     4096 bytes: version, numbers of sections and of Gaussians, level, range of harmonics
     sections   1024 bytes each: numbers of Gaussians, of buckets and of their bytes, degree of harmonics

@@ -37,7 +37,7 @@ class Film(NamedTuple):
     Attributes:
         at: frame -> all Gaussians; colours are the same in all.
         times: times of the T frames (two or more) in seconds, increasing.
-        num_moving: only this many Gaussians, the first ones, may differ between frames.
+        num_moving: only the first `num_moving` Gaussians may differ between frames.
     """
 
     at: Callable[[int], Gaussians]

@@ -16,7 +16,7 @@ _NUMBERED = re.compile(rf"(.*?)(\d+)({'|'.join(map(re.escape, READ))})", re.I | 
 
 
 def frame_files(folder: str | os.PathLike) -> list[Path]:
-    """The files of a folder that holds only the numbered frames of one scene, by number; otherwise none.
+    """The files of a folder that holds only the numbered frames of one scene, in order; otherwise none.
 
     There are two or more, whose names differ in a number before the ending. Labels and texts (.txt, .md,
     .log, without an ending) beside them, hidden files and folders are ignored.
