@@ -21,7 +21,7 @@ _UNSTEADY_KEYS = {"seconds", "machine", "fps", "from_cache"}
 _UNSTEADY_ENDINGS = ("_seconds", "_s", "_ms", "_hz", "_mb")
 _UNSTEADY_ARRAYS = {"update_s"}
 _OPTION_KEYS = {"photographs"}
-"""Entries of text within NPZ files that hold names of options: how a dataset was chosen."""
+"""Text entries of NPZ files that hold names of options, such as how a dataset was chosen."""
 _TIME = re.compile(r"\d[\d.,]*\s*(?:ms|s|seconds?|min|minutes?|hz|mb|gib|times a second)\b", re.IGNORECASE)
 _NUMBER = re.compile(r"\d+(?:[.,]\d+)*")
 _QUANTILES = (0.0, 0.05, 0.25, 0.5, 0.75, 0.95, 1.0)
@@ -67,8 +67,8 @@ def describe_text(text: str) -> dict[str, Any]:
 
 
 def steady(value: Any, left_out: Iterable[str] = ()) -> Any:
-    """A value from JSON without times, rates, machines and paths; of sentences only numbers remain, for words
-    are not results."""
+    """A value from JSON without times, rates, machines and paths; of sentences only the numbers remain, since
+    wording is not a result."""
     if isinstance(value, Mapping):
         return {
             key: steady(item, left_out)
@@ -87,7 +87,7 @@ def steady(value: Any, left_out: Iterable[str] = ()) -> Any:
 
 
 def _is_after_a_time(row: Any) -> bool:
-    """Whether it is a row of a fit's curve at a share of its minutes, whose step depends on the machine."""
+    """Whether it is a row of a fit's curve at a fraction of its time, whose step depends on the machine."""
     return isinstance(row, Mapping) and "part" in row and row.get("sh_degree", 0) is None
 
 
@@ -107,8 +107,8 @@ def _arrays(path: Path) -> Iterator[tuple[str, np.ndarray]]:
 
 
 def describe_file(path: Path) -> dict[str, Any]:
-    """The digest of one file: {"arrays": ...} or {"says": ...}; of others, such as videos, reports and
-    settings, only their existence."""
+    """The digest of one file: {"arrays": ...} or {"says": ...}; for other files, such as videos, reports and
+    settings, only their existence is recorded."""
     if path.suffix in (".npz", ".ply", ".png"):
         arrays = {name: array for name, array in _arrays(path) if name not in _UNSTEADY_ARRAYS}
         return {
@@ -131,7 +131,7 @@ def describe_run(folder: Path) -> dict[str, Any]:
 
 
 def compare(before: Mapping[str, Any], after: Mapping[str, Any]) -> dict[str, list[str]]:
-    """Differences between two records by case, a line each; no line where all is identical to the bit.
+    """Differences between two records by case, one line each; no lines for a case that is bitwise identical.
 
     Raises:
         ValueError: the records are of different formats.
@@ -172,7 +172,7 @@ def _compare_files(path: str, before: Mapping[str, Any] | None, after: Mapping[s
 
 
 def _compare_values(where: str, before: Any, after: Any) -> list[str]:
-    """Lines for all that differs between two values from JSON, named as in test.psnr or views[2].ssim."""
+    """Lines for all differences between two values from JSON, named as in test.psnr or views[2].ssim."""
     if isinstance(before, Mapping) and isinstance(after, Mapping):
         dot, lines = "." if where else "", []
         for key in dict.fromkeys([*before, *after]):

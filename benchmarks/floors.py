@@ -1,5 +1,5 @@
-"""Lower bounds of any implementation: exp for every pair, copying inputs and outputs once, and for features
-a matrix product over pairs and channels."""
+"""Lower bounds for any implementation: exp for every pair, copying inputs and outputs once, and, for
+features, a matrix product over pairs and channels."""
 
 import math
 from collections.abc import Sequence

@@ -1,8 +1,8 @@
-"""What each format makes of a scene: `python -m benchmarks.formats SCENE [--up UP] [--out TABLE.json]`.
+"""What each format preserves of a scene: `python -m benchmarks.formats SCENE [--up UP] [--out TABLE.json]`.
 
-Eight views on a circle around the scene, 320 x 240 pixels: the least PSNR of a render of the file read back,
-by us and by other programs where they are installed (tests/io/converters.py), against one of the scene; and
-of the files that those programs write of the scene, read by us.
+The scene is rendered in eight views on a circle around it, 320 x 240 pixels. The figure is the lowest PSNR
+between these renders and those of the file, read back by us and by other programs where they are installed
+(tests/io/converters.py); likewise for the files that those programs write of the scene, read by us.
 """
 
 import argparse
@@ -50,7 +50,7 @@ def cameras_around(gaussians: Gaussians, up: np.ndarray) -> Camera:
 
 
 class Judge:
-    """The least PSNR of a scene in its views, in dB, to a tenth; "exact" where nothing differs."""
+    """Rates copies of a scene by the lowest PSNR of its views, in dB, to a tenth; "exact" if none differs."""
 
     def __init__(self, gaussians: Gaussians, up: np.ndarray):
         """
@@ -65,7 +65,7 @@ class Judge:
         """Judge another scene.
 
         Args:
-            gaussians: it.
+            gaussians: the scene to judge.
         """
         found = np.asarray(render(gaussians, self._cameras).colors)
         worst = min(psnr(a, b) for a, b in zip(found, self._wanted, strict=True))
@@ -73,11 +73,11 @@ class Judge:
 
 
 def measure(scene: Gaussians, judge: Judge, folder: Path) -> dict[str, dict]:
-    """The row of each format: sizes, seconds, and dB by who wrote and who read.
+    """The row of each format: size, seconds, and dB by writer and reader.
 
     Args:
         scene: the scene.
-        judge: of it.
+        judge: the judge of that scene.
         folder: an empty folder.
     """
     programs = [program for program in CONVERTERS.values() if program.installed]
@@ -113,8 +113,8 @@ def table(rows: dict[str, dict], count: int) -> str:
     """The rows in Markdown.
 
     Args:
-        rows: as `measure` makes them.
-        count: of Gaussians.
+        rows: as returned by `measure`.
+        count: number of Gaussians.
     """
     said = [key for row in rows.values() for key in row if key.startswith(("read by", "written by"))]
     others = list(dict.fromkeys(said))

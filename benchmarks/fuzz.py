@@ -5,7 +5,7 @@ element of it. Then every image and every gradient (or tangent) has to be finite
 
 - a Gaussian that cannot be drawn is counted in `meta.culled`, and the rest is bitwise equal to the scene
   without it;
-- a Gaussian that is not counted is drawn as by the float64 reference, or left out if it is invisible there;
+- a Gaussian that is not counted is drawn as in the float64 reference, or left out if it is invisible there;
 - `reads` changes no bit; a camera that is not finite sees nothing and counts every row as culled; a
   background that is not finite, or whose square is not, is black.
 

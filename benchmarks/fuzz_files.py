@@ -1,9 +1,9 @@
-"""Fuzz the readers of files: damage one file of what a reader reads, and look at what it makes of it.
+"""Fuzz the readers of files: damage one of the files that a reader reads, and check how it responds.
 
-It may read it, with warnings, or refuse it in a sentence that names the file (docs/data-errors.md). A fault
-is any other exception, a message that is endless or names no file, a number that is not finite, more than
-`SECONDS` of computing or `GIB` of new memory, and the end of the process. Each case is made from the seed and
-its number alone. Run it with
+It may read the file, with warnings, or refuse it in a sentence that names the file (docs/data-errors.md). A
+fault is any other exception, a message that is endless or names no file, a number that is not finite, more
+than `SECONDS` of computing or `GIB` of new memory, or a crash of the process. Each case depends only on the
+seed and its number. Run it with
 
     python -m benchmarks.fuzz_files --count 10000 --out benchmarks/results/fuzz_files.json
     python -m benchmarks.fuzz_files --only .splat --seed 0 --first 123 --count 1   # one case, as printed
@@ -36,7 +36,7 @@ from gsjax.engine.program import USER_ERRORS
 
 SECONDS, GIB = 2.0, 1.0
 LONGEST = 1000  # characters of a message
-_NO_ANSWER_S = 60.0  # on the clock: a library may compute beyond what a signal interrupts
+_NO_ANSWER_S = 60.0  # wall-clock time, because signals do not interrupt a library's computing
 _GIB = 1 << 30
 
 
@@ -45,7 +45,7 @@ class Overtime(BaseException):
 
 
 class Case(NamedTuple):
-    """What came of a case: "read", "refused" or "fault", and what was said."""
+    """The outcome of a case: "read", "refused" or "fault", and the message."""
 
     number: int
     outcome: str
@@ -54,7 +54,7 @@ class Case(NamedTuple):
 
 @contextmanager
 def bounded(seconds: float = SECONDS, gib: float = GIB) -> Iterator[None]:
-    """Raises Overtime after so much computing, and a MemoryError where so much new memory is not enough."""
+    """Raise Overtime after `seconds` of computing; needing more than `gib` of new memory is a MemoryError."""
 
     def stop(*_: object) -> None:
         raise Overtime(f"more than {seconds:g} s")
@@ -76,7 +76,7 @@ def bounded(seconds: float = SECONDS, gib: float = GIB) -> Iterator[None]:
 
 
 class Trial:
-    """A reader with sound files in a folder, one of which is damaged in each case."""
+    """A reader with intact files in a folder, one of which is damaged in each case."""
 
     def __init__(self, reader: Reader, folder: Path):
         """
@@ -99,8 +99,8 @@ class Trial:
         """Damage a file, open it, and put it back.
 
         Args:
-            seed: of all cases.
-            number: of this case.
+            seed: the seed of all cases.
+            number: the number of this case.
         """
         rng = np.random.default_rng([seed, number])
         kind = self._kinds[rng.integers(len(self._kinds))]
@@ -147,9 +147,9 @@ def try_reader(name: str, numbers: Iterator[int] | range, seed: int, folder: Pat
     """Cases of a reader, in this process.
 
     Args:
-        name: of the reader, as in `READERS`.
-        numbers: of the cases.
-        seed: of all cases.
+        name: name of the reader, as in `READERS`.
+        numbers: numbers of the cases.
+        seed: the seed of all cases.
         folder: an empty folder.
     """
     trial = Trial(READERS[name], folder)
@@ -165,12 +165,12 @@ def _work(name: str, first: int, end: int, seed: int, pipe: Connection) -> None:
 
 
 def try_apart(name: str, first: int, end: int, seed: int) -> Iterator[Case]:
-    """Cases of a reader, in a process of its own, and another one where a case ends that.
+    """Cases of a reader, in a separate process, which is replaced whenever a case ends it.
 
     Args:
-        name: of the reader.
-        first, end: numbers of the cases.
-        seed: of all cases.
+        name: name of the reader.
+        first, end: range of the numbers of the cases; `end` is not included.
+        seed: the seed of all cases.
     """
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(["benchmarks.readers"])  # imported once for all processes
@@ -231,7 +231,7 @@ def main() -> None:
 
 
 def _by_place(faults: list[dict]) -> dict[str, list[int]]:
-    """Numbers of the cases with faults, by the first of what is said of those that come from one place."""
+    """Numbers of the cases with faults, grouped by the place that raised them, under its first message."""
     alike: dict[str, list[int]] = {}
     for fault in faults:
         place = fault["said"].rpartition("(")[2]

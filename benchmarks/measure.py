@@ -19,7 +19,7 @@ from gsjax.rasterize.rasterization import plan as make_plan
 
 MAX_ATTEMPTS = 3  # for a noisy workload
 GIB = 2**30
-PRODUCTS = {FORWARD: 1, BACKWARD: 3}  # of the weights' and features' values; then of the slopes of both
+PRODUCTS = {FORWARD: 1, BACKWARD: 3}  # of weights and features; backward also their gradients
 PLAIN, UNREAD = ", plain jit", ", no reads"
 
 

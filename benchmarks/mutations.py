@@ -1,6 +1,6 @@
-"""Mutations of files for benchmarks/fuzz_files.py: bytes, lines, JSON, and what gzip, zip and PNG pack.
+"""Mutations of files for benchmarks/fuzz_files.py: bytes, lines, JSON, and what gzip, zip and PNG contain.
 
-Checksums are made right again, so that readers look at what is behind them.
+Checksums are recomputed, so that readers do not stop at them.
 """
 
 import copy
@@ -51,8 +51,8 @@ def mutated(content: bytes, others: Sequence[bytes], rng: Rng) -> bytes:
 
     Args:
         content: the file.
-        others: other files, of which blocks are taken.
-        rng: decides all.
+        others: other files, from which blocks are taken.
+        rng: makes all random choices.
     """
     if rng.random() < 0.02:
         return b"" if rng.random() < 0.5 else _any(others, rng)
@@ -78,7 +78,7 @@ def _any(options: Sequence[Any], rng: Rng) -> Any:
 
 
 def _place(content: bytes, rng: Rng) -> int:
-    """Headers, where more is decided, are changed as often as all the rest."""
+    """A random position: half of the time in the header, which matters more than the rest."""
     return int(rng.integers(min(len(content), 256 if rng.random() < 0.5 else len(content)) + 1))
 
 
@@ -158,7 +158,7 @@ def _changed_lines(content: bytes, rng: Rng) -> bytes:
 
 
 def _json_of(content: bytes) -> Any:
-    """The tree of a JSON file; None if it is none."""
+    """The tree of a JSON file; None if it is not JSON."""
     if content[:1] not in (b"{", b"["):
         return None
     try:
@@ -209,13 +209,13 @@ def _places(node: Any) -> list[tuple[Any, Any]]:
     return places
 
 
-# What is packed.
+# Packed content.
 
 Change = Callable[[bytes], bytes]
 
 
 def _unpacked(content: bytes) -> Callable[[Change, Rng], bytes] | None:
-    """How to change what a file packs; None if it packs nothing."""
+    """How to change the packed content of a file; None if it has none."""
     if content.startswith(b"\x1f\x8b"):
         return lambda change, _: gzip.compress(change(gzip.decompress(content)), 1, mtime=0)
     if content.startswith(b"PK\x03\x04"):
@@ -255,7 +255,7 @@ def _changed_array(content: bytes, change: Change) -> bytes:
 
 
 def _with_checksums(content: bytes) -> bytes:
-    """A PNG whose chunks, as far as they can be told, have right checksums."""
+    """A PNG with correct checksums for all chunks that can still be located."""
     raw, at = bytearray(content), len(PNG)
     while at + 12 <= len(raw):
         end = at + 8 + struct.unpack_from(">I", raw, at)[0]

@@ -83,7 +83,7 @@ def make_programs(scene: Scene, plans: dict[str, Plan]) -> dict[str, Callable]:
 
 
 def make_stages(scene: Scene, plan: Plan) -> dict[str, Callable]:
-    """What a forward call begins with, by itself: programs like those of `make_programs`."""
+    """The first stages of a forward call by themselves, as programs like those of `make_programs`."""
 
     def project(inputs):
         usable = jnp.ones(len(scene.means), bool)

@@ -1,4 +1,4 @@
-"""All readers that benchmarks/fuzz_files.py tries: those of data, and of what runs keep."""
+"""All readers that benchmarks/fuzz_files.py tries: those of data, and those of files that runs write."""
 
 import json
 import socket
@@ -160,13 +160,13 @@ def _features(build: Callable[[Path], object]) -> Reader:
 
 
 def _lock(root: Path) -> None:
-    """By the first process of this machine, which is always there, and shares it."""
+    """A shared lock held by the first process of this machine, which is always running."""
     there = {"pid": 1, "host": socket.gethostname(), "since": "2026-01-01 00:00:00", "shared": True}
     (root / LOCK).write_text(json.dumps(there) + "\n")
 
 
 def _locked(root: Path) -> Arrays:
-    """Shared, where only the list decides: without locks of the file system."""
+    """Take a shared lock without locks of the file system, so that only the list in the file decides."""
     with mock.patch.object(locks, "fcntl", None), locks.locked(root, shared=True):
         return ()
 

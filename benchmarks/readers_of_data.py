@@ -1,6 +1,6 @@
-"""Readers of data that benchmarks/fuzz_files.py tries: for each, files that it reads, and how it is opened.
+"""Readers of data that benchmarks/fuzz_files.py tries: how to write files for each, and how to open them.
 
-What is opened is also looked at, for pictures are read late. The files are those of the tests of readers.
+Pictures are accessed too, since they are read lazily. The files are those of the tests of the readers.
 """
 
 import gzip
@@ -49,8 +49,8 @@ class Reader(NamedTuple):
     Attributes:
         build: writes files that it reads into a folder.
         open: reads them, and returns what has to be finite.
-        share: of the cases, where each takes long.
-        needs: the package of an extra that it takes; "" if none.
+        share: fraction of the cases that is tried; below 1 where each takes long.
+        needs: the package that it needs from an optional extra; "" if none.
     """
 
     build: Callable[[Path], object]

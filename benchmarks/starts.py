@@ -1,4 +1,4 @@
-"""Waiting: how long each command takes until its first update and in all, cold and warm, and why.
+"""Start-up times: how long each command takes until its first update and in total, cold and warm, and why.
 
     gsjax bench --starts --only track fit
 
@@ -49,7 +49,7 @@ COMMANDS: dict[str, tuple[str, ...]] = {
     "view": ("view", "{fit}"),
 }  # fmt: skip
 """Each command on a small built-in scene; {fit} is the folder of the run of `fit`. The first result of `view`
-is its page, with which it ends."""
+is its page, after which it ends."""
 
 
 def watch(record: Path, begun: float, arguments: Sequence[str]) -> int:
@@ -58,7 +58,7 @@ def watch(record: Path, begun: float, arguments: Sequence[str]) -> int:
     Args:
         record: the file to write.
         begun: when the process was started, seconds since the epoch.
-        arguments: the command's.
+        arguments: arguments of the command.
     """
     import jax
 
@@ -98,7 +98,7 @@ def watch(record: Path, begun: float, arguments: Sequence[str]) -> int:
 
 
 def _end_with_its_page(served: Callable[[], None]) -> None:
-    """Let a viewer end, as by Ctrl-C, once a browser could have its page."""
+    """Make a viewer end, as by Ctrl-C, once its page can be loaded."""
     from gsjax.viz.viewer import Viewer
 
     def wait(viewer: Viewer) -> None:
@@ -108,7 +108,7 @@ def _end_with_its_page(served: Callable[[], None]) -> None:
         raise KeyboardInterrupt
 
     Viewer.wait = wait
-    os._exit = sys.exit  # as the command line leaves after Ctrl-C; the record is written after it
+    os._exit = sys.exit  # by which the command line exits after Ctrl-C, before the record is written
 
 
 def _union(spans: list[tuple[float, float]]) -> float:

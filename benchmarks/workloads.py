@@ -16,7 +16,7 @@ from gsjax.geometry.cameras import intrinsics, look_at
 from gsjax.geometry.spherical_harmonics import evaluate_sh
 from gsjax.io.ply import read_ply
 
-HEAVY_CHANNELS = 64  # with this many channels or more, three calls have to do
+HEAVY_CHANNELS = 64  # with this many channels or more, only three calls are timed
 
 
 class Scene(NamedTuple):

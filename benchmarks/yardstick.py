@@ -1,4 +1,4 @@
-"""What every method computes, as digests: run it before and after a change that must not change results.
+"""Digests of what every method computes: run it before and after a change that must not alter results.
 
     python -m benchmarks.yardstick OUT [--only NAME ...] [--optimized]    # writes OUT/yardstick.json
     python -m benchmarks.yardstick --compare BEFORE.json AFTER.json       # exits with 1 where they differ
@@ -40,7 +40,7 @@ class Case:
 
     Attributes:
         name: name for `--only`, and of its run folder.
-        arguments: of `gsjax`, without `--out`; "{runs}" stands for the folder that holds all run folders.
+        arguments: arguments of `gsjax` without `--out`; "{runs}" is the folder that holds all run folders.
         needs: the name of the case whose run it reads, if any.
     """
 
@@ -135,7 +135,7 @@ CASES = (
 def _fast_flags() -> str:
     """Flags of XLA by which programs compile without optimising, as in tests/conftest.py."""
     flags = "--xla_backend_optimization_level=0"
-    if version("jaxlib").startswith("0.10."):  # XLA ends a process that names a flag it has not
+    if version("jaxlib").startswith("0.10."):  # XLA aborts a process that passes an unknown flag
         flags += " --xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1"
     return flags
 
@@ -145,7 +145,7 @@ def record(out: Path, only: Sequence[str] = (), optimized: bool = False) -> int:
 
     Args:
         out: the folder; records of other cases that it holds are kept.
-        only: names of cases; all unless given. Cases that they need run too where they have not yet.
+        only: names of cases; default: all. Cases that they need are run too, unless their runs exist.
         optimized: compile as users do.
 
     Raises:

@@ -1,4 +1,4 @@
-"""Plain arrays of .npy and .npz files: nothing is unpickled, and what a file claims is not believed."""
+"""Loads plain arrays from .npy and .npz files, without unpickling anything or trusting their headers."""
 
 import struct
 import tokenize
@@ -19,12 +19,12 @@ _DAMAGED = (
     *(ArithmeticError, MemoryError, EOFError, OSError, RuntimeError, struct.error),
     *(zipfile.BadZipFile, zlib.error, LZMAError),
 )
-_LARGE, _MOST_PACKED = 1 << 30, 100  # bytes; largest compression ratio of more
+_LARGE, _MOST_PACKED = 1 << 30, 100  # bytes; largest compression ratio beyond that
 _ZIP = b"PK"
 
 
 class ArraysError(ValueError):
-    """A file holds no plain arrays; the message says why in a few words, and does not name the file."""
+    """A file does not hold plain arrays; the message briefly says why, and does not name the file."""
 
 
 def load_arrays(path: Path) -> dict[str, np.ndarray]:
@@ -65,7 +65,7 @@ def _of_archive(archive: zipfile.ZipFile, size: int) -> dict[str, np.ndarray]:
 
 
 def _array(file: Any, size: int) -> np.ndarray:
-    """The array in a stream of so many bytes, whose header is compared with them before memory is taken."""
+    """The array in a stream of `size` bytes, whose header is checked before memory is allocated."""
     version = npy.read_magic(file)
     if version not in _HEADERS:
         raise ValueError(f"version {version} of .npy")
@@ -82,5 +82,5 @@ def _array(file: Any, size: int) -> np.ndarray:
 _HEADERS = {
     (1, 0): npy.read_array_header_1_0,
     (2, 0): npy.read_array_header_2_0,
-    (3, 0): npy.read_array_header_2_0,  # which only names fields in another encoding
+    (3, 0): npy.read_array_header_2_0,  # differs only in the encoding of field names
 }

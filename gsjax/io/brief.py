@@ -1,4 +1,4 @@
-"""What a message quotes of a file or of a library, in bounds: damaged files hold words of any length."""
+"""Shortens what error messages quote from files and libraries: damaged files hold text of any length."""
 
 from collections.abc import Iterable
 
@@ -11,7 +11,7 @@ def brief(text: object, most: int = _MOST) -> str:
 
     Args:
         text: what to quote, or an error of another library.
-        most: characters that are kept.
+        most: number of characters to keep.
     """
     words = str(text)
     if len(words) > 4 * most:  # before splitting it
@@ -24,8 +24,7 @@ def brief(text: object, most: int = _MOST) -> str:
 
 
 def shortened(names: Iterable[str], most: int = 3) -> str:
-    """Names joined for a message, shortened to the first few if there are many; the middle of endless ones is
-    left out.
+    """Names joined for a message: only the first few if there are many, without the middle of very long ones.
 
     Args:
         names: the names.

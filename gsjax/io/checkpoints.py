@@ -1,9 +1,9 @@
 """Checkpoints: a pytree in one self-describing .npz, without pickle.
 
-The file holds the arrays by their paths, and a JSON header with the tree around them: containers, numbers,
-text, and the type names and fields (static ones included) of NamedTuples, dataclasses and equinox modules. It
-is read without a template. Only types of gsjax and of the libraries whose states it stores are instantiated,
-and none of their code runs except the checks of dataclasses.
+The file holds each array under its path in the tree, and a JSON header with the rest of the tree: containers,
+numbers, text, and the type names and fields (static ones included) of NamedTuples, dataclasses and equinox
+modules. It is read without a template. Only types of gsjax and of the libraries whose states it stores are
+instantiated, and none of their code runs except the checks of dataclasses.
 """
 
 import dataclasses
@@ -55,7 +55,7 @@ def save_checkpoint(path: str | os.PathLike, tree: Any, metadata: Mapping[str, A
         "metadata": dict(metadata or {}),
         "sha256": _checksum(arrays),
     }
-    # Uncompressed: optimizers' floats shrink by a tenth, in sixty times the time.
+    # Uncompressed: compression shrinks an optimizer's floats by only a tenth and takes sixty times as long.
     write_npz(path, arrays | {_HEADER: np.array(json.dumps(header))}, compress=False)
 
 
@@ -88,7 +88,7 @@ def load_metadata(path: str | os.PathLike) -> dict[str, Any]:
 
 
 def encode(tree: Any) -> tuple[Any, dict[str, np.ndarray]]:
-    """A tree as JSON, equal for equal trees, and its arrays by their paths.
+    """A tree as JSON (equal for equal trees), and its arrays by path.
 
     Args, raises: as `save_checkpoint`.
     """
@@ -129,8 +129,8 @@ def _fields_of(node: Any, names: Any, path: str, arrays: dict[str, np.ndarray]) 
 
 
 def _name_of(kind: type) -> str:
-    """The name under which a type is found again: "optax:ScaleByAdamState" if the library itself exports it,
-    since its inner modules may move."""
+    """The name by which a type can be found again: "optax:ScaleByAdamState" if the library itself exports it,
+    since its submodules may move."""
     library = kind.__module__.split(".")[0]
     if library not in _LIBRARIES:
         raise TypeError(
@@ -197,7 +197,7 @@ def _made(kind: type, fields: dict[str, Any]) -> Any:
 
 
 def _read(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    """The arrays and the header of a checkpoint whose checksum is right."""
+    """The arrays and the header of a checkpoint, whose checksum is verified."""
     if not path.is_file():
         raise FileNotFoundError(f"{path}: expected a checkpoint, found no file. Check the path")
     try:

@@ -1,4 +1,4 @@
-"""Few values in place of many: codebooks of numbers, and palettes of vectors."""
+"""Quantisation: codebooks of numbers, and palettes of vectors."""
 
 import numpy as np
 from jaxtyping import Float, Int, UInt8
@@ -7,7 +7,7 @@ _SIZE, _ROUNDS = 256, 8
 
 
 def codebook(values: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "256"]:
-    """256 ascending numbers near to which all values are (Lloyd's algorithm).
+    """A codebook of 256 ascending numbers that approximate the values (Lloyd's algorithm).
 
     Args:
         values: at least one finite number.
@@ -27,7 +27,7 @@ def codebook(values: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "256"]:
 
 
 def nearest(book: Float[np.ndarray, "256"], values: Float[np.ndarray, "*n"]) -> UInt8[np.ndarray, "*n"]:
-    """The index of the number of an ascending codebook that is nearest to each value.
+    """The index of the entry of an ascending codebook that is nearest to each value.
 
     Args:
         book: the codebook.
@@ -39,10 +39,11 @@ def nearest(book: Float[np.ndarray, "256"], values: Float[np.ndarray, "*n"]) -> 
 def palette(
     rows: Float[np.ndarray, "N D"], most: int
 ) -> tuple[Float[np.ndarray, "K D"], Int[np.ndarray, "N"]]:
-    """At most `most` vectors, and which of them stands for each row. Up to as many rows stand for themselves.
+    """At most `most` vectors, and the index of the one that represents each row.
 
-    Otherwise cells of rows are halved, those with the largest sum of squares first, at the mean of the
-    coordinate that varies most, and each is replaced by its mean.
+    If there are no more rows than that, each represents itself. Otherwise cells of rows are split in two,
+    those with the largest sum of squares first, at the mean of the coordinate that varies most, and each cell
+    is represented by its mean.
 
     Args:
         rows: the vectors.
@@ -54,7 +55,7 @@ def palette(
     while count < most:
         means, squares, _ = _moments(rows, labels, count)
         errors = squares.sum(axis=1)
-        # At least half of them, so that there are few rounds.
+        # At least half of the cells, so that there are few rounds.
         split = max(int(np.sum(errors > 0.5 * errors.mean())), (count + 1) // 2)
         chosen = np.argsort(-errors, kind="stable")[: min(split, most - count)]
         chosen = chosen[errors[chosen] > 0]

@@ -56,7 +56,7 @@ def is_compressed(ply: PlyData) -> bool:
 
 
 def positions(ply: PlyData) -> Float[np.ndarray, "N 3"]:
-    """The places of the Gaussians of a compressed PLY in which `find_fault` finds nothing, float64."""
+    """The positions of the Gaussians of a compressed PLY in which `find_fault` finds nothing, float64."""
     fractions = _fractions(ply["vertex"].data["packed_position"], (11, 10, 11))
     return _in_range(ply["chunk"].data, _POSITION, fractions)
 
@@ -76,7 +76,7 @@ def decompress(ply: PlyData, means: Float[np.ndarray, "N 3"]) -> Gaussians:
     colors, opacities = np.split(_fractions(vertices["packed_color"], (8, 8, 8, 8)), [3], axis=1)
     if "min_r" in chunks.dtype.names:
         colors = _in_range(chunks, _COLOR, colors)
-    with np.errstate(over="ignore"):  # to infinities, which are left out
+    with np.errstate(over="ignore"):  # infinite scales are left out later
         scales = np.exp(_in_range(chunks, _SCALE, log_scales))
     return gaussians_from_activated(
         means,
@@ -249,7 +249,7 @@ def _ranged(
 
 
 def _words(fractions: Float[np.ndarray, "N parts"], bits: tuple[int, ...]) -> UInt32[np.ndarray, "N"]:
-    """Fractions 0 to 1 in as many bits each, highest first; the inverse of `_fractions`."""
+    """Fractions 0 to 1 packed into words of the given bits, highest first; the inverse of `_fractions`."""
     shifts = sum(bits) - np.cumsum(bits)
     codes = np.round(np.clip(fractions, 0, 1) * ((1 << np.array(bits)) - 1)).astype(np.uint32)
     return np.bitwise_or.reduce(codes << shifts.astype(np.uint32), axis=1)

@@ -1,9 +1,10 @@
-"""glTF with KHR_gaussian_splatting, as one .glb: written, not read. Nothing is rounded.
+"""Writes glTF with KHR_gaussian_splatting as one .glb, with Gaussians in float32. The format is not read.
 
 Attributes of one primitive of points: POSITION, rotations x y z w, scales, opacities 0 to 1 and an
-accessor for each coefficient of the harmonics, all float32; and COLOR_0, by which programs without the
-extension show points. Y of glTF points up and that of a 3DGS PLY down, so the node is turned half around X.
-It is also shifted to the origin of a scene far from 0, for JSON has the digits that float32 lacks.
+accessor for each coefficient of the harmonics, all float32; and COLOR_0, for programs that lack the extension
+and show points. The y axis points up in glTF and down in a 3DGS PLY, so the node is rotated by 180 degrees
+about x. For a scene far from 0 it is also translated to the scene's origin, since numbers in JSON have the
+digits that float32 lacks.
 Source: extensions/2.0/Khronos/KHR_gaussian_splatting in github.com/KhronosGroup/glTF.
 """
 
@@ -31,7 +32,7 @@ def write_glb(path: Path, gaussians: Gaussians, *, origin: Float[np.ndarray, "3"
     Args:
         path: the file.
         gaussians: Gaussians that can all be drawn.
-        origin: what means are relative to; None for 0.
+        origin: the point that means are relative to; None for 0.
     """
     attributes = _attributes(gaussians)
     views, accessors, start = [], [], 0
@@ -47,7 +48,7 @@ def write_glb(path: Path, gaussians: Gaussians, *, origin: Float[np.ndarray, "3"
     }
     node: dict[str, Any] = {"mesh": 0, "rotation": [1, 0, 0, 0]}
     if origin is not None:
-        node["translation"] = (origin * [1, -1, -1]).tolist()  # glTF turns a node before it shifts it
+        node["translation"] = (origin * [1, -1, -1]).tolist()  # glTF rotates a node before translating it
     scene = {
         "asset": {"version": "2.0", "generator": "gsjax"},
         "extensionsUsed": [_EXTENSION],
@@ -76,7 +77,7 @@ def _attributes(gaussians: Gaussians) -> dict[str, np.ndarray]:
         "POSITION": columns.means,
         "COLOR_0": np.column_stack([to_bytes(columns.colors), to_bytes(columns.opacities)]),
         f"{_EXTENSION}:ROTATION": columns.quats[:, [1, 2, 3, 0]],
-        f"{_EXTENSION}:SCALE": np.exp(columns.log_scales),  # drafts had their logarithms
+        f"{_EXTENSION}:SCALE": np.exp(columns.log_scales),  # drafts stored logarithms
         f"{_EXTENSION}:OPACITY": columns.opacities[:, None],
         f"{_EXTENSION}:SH_DEGREE_0_COEF_0": (columns.colors - 0.5) / SH_C0,
     }

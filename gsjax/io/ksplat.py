@@ -1,13 +1,14 @@
-"""The .ksplat of mkkellogg's GaussianSplats3D, read alone: sections of records, little-endian.
+"""Reads mkkellogg's .ksplat (GaussianSplats3D): sections of records, little-endian. It is not written.
 
     header     4096 bytes: version, numbers of sections and of Gaussians, level, range of harmonics
     sections   1024 bytes each: numbers of Gaussians, of buckets and of their bytes, degree of harmonics
     data       of each section: lengths of partly filled buckets, centres of buckets, records
 
-A record has centre, scales, rotation w x y z, red green blue opacity as uint8, and harmonics, band by band
-and within it channel by channel. Level 0 holds float32; levels 1 and 2 float16, but for centres: uint16, an
-offset from the centre of the bucket that the Gaussian is in; and harmonics of level 2: uint8 of a range. Axes
-are those of the 3DGS PLY. Source: SplatBuffer.js in github.com/mkkellogg/GaussianSplats3D.
+A record holds the centre, scales, rotation w x y z, red green blue opacity as uint8, and harmonics, band by
+band and channel by channel within each band. Level 0 stores float32. Levels 1 and 2 store float16, except
+that centres are uint16 offsets from the centre of the Gaussian's bucket, and harmonics of level 2 are uint8
+fractions of a range. Axes are those of the 3DGS PLY. Source: SplatBuffer.js in
+github.com/mkkellogg/GaussianSplats3D.
 """
 
 import struct
@@ -33,11 +34,11 @@ _HEADER_SIZE, _SECTION_SIZE = 4096, 1024
 _HEADER = struct.Struct("<4xI12xH14xff")
 """Number of sections, level, and range of harmonics."""
 _SECTION = struct.Struct("<IIIIfHxxI4xIIH")
-"""The fields of a `_Section`, but for its start."""
+"""The fields of a `_Section` except its start."""
 _RANGE = 32767
 _CENTER = np.dtype(("<f4", 3))
 _TYPES = (("<f4", "<f4", "<f4"), ("<u2", "<f2", "<f2"), ("<u2", "<f2", "u1"))
-"""Of centres, of scales and rotations, of harmonics, by level."""
+"""Types of centres, of scales and rotations, and of harmonics, by level."""
 
 
 class _Section(NamedTuple):
@@ -71,7 +72,7 @@ def read_ksplat(path: Path) -> tuple[Gaussians, SceneReport]:
         path: the file.
 
     Raises:
-        SceneError: it is no .ksplat, cut off, or its numbers do not agree.
+        SceneError: it is not a .ksplat, is cut off, or its counts are inconsistent.
     """
     data = path.read_bytes()
     if len(data) < _HEADER_SIZE or data[:4] != MAGIC:
@@ -93,7 +94,7 @@ def read_ksplat(path: Path) -> tuple[Gaussians, SceneReport]:
             found = f"{section.count} Gaussians in room for {section.room}, {len(data)} bytes of {end}"
             raise SceneError(path, f"section {number} with all its data", found, AGAIN)
         if section.count:
-            with np.errstate(invalid="ignore"):  # of NaN, whose Gaussians are left out
+            with np.errstate(invalid="ignore"):  # NaN, whose Gaussians are left out later
                 parts.append(_decode(path, data, section, record, (low or -1.5, high or 1.5)))
         start = end
     rest = max((part.rest.shape[1] for part in parts), default=0)
@@ -108,7 +109,7 @@ def read_ksplat(path: Path) -> tuple[Gaussians, SceneReport]:
 
 
 def _record(level: int, degree: int) -> np.dtype:
-    """The type of a record."""
+    """The dtype of a record."""
     center, shape, harmonics = _TYPES[level]
     fields = [("means", center, 3), ("scales", shape, 3), ("quats", shape, 4), ("rgba", "u1", 4)]
     return np.dtype([*fields, ("rest", harmonics, (3 * REST_SIZES[degree],))])

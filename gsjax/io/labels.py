@@ -1,4 +1,4 @@
-"""Labels of Gaussians, in a file beside their PLY: readers of 3DGS refuse or misread an integer property."""
+"""Labels of Gaussians, in a file beside their PLY: readers of 3DGS refuse or misread integer properties."""
 
 import os
 import warnings
@@ -15,7 +15,7 @@ _NAME = "labels"
 
 
 def labels_beside(path: str | os.PathLike) -> Path:
-    """The file of the labels of a PLY: scene_labels.npz of scene.ply."""
+    """The labels file of a PLY: scene_labels.npz for scene.ply."""
     path = Path(path)
     return path.with_name(path.stem + ENDING)
 
@@ -31,8 +31,8 @@ def write_labels(path: str | os.PathLike, labels: Integer[np.ndarray, "N"]) -> N
 
 
 def read_labels(path: str | os.PathLike, count: int) -> Int[np.ndarray, "N"] | None:
-    """The labels beside the PLY at `path`, one for each row; None without, and, with a warning, where they do
-    not fit it.
+    """The labels beside the PLY at `path`, one for each row; None if there are none or, with a warning, if
+    they do not fit it.
 
     Args:
         path: the PLY.

@@ -1,9 +1,9 @@
-"""A web page that shows a scene: one .html that opens from disk, without a network or a program beside it.
+"""A web page that shows a scene: one .html that opens from disk, without a network or a server.
 
 It holds the scene as a .splat, so without view-dependent colour, and a viewer (page.html) of a few kB: WebGL
-2, sorted in a worker. Of a scene that moves it also holds, for each frame, what moves: 16 bits for each
-coordinate of places (of logarithms of distances, as in SOG), rotations and, where they change, scales, and
-for opacities.
+2, with sorting in a worker. For a moving scene it also holds each frame of the moving Gaussians, with 16 bits
+for each coordinate of positions (on a logarithmic scale, as in SOG), opacity, component of rotations and,
+where they change, scale.
 """
 
 import base64
@@ -27,7 +27,7 @@ _FOCAL = 1.2  # of the height: 45 degrees from top to bottom
 _MOST = 65535
 _MOST_DEFLATED = 400_000_000  # bytes: in base64, the 2^29 characters of Chromium's longest text
 _LEAST_STEP = 1e-3  # seconds that the last frame is shown
-_LEAST_UNIT = 1e-6  # of the distance of the farthest place
+_LEAST_UNIT = 1e-6  # of the distance of the farthest Gaussian
 _TEMPLATE = Path(__file__).with_name("page.html")
 
 
@@ -36,8 +36,8 @@ class Film(NamedTuple):
 
     Attributes:
         at: frame -> all Gaussians; colours are the same in all.
-        times: of T frames, two or more, in seconds, increasing.
-        num_moving: only the first so many Gaussians may differ between frames.
+        times: times of the T frames (two or more) in seconds, increasing.
+        num_moving: only the first `num_moving` Gaussians may differ between frames.
     """
 
     at: Callable[[int], Gaussians]
@@ -61,16 +61,16 @@ def write_page(
     Args:
         path: the file; the page is titled by its name.
         gaussians: Gaussians that can all be drawn.
-        antialiased: whether the scene was fitted with antialiasing; it is drawn so.
+        antialiased: whether the scene was fitted with antialiasing, and is to be drawn with it.
         up: unit vector; by default as in most PLY files, whose y points down.
         background: RGB, 0 to 1.
-        view: where the page opens: the place of the eye and what it looks at; default: from the side.
+        view: initial position of the eye, and the point that it looks at; default: from the side.
         near: distance from the eye below which nothing is drawn; at least a small share of the scene's size.
-        film: the scene over time, which the page plays; `gaussians` in its first frame. None if it stands
-            still.
+        film: the scene over time, which the page plays; `gaussians` is its first frame. None for a static
+            scene.
     """
     means = np.asarray(gaussians.means, np.float64)
-    center = np.quantile(means, (0.01, 0.99), axis=0).mean(axis=0)  # but for a few that are far away
+    center = np.quantile(means, (0.01, 0.99), axis=0).mean(axis=0)  # without a few that are far away
     radius = np.quantile(np.linalg.norm(means - center, axis=1), 0.98)
     order, motion, moved = (np.arange(gaussians.num), None, b"") if film is None else _packed(film)
     order = np.append(order, np.arange(len(order), gaussians.num))
@@ -99,8 +99,9 @@ def write_page(
 
 
 def _packed(film: Film) -> tuple[np.ndarray, dict[str, Any] | None, bytes]:
-    """The order in which those of the first Gaussians that move come before those that do not, what the page
-    is told of them, and their values. Frames are asked for one at a time, twice: for ranges, for values.
+    """An order of the first `num_moving` Gaussians in which those that do move come first, the description of
+    their motion for the page, and their values. Frames are evaluated one at a time, in two passes: for the
+    ranges, then for the values.
 
     Raises:
         ValueError: some frame holds values that are not finite, or there are more than a page can hold.
@@ -131,8 +132,8 @@ def _packed(film: Film) -> tuple[np.ndarray, dict[str, Any] | None, bytes]:
 
 
 class _Ranges(NamedTuple):
-    """What steps of 16 bits mean: places x are steps of sign(u) log(1 + |u|), u = (x - middle) / unit, so
-    that a few Gaussians far away do not coarsen the others; steps of the logarithms of scales."""
+    """Ranges of the 16-bit values. Positions x are quantised as sign(u) log(1 + |u|) with u = (x - middle) /
+    unit, so that a few Gaussians far away do not coarsen the others; scales are quantised as logarithms."""
 
     middle: Float[np.ndarray, "3"]
     unit: Float[np.ndarray, ""]
@@ -142,7 +143,7 @@ class _Ranges(NamedTuple):
 
 
 def _ranges(low: Float[np.ndarray, "M 11"], high: Float[np.ndarray, "M 11"]) -> _Ranges:
-    """Of what moves, from the least and largest values of each Gaussian."""
+    """The ranges of the moving Gaussians, from the smallest and largest values of each."""
     first, last = low[:, :3].astype(np.float64), high[:, :3].astype(np.float64)
     middle = np.median((first + last) / 2, axis=0)
     reach = np.linalg.norm(np.maximum(middle - first, last - middle), axis=1)
@@ -163,7 +164,7 @@ def _logarithms(values: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
 
 
 def _deflated(film: Film, rows: Int[np.ndarray, "M"], ranges: _Ranges, grows: bool) -> bytes:
-    """The values of all frames.
+    """The values of all frames, compressed.
 
     Raises:
         ValueError: they are more than a page can hold.
@@ -189,14 +190,14 @@ def _deflated(film: Film, rows: Int[np.ndarray, "M"], ranges: _Ranges, grows: bo
 
 
 def _values(gaussians: Gaussians) -> Float[np.ndarray, "M 11"]:
-    """Place, opacity, rotation and logarithms of scales, float32."""
+    """Position, opacity, rotation and logarithms of scales, float32."""
     found = columns_of(gaussians)
     return np.column_stack([found.means, found.opacities, found.quats, found.log_scales]).astype(np.float32)
 
 
 def _differences(steps: UInt16[np.ndarray, "M values"], before: UInt16[np.ndarray, "M values"]) -> bytes:
-    """Differences from the frame before, which deflate shrinks further than the values: their signs in the
-    lowest bit, and for each value the low bytes of all before the high ones."""
+    """Differences from the previous frame, which deflate compresses better than the values: with the sign in
+    the lowest bit (zigzag), and for each value the low bytes of all Gaussians before the high ones."""
     change = (steps - before).astype(np.int16)
     zigzag = ((change << 1) ^ (change >> 15)).astype(np.uint16).T
     return np.stack([zigzag & 0xFF, zigzag >> 8], axis=1).astype(np.uint8).tobytes()

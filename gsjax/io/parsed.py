@@ -1,4 +1,4 @@
-"""JSON and YAML that somebody may have changed: whatever is wrong is a ValueError with a short message."""
+"""Parses JSON and YAML that may have been edited: any fault is a ValueError with a short message."""
 
 import json
 from collections.abc import Callable
@@ -10,20 +10,20 @@ from gsjax.io.brief import brief
 
 
 def parse_json(text: str | bytes) -> Any:
-    """What JSON says.
+    """The value of a JSON text.
 
     Args:
         text: the JSON.
 
     Raises:
-        ValueError: it is none, is nested too deep, or has a number of too many digits; the message says so,
-            and does not name the file.
+        ValueError: it is not JSON, is nested too deeply, or has a number with too many digits; the message
+            says so, and does not name the file.
     """
     return _parsed(json.loads, text)
 
 
 def parse_yaml(text: str | bytes) -> Any:
-    """What YAML says, without making anything but plain values.
+    """The value of a YAML text; only plain values are constructed.
 
     Args:
         text: the YAML.

@@ -1,4 +1,4 @@
-"""PLY files of any elements, parsed by plyfile once their headers are known to be reasonable."""
+"""Parses PLY files of any elements with plyfile, after checking that their headers are plausible."""
 
 import re
 from pathlib import Path
@@ -37,8 +37,8 @@ def parse_ply(path: Path) -> PlyData:
 
 
 def _least_size(path: Path) -> int:
-    """Bytes without which a file cannot hold its header and the rows that are promised there. plyfile
-    allocates rows of lists before it reads them.
+    """The fewest bytes that can hold a file's header and the rows that it promises. It is checked because
+    plyfile allocates rows of lists before it reads them.
 
     Raises:
         ValueError: the header has no end, which plyfile would look for byte by byte.

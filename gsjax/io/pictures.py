@@ -1,4 +1,4 @@
-"""Writing pictures to files, and the errors of damaged ones."""
+"""Writes pictures to files, and turns Pillow's errors for damaged ones into a single type."""
 
 import struct
 import zlib
@@ -20,12 +20,12 @@ _DAMAGED = (
 
 
 class PictureError(ValueError):
-    """Pillow cannot read a picture; the message says why in a few words, and does not name the file."""
+    """Pillow cannot read a picture; the message briefly says why, and does not name the file."""
 
 
 @contextmanager
 def pillow_errors() -> Iterator[None]:
-    """Whatever Pillow raises in the block for a damaged picture is raised as a PictureError."""
+    """Re-raise whatever Pillow raises in the block for a damaged picture as a PictureError."""
     from PIL import Image
 
     try:

@@ -5,7 +5,7 @@ then blue), opacity as a logit, scale_0..2 as logarithms, rot_0..3 as w x y z. g
 has them. Labels lie in a file beside it (`gsjax.io.labels`), because other readers trip over integers.
 PlayCanvas's compressed PLY is read too.
 
-That a scene is to be drawn antialiased (Mip-Splatting) is said in a comment of the header: Brush and
+A comment in the header says whether the scene is to be drawn antialiased (Mip-Splatting): Brush and
 splat-transform write "SplatRenderMode: mip", Postshot "antialiased 1"; the last such line counts.
 """
 
@@ -41,8 +41,8 @@ _NORMALS = ("nx", "ny", "nz")
 _REST_COUNTS = tuple(3 * (size - 1) for size in SH_SIZES)
 _ANTIALIASED = "SplatRenderMode: mip"
 _MODES = re.compile(r"\s*(?:splatrendermode\s*:\s*(\w+)|antialiased\s+([01])|train_flags\b(.*))\s*$", re.I)
-_ENOUGH, _VARY = 10, 0.05  # Gaussians, for a verdict on all of them; a range of opacities
-_LOST = 0.01  # of a Gaussian's size: steps of float32 that are larger lose its place
+_ENOUGH, _VARY = 10, 0.05  # least number of Gaussians, and range of opacities, to judge by
+_LOST = 0.01  # of a Gaussian's size: larger steps of float32 lose its position
 
 
 class PlyError(SceneError):
@@ -64,8 +64,8 @@ def write_ply(
         gaussians: the Gaussians, on the host or a device.
         labels: integers [N], written to a file beside it: NAME_labels.npz of NAME.ply. Without labels, the
             labels of a PLY that is replaced are removed.
-        origin: what means are relative to (`SceneReport.origin`, `Photographs.origin`); it is put back. Where
-            float32 would then lose places, x y z are of type double.
+        origin: the point that means are relative to (`SceneReport.origin`, `Photographs.origin`); it is added
+            back. Where float32 would then lose positions, x y z are of type double.
         antialiased: say in a comment that the scene is to be drawn antialiased.
 
     Raises:
@@ -101,7 +101,7 @@ def write_ply(
 
 
 def _reach(columns: dict[str, np.ndarray]) -> float:
-    """The largest coordinate that is finite."""
+    """The largest magnitude of a finite coordinate."""
     finite = (columns[axis][np.isfinite(columns[axis])] for axis in _PLACE)
     return float(max(np.abs(values).max(initial=0) for values in finite))
 
@@ -144,7 +144,7 @@ def read_ply(path: str | os.PathLike) -> tuple[Gaussians, SceneReport]:
     The file may be binary of either byte order, or ASCII. Rows that cannot be drawn (with a NaN or a zero
     quaternion) are left out and counted, with a warning. Infinities that mean something are kept as the
     nearest value that can be drawn: an opacity of logit +inf is opaque, a log scale of -inf is flat; a logit
-    of -inf is invisible, and left out and counted. Places far from 0 are returned relative to
+    of -inf is invisible, and left out and counted. Positions far from 0 are returned relative to
     `SceneReport.origin`, with a warning. See `gsjax.io.compressed_ply` for packed values.
 
     Raises:
@@ -198,7 +198,7 @@ def _relative(
 
 
 def _says_antialiased(comments: Iterable[str]) -> bool | None:
-    """Whether the last comment about how to draw the scene says so; None if none does."""
+    """Whether the last comment on how to draw the scene asks for antialiasing; None if there is none."""
     said = [found for comment in comments if (found := _MODES.match(comment))]
     if not said:
         return None
@@ -207,7 +207,7 @@ def _says_antialiased(comments: Iterable[str]) -> bool | None:
 
 
 def _warn_if_activated(path: Path, gaussians: Gaussians) -> None:
-    """Warns where all opacities and sizes look like what logits and logarithms are to become."""
+    """Warns if the opacities and scales look like activated ones rather than logits and logarithms."""
     log_scales, logits = np.asarray(gaussians.log_scales), np.asarray(gaussians.logit_opacities)
     finite = np.isfinite(logits) & np.isfinite(log_scales).all(axis=1)
     logits = logits[finite]
@@ -250,7 +250,7 @@ def _known(path: Path, vertices: np.ndarray) -> set[str]:
 def _uncompressed(
     vertices: np.ndarray, means: Float[np.ndarray, "N 3"]
 ) -> tuple[Gaussians, Bool[np.ndarray, "N"]]:
-    """The Gaussians of a PLY in the 3DGS layout, whose infinities are finite where they mean something, and
+    """The Gaussians of a PLY in the 3DGS layout, with meaningful infinities replaced by finite values, and
     which of them are invisible."""
     names = vertices.dtype.names or ()
     rest, features = _numbered(names, "f_rest_"), _numbered(names, "feature_")
@@ -295,7 +295,7 @@ def _numbered(names: tuple[str, ...], prefix: str) -> list[str]:
 
 
 def _stack(vertices: np.ndarray, names) -> np.ndarray:
-    """Columns of a structured array stacked along axis 1, float32; what does not fit is infinite."""
+    """Columns of a structured array stacked along axis 1, float32; values that overflow become infinite."""
     with np.errstate(over="ignore"):
         return np.stack([vertices[name] for name in names], axis=1).astype(np.float32)
 

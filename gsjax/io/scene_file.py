@@ -1,4 +1,4 @@
-"""What readers and writers of Gaussians share: error, report, bounded sizes, values as files have them."""
+"""What readers and writers of Gaussians share: error, report, limits on sizes, values as files store them."""
 
 import os
 import warnings
@@ -14,7 +14,7 @@ from gsjax.io.brief import brief
 from gsjax.scene.gaussians import SH_SIZES, Gaussians, take, valid_rows
 
 REST_SIZES = tuple(size - 1 for size in SH_SIZES)
-"""Coefficients of a colour channel beside the constant one, by degree."""
+"""Coefficients of a colour channel besides the constant one, by degree."""
 AGAIN = "It may be cut off or damaged: copy or export it again"
 SH_C0 = 0.5 / np.sqrt(np.pi)
 _ALWAYS_ROOM = 1 << 26
@@ -23,7 +23,7 @@ _LEAST_OPACITY = 1e-6
 
 
 class SceneError(ValueError):
-    """A file is not one of Gaussians; the message has the path, what was expected and found, and advice."""
+    """A file does not hold Gaussians; the message has the path, what was expected and found, and advice."""
 
     def __init__(self, path: str | os.PathLike, expected: str, found: str, advice: str):
         super().__init__(f"{path}: expected {expected}, found {brief(found)}. {advice}")
@@ -42,9 +42,10 @@ class SceneReport:
         labels: int32 label of each returned Gaussian, [N]; None if the file has no labels.
         antialiased: whether the scene is to be drawn antialiased; None if the file does not say.
         invisible: number of those left out because their opacity is 0, a logit of -inf.
-        origin: what was taken off the means because they lie far from 0, where float32 cannot hold them; None
-            if they are as in the file.
-        places: of the returned Gaussians as in the file, float64 [N,3]; None if they are as returned.
+        origin: what was subtracted from the means because they lie far from 0, where float32 is too coarse;
+            None if they are as in the file.
+        places: positions of the returned Gaussians as in the file, float64 [N,3]; None if they are as
+            returned.
     """
 
     format: str
@@ -68,7 +69,7 @@ class Columns(NamedTuple):
         log_scales: logarithms of the scales, [N,3].
         opacities: 0 to 1, [N].
         colors: RGB, 0 to 1 where it can be shown, [N,3].
-        rest: spherical harmonics but for the constant, [N,K-1,3]; K-1 may be 0.
+        rest: spherical harmonics without the constant one, [N,K-1,3]; K-1 may be 0.
     """
 
     means: Float[np.ndarray, "N 3"]
@@ -103,7 +104,7 @@ def gaussians_of(columns: Columns) -> Gaussians:
     sh0 = (columns.colors - 0.5) / SH_C0
 
     def as_array(value: np.ndarray):
-        with np.errstate(invalid="ignore", over="ignore"):  # to what `drawable` leaves out
+        with np.errstate(invalid="ignore", over="ignore"):  # `drawable` leaves these out
             return jnp.asarray(value.astype(np.float32))
 
     return Gaussians(
@@ -131,10 +132,10 @@ def drawable(
     Args:
         path: the file.
         format: what it is, in words.
-        gaussians: all of it.
+        gaussians: all its Gaussians.
         invisible: which of them have an opacity of 0.
         labels: one for each.
-        places: of each as in the file.
+        places: position of each as in the file.
         **known: other fields of the report.
     """
     valid = valid_rows(gaussians)
@@ -162,13 +163,13 @@ def drawable(
 
 
 def expect_room(path: Path, size: int, stored: int, what: str) -> None:
-    """Refuse what expands beyond reason, before anything of its size is allocated.
+    """Refuse data that would unpack to an unreasonable size, before anything of that size is allocated.
 
     Args:
         path: the file, for the error.
-        size: bytes that it says it unpacks to.
+        size: bytes that it claims to unpack to.
         stored: bytes that it takes in the file.
-        what: what unpacks, for the error.
+        what: what is unpacked, for the error.
 
     Raises:
         SceneError: more than 64 MiB, and more than 64 times what is stored.
@@ -192,5 +193,5 @@ def spatial_order(means: Float[np.ndarray, "N 3"]) -> Int[np.ndarray, "N"]:
 
 
 def to_bytes(fractions: Float[np.ndarray, "*n"]) -> UInt8[np.ndarray, "*n"]:
-    """Fractions, 0 to 1, to the nearest of 256 steps, uint8; others are clipped."""
+    """Fractions 0 to 1, rounded to the nearest of 256 steps, uint8; others are clipped."""
     return np.round(np.clip(fractions, 0, 1) * 255).astype(np.uint8)

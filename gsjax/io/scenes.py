@@ -1,7 +1,7 @@
 """Files of Gaussians of every format: read by their content, written by their ending.
 
-PLY of 3DGS and compressed, .splat, .spz and .sog both ways; .ksplat in; .glb and .html, a page that shows the
-scene, out.
+PLY (of 3DGS, and compressed), .splat, .spz and .sog are read and written; .ksplat is only read; .glb and
+.html, a page that shows the scene, are only written.
 """
 
 import os
@@ -24,13 +24,13 @@ Reader = Callable[[Path], tuple[Gaussians, SceneReport]]
 
 @dataclass(frozen=True)
 class Format:
-    """A format that is written.
+    """A format that can be written.
 
     Attributes:
         name: what it is called in messages.
         write: (path, Gaussians that can all be drawn, ...) -> None.
         degree: largest degree of spherical harmonics that it keeps.
-        options: what else `write` takes.
+        options: the other arguments that `write` takes.
     """
 
     name: str
@@ -49,10 +49,10 @@ FORMATS = {
     ".glb": Format("glTF", glb.write_glb, options=("origin",)),
     ".html": Format("a page", page.write_page, degree=0, options=_OF_PAGES),
 }
-"""The formats that are written, by the ending of a file; of two that fit, the first."""
+"""The formats that can be written, by the ending of a file; of two that fit, the first counts."""
 
 READ = (".ply", ".compressed.ply", ".splat", ".spz", ".sog", ".ksplat")
-"""Endings of what is read. Only .splat is known by its ending, for it has no header."""
+"""Endings of files that can be read. Only .splat is recognised by its ending, since it has no header."""
 _BY_START: dict[bytes, Reader] = {
     b"ply": ply.read_ply,
     spz.MAGIC: spz.read_spz,
@@ -80,7 +80,7 @@ def is_scene(path: str | os.PathLike) -> bool:
 
 
 def read_gaussians(path: str | os.PathLike) -> tuple[Gaussians, SceneReport]:
-    """The Gaussians of a file, float32, and what else it held. The format is told by the content.
+    """The Gaussians of a file, float32, and what else it held. The format is recognised by the content.
 
     Gaussians that cannot be drawn (with a NaN or a zero quaternion) are left out and counted, with a warning.
 
@@ -89,7 +89,7 @@ def read_gaussians(path: str | os.PathLike) -> tuple[Gaussians, SceneReport]:
 
     Raises:
         FileNotFoundError: there is no file at `path`.
-        SceneError: it is none of these, cut off, damaged, or says that it is far larger than it can be.
+        SceneError: it is none of these, is cut off or damaged, or claims to be far larger than it can be.
     """
     path = Path(path)
     if not path.is_file():
@@ -132,18 +132,18 @@ def write_gaussians(
         path: a .ply, .compressed.ply, .splat, .spz, .sog, .glb, or .html, a page that shows the scene.
         gaussians: the scene, on the host or a device.
         labels: one for each Gaussian, [N]. A .ply has them in a file beside it (`write_ply`); others leave
-            them out, which is said unless all are the same.
-        antialiased: whether it is to be drawn antialiased, which .ply, .spz, .sog and a page say.
-        origin: what means are relative to (`SceneReport.origin`, `Photographs.origin`). A .ply and a .glb
-            have room for it, and it is put back; others would round places, which stay relative to it.
-        order: of .compressed.ply and .sog alone: rows in the order of the file; default: spatial. The others
+            them out, which is reported unless all are the same.
+        antialiased: whether it is to be drawn antialiased, which .ply, .spz, .sog and a page record.
+        origin: the point that means are relative to (`SceneReport.origin`, `Photographs.origin`). It is added
+            back in a .ply and a .glb; the others would round positions, which stay relative to it.
+        order: only for .compressed.ply and .sog: rows in the order of the file; default: spatial. The others
             keep the order of the scene.
-        up: of a page alone: the direction that points up; default: -y, as in most PLY files.
-        background: of a page alone: RGB, 0 to 1; default: black.
-        view: of a page alone: the place of the eye and what it looks at, as the page opens; default: from the
+        up: only for a page: the direction that points up; default: -y, as in most PLY files.
+        background: only for a page: RGB, 0 to 1; default: black.
+        view: only for a page: initial position of the eye, and the point that it looks at; default: from the
             side.
-        near: of a page alone: distance from the eye below which nothing is drawn; default: next to nothing.
-        film: of a page alone: the scene over time, which it plays; `gaussians` is its first frame.
+        near: only for a page: distance from the eye below which nothing is drawn; default: next to nothing.
+        film: only for a page: the scene over time, which it plays; `gaussians` is its first frame.
 
     Returns:
         What was left out, each in a few words.

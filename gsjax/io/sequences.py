@@ -1,4 +1,4 @@
-"""Scenes that move as numbered files of Gaussians, one a frame, in one folder: frame_0000.ply, ..."""
+"""Moving scenes as numbered files of Gaussians in one folder, one per frame: frame_0000.ply, ..."""
 
 import os
 import re
@@ -16,10 +16,10 @@ _NUMBERED = re.compile(rf"(.*?)(\d+)({'|'.join(map(re.escape, READ))})", re.I | 
 
 
 def frame_files(folder: str | os.PathLike) -> list[Path]:
-    """The files of a folder that holds nothing but the numbered frames of one scene, by number; else none.
+    """The files of a folder that holds only the numbered frames of one scene, in order; otherwise none.
 
     There are two or more, whose names differ in a number before the ending. Labels and texts (.txt, .md,
-    .log, without an ending) beside them, hidden files and folders are passed over.
+    .log, without an ending) beside them, hidden files and folders are ignored.
 
     Args:
         folder: the folder.
@@ -38,7 +38,7 @@ def frame_files(folder: str | os.PathLike) -> list[Path]:
 
 
 def missing_numbers(files: Sequence[Path]) -> list[int]:
-    """The numbers that some frames lack, where the others follow each other in even steps.
+    """The numbers missing from a sequence of frames that is otherwise numbered in even steps.
 
     Args:
         files: two or more, from `frame_files`.
@@ -53,7 +53,7 @@ def missing_numbers(files: Sequence[Path]) -> list[int]:
 
 
 def scenes_within(folder: str | os.PathLike) -> list[Path]:
-    """The files of Gaussians in a folder, for messages about one that is no scene by itself.
+    """The files of Gaussians in a folder, for messages about a folder that is not itself a scene.
 
     Args:
         folder: the folder.
@@ -62,7 +62,7 @@ def scenes_within(folder: str | os.PathLike) -> list[Path]:
 
 
 def scenes_in_words(scenes: Sequence[Path]) -> str:
-    """Files of Gaussians, and what they lie beside.
+    """Files of Gaussians, and the files beside them, in words.
 
     Args:
         scenes: from `scenes_within`, at least one.

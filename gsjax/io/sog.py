@@ -1,10 +1,10 @@
-"""PlayCanvas's SOG, version 2: pictures of bytes, and a meta.json that says what they mean; in a zip, or in a
-folder. A pixel of each picture is a Gaussian, row by row.
+"""PlayCanvas's SOG, version 2: 8-bit pictures, and a meta.json that says what they mean, in a zip or a
+folder. Each pixel of a picture is a Gaussian, row by row.
 
     means_l, means_u   low and high byte of x y z: 65535 steps between mins and maxs of sign(x) log(1 + |x|)
     scales             three indices into a codebook of 256 logarithms
-    quats              three components, 255 (q sqrt(2) + 1) / 2, but for the largest of w x y z: alpha is 252
-                       plus its index
+    quats              three components, 255 (q sqrt(2) + 1) / 2, without the largest of w x y z; alpha is 252
+                       plus the index of the largest
     sh0                three indices into a codebook of the constant harmonic; alpha is the opacity
     shN_labels         low and high byte of an index into a palette of the other harmonics
     shN_centroids      that palette, 64 entries a row, a pixel per coefficient: indices into a codebook
@@ -54,13 +54,13 @@ _MOST_PALETTE = 1 << 16
 _LARGEST = 252
 """Alpha of a rotation whose largest component is w."""
 _DAMAGED = (zipfile.BadZipFile, zlib.error, NotImplementedError, RuntimeError, EOFError, OSError, ValueError)
-"""What zipfile raises for a file that is none, or encrypted, or packed in a way that it does not know."""
+"""What zipfile raises for a file that is no zip, is encrypted, or uses an unknown compression method."""
 
 Load = Callable[[str], bytes]
 
 
 def is_meta(path: Path) -> bool:
-    """Whether a file is the meta.json of a SOG in a folder, by what it says.
+    """Whether a file is the meta.json of a SOG in a folder, judging by its content.
 
     Args:
         path: the file, which need not exist.
@@ -83,7 +83,7 @@ def read_sog(path: Path) -> tuple[Gaussians, SceneReport]:
         path: the file.
 
     Raises:
-        SceneError: it is no SOG of version 2, or cut off; a picture is missing, too small for the Gaussians
+        SceneError: it is not SOG version 2, or is cut off; a picture is missing, too small for the Gaussians
             or far larger than its file allows; or a name leads out of the archive or folder.
     """
     if path.suffix.lower() == ".json":
@@ -122,7 +122,7 @@ def _member(path: Path, archive: zipfile.ZipFile, name: str) -> bytes:
 
 
 class _Meta:
-    """meta.json, every value of which is checked when it is asked for."""
+    """The values of a meta.json, each of which is checked when it is read."""
 
     def __init__(self, path: Path, text: bytes):
         self.path = path
@@ -202,7 +202,7 @@ def _read(path: Path, load: Load) -> tuple[Gaussians, SceneReport]:
 
 
 def _picture(path: Path, name: str, data: bytes) -> UInt8[np.ndarray, "H W 4"]:
-    """A picture as RGBA, whose size is known before it is decoded."""
+    """A picture as RGBA, whose size is checked before it is decoded."""
     from PIL import Image
 
     try:
@@ -258,8 +258,8 @@ def write_sog(
     """Write a .sog of version 2, atomically. Gaussians come in spatial order, which compresses better,
     unless another is given.
 
-    Scales and colours are rounded to codebooks of 256 values. More than 65,536 Gaussians share as many sets
-    of view-dependent colour.
+    Scales and colours are rounded to codebooks of 256 values. More than 65,536 Gaussians share that many
+    sets of view-dependent colour.
 
     Args:
         path: the file.
@@ -344,7 +344,7 @@ def _opaque(pixels: np.ndarray) -> UInt8[np.ndarray, "H W 4"]:
 
 
 def _webp(pixels: UInt8[np.ndarray, "H W 4"]) -> bytes:
-    """Lossless, with the colour of transparent pixels too."""
+    """A picture as lossless WebP, which keeps the colour of transparent pixels too."""
     from PIL import Image
 
     stream = io.BytesIO()

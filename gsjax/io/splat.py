@@ -2,7 +2,7 @@
 
     x y z              float32
     scales             3 float32, not logarithms
-    red green blue     uint8, 0 to 1, of the constant harmonic alone; then the opacity
+    red green blue     uint8, 0 to 1, of the constant harmonic only; then the opacity
     w x y z            uint8, (k - 128) / 128 of a unit quaternion
 
 Axes are those of the 3DGS PLY. Source: convert.py and main.js in github.com/antimatter15/splat.

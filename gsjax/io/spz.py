@@ -44,17 +44,17 @@ MAGIC = b"NGSP"
 GZIP = b"\x1f\x8b"
 _HEADER = struct.Struct("<4sIIBBBB")
 _TABLE = struct.Struct("<4sIIBBBBI12x")  # the header of version 4
-_MOST_BEHIND = 1 << 20  # bytes that may follow the arrays: extensions of vendors
+_MOST_BEHIND = 1 << 20  # bytes that may follow the arrays: vendor extensions
 _COLOR_SCALE = 0.15
 _ANTIALIASED = 1
 _MOST_FRACTIONAL, _FEWEST_FRACTIONAL = 16, 0
 _FLIP = np.array([1.0, -1.0, -1.0])
 _FLIP_QUAT = np.array([1.0, 1.0, -1.0, -1.0])
-# Which coefficients change sign where y and z do: those odd in y z, by band.
+# The coefficients, by band, that change sign when y and z do: those odd in y z.
 _FLIP_REST = np.array([-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1.0])
 _BUCKETS = np.array([8] * 3 + [16] * 12)
-"""Steps of 1/128 to which coefficients are rounded, so that they compress: 5 bits of the first band, 4 of the
-others, as Niantic's own writer does."""
+"""Steps, in 1/128, to which coefficients are rounded so that they compress: 5 bits for the first band, 4 for
+the others, as in Niantic's own writer."""
 
 
 class _Header(NamedTuple):
@@ -78,8 +78,8 @@ def read_spz(path: Path) -> tuple[Gaussians, SceneReport]:
         path: the file.
 
     Raises:
-        SceneError: it is no SPZ, of another version or degree, cut off, or says that it is far larger than
-            its size allows.
+        SceneError: it is not an SPZ, has another version or degree, is cut off, or claims to hold far more
+            than its size allows.
     """
     data = path.read_bytes()
     packed, size = data[:2] == GZIP, _HEADER.size
@@ -120,7 +120,7 @@ def _parse(path: Path, head: bytes) -> _Header:
 
 
 def _inflated(path: Path, data: bytes, header: _Header) -> bytes:
-    """What follows the header in a gzip stream, whose checksum is compared."""
+    """What follows the header in a gzip stream, whose checksum is verified."""
     needed = sum(header.sizes())
     expect_room(path, needed, len(data), f"{header.count} Gaussians")
     stream = zlib.decompressobj(31)

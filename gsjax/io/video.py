@@ -85,7 +85,7 @@ class _Encoder:
 
     def __init__(self, path: Path, *, size: str, rate: str, quality: str):
         source = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", size, "-r", rate, "-i", "-"]
-        # A quarter of the time of x264's default, and files no larger: runs film every camera.
+        # Takes a quarter of the time of x264's default for files no larger; runs film every camera.
         target = ["-c:v", "libx264", "-preset", "veryfast", "-crf", quality]
         target += ["-pix_fmt", "yuv420p", "-movflags", "+faststart"]
         # Its messages go to a file, because an unread pipe would fill up and block it.
@@ -142,7 +142,7 @@ def read_video_frames(path: str | os.PathLike) -> UInt8[np.ndarray, "T H W 3"]:
 
 
 class Packets(NamedTuple):
-    """The packets of a video's pictures, of which each mostly holds one.
+    """The packets of a video's pictures; most of them hold one picture each.
 
     Attributes:
         times: presentation timestamps, seconds, sorted, [n].
@@ -197,7 +197,7 @@ def _to_bytes(frame: np.ndarray) -> np.ndarray:
 
 
 def _ffmpeg() -> str:
-    """The path of ffmpeg. Imported late, as most programs read and write no video."""
+    """The path of ffmpeg. Imported late, since most programs neither read nor write video."""
     import imageio_ffmpeg
 
     return imageio_ffmpeg.get_ffmpeg_exe()

@@ -24,16 +24,16 @@ Points = Float[np.ndarray, "V 3"]
 Symmetries = Float[np.ndarray, "S 4 4"]
 
 AUC_LIMIT_M = 0.1
-"""Where the curves of ADD and ADD-S end."""
+"""Upper limit of the curves of ADD and ADD-S."""
 ADD_SHARE = 0.1
-"""Of the diameter: a pose with a smaller ADD is called correct."""
+"""Fraction of the diameter: a pose with a smaller ADD counts as correct."""
 MSSD_SHARES = np.arange(1, 11) / 20
-"""Of the diameter: thresholds over which BOP averages the recall of MSSD."""
+"""Fractions of the diameter: thresholds over which BOP averages the recall of MSSD."""
 MSPD_PIXELS = 5.0 * np.arange(1, 11)
 """Thresholds over which BOP averages the recall of MSPD, in an image that is `MSPD_WIDTH` wide."""
 MSPD_WIDTH = 640
 
-_REST = 1e-9  # share of the points' spread: far above rounding, and too little to turn anything
+_REST = 1e-9  # fraction of the points' spread: far above rounding, too small to affect rotations
 _BLOCK = 1024  # points whose distances to all others are held at once
 _BOUNDING = 64  # points that bound the largest distance from below
 
@@ -45,7 +45,7 @@ class PoseScore(NamedTuple):
         add_mm, add_s_mm: mean ADD and ADD-S, millimetres.
         add_auc, add_s_auc: `accuracy_auc` of ADD and of ADD-S, 0 to 1.
         add_recall, add_s_recall: share of frames with an ADD, or ADD-S, below a tenth of the diameter.
-        recall_5cm_5deg: share of frames less than 5 cm and less than 5 degrees off.
+        recall_5cm_5deg: share of frames with errors below 5 cm and below 5 degrees.
     """
 
     add_mm: float
@@ -61,8 +61,8 @@ def fitted_poses(means: Float[np.ndarray, "T N 3"], first: Float[np.ndarray, "4 
     """The poses of an object that moves from its `first` pose as its points do: E_t P_0, where the rigid
     motion E_t takes the points from frame 0 to frame t with the least sum of squared distances (Kabsch 1976).
 
-    A rotation that the points leave open, such as that about a line on which all of them lie, is the smallest
-    one.
+    Where the points do not determine a rotation, such as about a line on which all of them lie, the smallest
+    one is used.
 
     Args:
         means: positions of the object's points over time, world, metres; at least one point.
@@ -108,8 +108,8 @@ def add_s_errors(estimated: Poses, true: Poses, points: Points) -> Float[np.ndar
 def accuracy_auc(errors: Float[np.ndarray, "T"], limit: float = AUC_LIMIT_M) -> float:
     """The area under the curve of accuracy over thresholds from 0 to `limit`, 0 to 1.
 
-    Accuracy is the share of frames whose error is at most the threshold. This is the sum of the YCB-Video
-    toolbox (`VOCap` in `plot_accuracy_keyframe.m`), which BundleSDF's evaluation has too: with errors
+    Accuracy is the share of frames whose error is at most the threshold. This is the sum that the
+    YCB-Video toolbox (`VOCap` in `plot_accuracy_keyframe.m`) and BundleSDF's evaluation compute: with errors
     e_1 <= ... <= e_m below the limit, of n in all, and e_0 = 0,
 
         ( sum_i (e_i - e_i-1) i / n  +  (limit - e_m) m / n ) / limit
@@ -163,7 +163,7 @@ def mssd(estimated: Poses, true: Poses, points: Points, symmetries: Symmetries) 
     Args:
         estimated, true: poses, model to world.
         points: vertices of the model, in its own frame, metres.
-        symmetries: motions of the model, in its own frame, that leave it as it was; one is the identity.
+        symmetries: motions of the model, in its own frame, that leave it unchanged; one is the identity.
     """
     pairs = zip(estimated, true, strict=True)
     return np.array([_least_maximum(pose, other @ symmetries, points, _placed) for pose, other in pairs])
@@ -183,7 +183,7 @@ def mspd(
     Args:
         estimated, true: poses, model to world.
         points: vertices of the model, in its own frame, metres.
-        symmetries: motions of the model, in its own frame, that leave it as it was; one is the identity.
+        symmetries: motions of the model, in its own frame, that leave it unchanged; one is the identity.
         viewmats, Ks: world to camera (OpenCV), and intrinsics, of one camera in each frame.
     """
     errors = []
@@ -205,7 +205,7 @@ def average_recall(errors: Float[np.ndarray, "T"], thresholds: Float[np.ndarray,
 
 def diameter(points: Points) -> float:
     """The largest distance between two of the points, in their unit; 0 for one point."""
-    with suppress(QhullError, ValueError):  # they lie in a plane, or are few
+    with suppress(QhullError, ValueError):  # the points are coplanar, or too few
         points = points[ConvexHull(points).vertices]
     blocks = np.array_split(points, -(-len(points) // _BLOCK))
     return float(max(cdist(block, points).max() for block in blocks))
@@ -255,9 +255,9 @@ def _least_maximum(
     points: np.ndarray,
     place: Callable[[np.ndarray, np.ndarray], np.ndarray],
 ) -> float:
-    """The least, over the `others`, of the largest distance between where a point is in the pose and there.
+    """The minimum, over the `others`, of the largest distance between a point in the pose and in the other.
 
-    A few points bound each of the others from below, so most of them need no second look.
+    A few points bound this distance from below, so that most of the others need not be evaluated in full.
     """
     target, few = place(pose, points), slice(None, None, max(1, len(points) // _BOUNDING))
 

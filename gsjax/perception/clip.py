@@ -17,7 +17,7 @@ from gsjax.perception.pictures import square_crop, to_bytes
 
 _BATCH = 32  # images; SAM finds hundreds of masks in a photograph
 _CLIP, _SIGLIP = "clip", "siglip"  # `model_type` in config.json; SigLIP 2 of fixed resolution is "siglip" too
-_CHANCE = 0.01  # of a match by SigLIP's sigmoid
+_CHANCE = 0.01  # probability of a match by SigLIP's sigmoid
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,8 @@ class ClipEncoder:
         device: the device that holds the model.
         min_score: a query whose best cosine is lower matches none of the objects. CLIP's cosines lie around
             0.25 to 0.3 for an image and a matching text, and around 0.15 to 0.2 for one that does not match.
-            SigLIP's are lower: `load_clip` takes the one at which its own sigmoid gives a match 1 in 100.
+            SigLIP's are lower: `load_clip` takes the one at which SigLIP's own sigmoid gives a match a
+            probability of 1 in 100.
     """
 
     model: Any
@@ -47,13 +48,12 @@ class ClipEncoder:
 
     @property
     def dimension(self) -> int:
-        """Numbers of a vector."""
+        """Length of a vector."""
         config = self.model.config
         return config.vision_config.hidden_size if self.is_siglip else config.projection_dim
 
     def embed_images(self, images: list[np.ndarray]) -> Float[np.ndarray, "n D"]:
-        """Unit vectors of RGB images [h,w,3], uint8 or floats 0 to 1; a few images at a time are in the
-        model's memory."""
+        """Unit vectors of RGB images [h,w,3], uint8 or floats 0 to 1, computed in batches to limit memory."""
         vectors = []
         for first in range(0, len(images), _BATCH):
             some = [to_bytes(image) for image in images[first : first + _BATCH]]

@@ -79,7 +79,7 @@ class ClassCodebook:
         return self._vector(name)
 
     def others(self, text: str) -> tuple[str, ...]:
-        """All names but this one."""
+        """All names except this one."""
         return tuple(name for name in self.names if name != _plain(text))
 
     def _vector(self, name: str) -> Float[np.ndarray, "D"]:

@@ -22,7 +22,8 @@ class Dinov2Encoder:
         model, processor: the network and its preprocessor, from the transformers package.
         torch: the torch module.
         device: the device that holds the model.
-        resolution: shorter side of the model's input, pixels, rounded to whole patches. Larger resolves more.
+        resolution: shorter side of the model's input, pixels, rounded to whole patches. Larger values resolve
+            more.
     """
 
     model: Any

@@ -1,8 +1,8 @@
-"""Features computed by other tools, read in the layouts that these write.
+"""Reads features computed by other tools, in the layouts that those tools write.
 
-layout          files of an image NAME                        contents
-langsplat       NAME_s.npy, NAME_f.npy                        [4,H,W] rows (-1: none), at four sizes of
-                                                              objects, of [n,512]
+layout          files for an image NAME                       contents
+langsplat       NAME_s.npy, NAME_f.npy                        [4,H,W] rows (-1: none) of [n,512], for four
+                                                              sizes of objects
 feature-3dgs    NAME_fmap_CxHxW.npy, or .pt                   [C,H,W]: LSeg's, SAM's
 lerf            level_0.npy, level_1.npy, ... (CLIP), or      [images,h,w,C], in the order of the images
                 the folder's only .npy (DINO)
@@ -34,7 +34,7 @@ _LAYOUTS = (
     "NAME_s.npy with NAME_f.npy (LangSplat), NAME_fmap_CxHxW.npy or .pt (Feature-3DGS), level_0.npy or "
     "one .npy of all images (LERF), NAME.npy, or NAME.npz with features, or with ids and codebook"
 )
-_LONGEST = 200  # characters of what is quoted of a file
+_LONGEST = 200  # characters quoted from a file
 # Masks compress a thousandfold but are small; features are large but compress far less.
 _LARGE, _MOST_PACKED = 2**30, 100  # bytes; largest compression ratio
 
@@ -48,7 +48,8 @@ class PictureFeatures:
         ids: row of the codebook for each pixel, [H,W]; -1 where there is none. None for maps.
         codebook: embeddings of the masks, [n,C]. None for maps.
         map: features of the pixels, [h,w,C]. None for masks.
-        filled: with all levels, those on which a pixel has another's mask, [H,W,levels]. None for one level.
+        filled: with all levels, those on which a pixel has the mask of another level, [H,W,levels]. None for
+            one level.
     """
 
     path: Path
@@ -74,8 +75,8 @@ def read_feature_folder(
         folder: the folder of the files.
         names: names of all images. Suffixes are ignored, and leading folders too where that is unambiguous.
         which: indices of the images to read; with one file per image, only these have to exist. Default: all.
-        level: size of objects to read from LangSplat's files: default, small, medium or large; each for the
-            last three, with codebooks as from `joined_levels`.
+        level: size of objects to read from LangSplat's files: default, small, medium or large; or "each" for
+            the last three together, with codebooks as from `joined_levels`.
 
     Raises:
         FileNotFoundError: the folder does not exist, or has no features for an image.
@@ -249,7 +250,7 @@ def _load(path: Path) -> np.ndarray:
 
 @contextmanager
 def _refusing(path: Path, expected: str) -> Iterator[None]:
-    """Turn every error into a ValueError; numpy, zipfile and the unpackers raise all kinds of them."""
+    """Turn every error into a ValueError; numpy, zipfile and the decompressors raise all kinds of them."""
     try:
         yield
     except Exception as error:

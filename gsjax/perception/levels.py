@@ -1,5 +1,5 @@
-"""Masks on several levels: things, their parts, and the parts of these. LangSplat (Qin et al. 2024, section
-3.2) keeps three, as SAM finds them.
+"""Masks on several levels: objects, their parts, and the parts of those. LangSplat (Qin et al. 2024, section
+3.2) keeps three levels, as SAM finds them.
 """
 
 from collections.abc import Iterator, Sequence
@@ -10,21 +10,21 @@ from jaxtyping import Bool, Float, Int
 
 Level = Literal["small", "medium", "large"]
 LEVELS: tuple[Level, ...] = get_args(Level)
-"""Levels by the size of what they hold apart."""
-_WITHIN = 0.8  # share of a mask that lies in a larger one of which it is a part
+"""The levels, in ascending order of the size of the objects that they separate."""
+_WITHIN = 0.8  # least fraction of a part that lies within the mask of the larger object
 
 
 def labels_on_levels(
     masks: Bool[np.ndarray, "n H W"], max_fraction: float = 1.0, min_pixels: int = 1
 ) -> Int[np.ndarray, "levels H W"]:
-    """A label image for each level from masks that may overlap: 1 + the row of the mask, 0 where none of that
-    level is. A mask that lies in no other is "large", one that lies in a large one "medium", and all that lie
-    deeper are "small". Of masks of one level, the smaller is on top.
+    """A label image for each level from masks that may overlap: 1 + the row of the mask, 0 where the level
+    has none. A mask that lies in no other is "large", one that lies in a large one is "medium", and all that
+    are nested deeper are "small". Where masks of one level overlap, the smaller one is on top.
 
     Args:
         masks: masks of one image.
         max_fraction: a mask that covers more of the image is left out.
-        min_pixels: and so is one of fewer pixels.
+        min_pixels: a mask with fewer pixels is left out, too.
     """
     areas = masks.sum(axis=(1, 2))
     size = masks.shape[1] * masks.shape[2]
@@ -40,8 +40,8 @@ def labels_on_levels(
 
 
 def labels_on_level(labels: Int[np.ndarray, "levels H W"], level: Level) -> Int[np.ndarray, "H W"]:
-    """Labels on one level; where it has none, those of the next larger level or, without one, of the next
-    smaller.
+    """Labels on one level; where it has none, those of the next larger level or, if that has none either, of
+    the next smaller.
 
     Args:
         labels: on all levels; 0 where there is none.
@@ -56,9 +56,9 @@ def labels_on_level(labels: Int[np.ndarray, "levels H W"], level: Level) -> Int[
 def joined_levels(
     ids: Sequence[Int[np.ndarray, "H W"]], codebooks: Sequence[Float[np.ndarray, "_ C"]]
 ) -> tuple[Int[np.ndarray, "H W"], Float[np.ndarray, "k channels"], Bool[np.ndarray, "H W levels"]]:
-    """The masks of all levels as one image of ids: its codebook has the embeddings of a pixel on all levels,
-    one after another. On a level where a pixel has no mask it has that of the next larger level or, without
-    one, of the next smaller; these levels are returned too.
+    """The masks of all levels as one image of ids, whose codebook concatenates the embeddings of a pixel on
+    all levels. On a level where a pixel has no mask, it takes that of the next larger level or, if there is
+    none, of the next smaller; the levels filled in this way are returned too.
 
     Args:
         ids: row of the level's codebook for each pixel; -1 where there is none. The smallest level is first.
@@ -73,7 +73,7 @@ def joined_levels(
     for level, row in enumerate(filled):
         for other in _instead(level, len(rows)):
             np.copyto(row, rows[other], where=row < 0)
-    key = np.zeros(rows.shape[1:], np.int64)  # a number for each combination: sorted faster than rows
+    key = np.zeros(rows.shape[1:], np.int64)  # one number per combination, which sorts faster than rows
     for row in filled:
         key = key * (len(book) + 1) + row + 1
     combined, first, place = np.unique(key, return_index=True, return_inverse=True)
@@ -85,6 +85,6 @@ def joined_levels(
 
 
 def _instead(level: int, count: int) -> Iterator[int]:
-    """The levels to turn to where one has no mask."""
+    """The levels to fall back on, in order, where one has no mask."""
     yield from range(level + 1, count)
     yield from reversed(range(level))

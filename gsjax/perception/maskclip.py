@@ -23,15 +23,15 @@ class MaskClipEncoder:
 
     Attributes:
         clip: the model, also used for text.
-        resolution: shorter side of the model's input, pixels, rounded to whole patches. Larger resolves more,
-            as far as the interpolated position embeddings allow.
+        resolution: shorter side of the model's input, pixels, rounded to whole patches. Larger values resolve
+            more, as far as the interpolated position embeddings allow.
     """
 
     clip: ClipEncoder
     resolution: int = 448
 
     def __post_init__(self):
-        if self.clip.is_siglip:  # it pools by a query of its own, not by a token among the patches
+        if self.clip.is_siglip:  # it pools with a learned query, not with a token among the patches
             raise ValueError(
                 "vectors of patches: expected the weights of CLIP, found those of SigLIP, which has vectors "
                 "of whole pictures only"

@@ -1,7 +1,7 @@
 """Planes in a depth image, found one after the other by RANSAC (Fischler and Bolles 1981).
 
 A hypothesis is a pixel and its normal, and the normal of an inlier has to agree too: an infinite plane cuts
-through any object that crosses it, and by distance alone those cuts would count as plane.
+through any object that crosses it, and by distance alone those cuts would count as part of the plane.
 """
 
 from dataclasses import dataclass
@@ -78,7 +78,7 @@ def surface_normals(points: Float[np.ndarray, "H W 3"]) -> Float[np.ndarray, "H 
 
 
 def _opened(pixels: Bool[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"]:
-    """What is left of pixels without what is thin, grown back and a little beyond."""
+    """The pixels without thin structures (a morphological opening), dilated by `_EDGE`."""
     core = ndimage.binary_opening(pixels)
     return np.asarray(ndimage.binary_dilation(core, iterations=_EDGE))
 

@@ -76,7 +76,7 @@ class FlowPropagator:
         lab_before: Float[np.ndarray, "H W 3"],
         lab: Float[np.ndarray, "H W 3"],
     ) -> Int[np.ndarray, "H W"]:
-        """The label of each pixel's origin in the image before, _UNKNOWN where that is uncertain."""
+        """The label of each pixel's origin in the previous image, _UNKNOWN where that is uncertain."""
         rows, columns = np.nonzero(certain)
         steps = np.rint(backward[certain]).astype(int)
         origins = rows + steps[:, 1], columns + steps[:, 0]

@@ -83,8 +83,8 @@ class SamSegmenter:
         return name_by_size(labels_of_masks(found.masks, found.scores, self.max_fraction), self.min_pixels)
 
     def levels(self, image: Num[np.ndarray, "H W 3"]) -> Int[np.ndarray, "levels H W"]:
-        """Labels of everything on the levels of `gsjax.perception.levels`: things, their parts, and the parts
-        of these; 0 where there is none.
+        """Labels of everything on the levels of `gsjax.perception.levels`: objects, their parts, and the
+        parts of those; 0 where there is none.
 
         Args:
             image: RGB, uint8 or floats 0 to 1.

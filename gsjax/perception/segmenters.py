@@ -183,7 +183,7 @@ class PlaneOrRegionSegmenter:
 
 @dataclass(frozen=True)
 class PieceSegmenter:
-    """Pieces of objects: regions of similar colour, with depth only those that protrude from planes.
+    """Pieces of objects: regions of similar colour; with depth, only those that protrude from planes.
 
     For methods that merge pieces by other evidence, such as common motion: a door is a piece, and so is each
     side of a box.

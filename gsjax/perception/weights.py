@@ -77,8 +77,8 @@ def load_model(transformers: ModuleType, kind: str, folder: Path, device: str, *
         kind: the name of its class.
         folder: from `model_folder`.
         device: device of torch.
-        half: compute with weights of half precision as they are, except on a CPU, which is slower with them;
-            the caller gives inputs of the model's `dtype`. Otherwise in single precision.
+        half: keep weights of half precision as they are, except on a CPU, which is slower with them; the
+            caller must pass inputs of the model's `dtype`. Otherwise they are converted to single precision.
     """
     with _without_bars(transformers.utils.logging):
         model = getattr(transformers, kind).from_pretrained(folder, **LOCAL_WEIGHTS).eval()
@@ -87,7 +87,7 @@ def load_model(transformers: ModuleType, kind: str, folder: Path, device: str, *
 
 @contextmanager
 def _without_bars(logging: Any) -> Iterator[None]:
-    """No progress bars of transformers, which would mix with a command's own."""
+    """Hide the progress bars of transformers, which would mix with a command's own."""
     shown = logging.is_progress_bar_enabled()
     logging.disable_progress_bar()
     try:

@@ -1,7 +1,7 @@
-"""Pictures and pages. matplotlib is loaded here first, whatever MPLBACKEND says.
+"""Pictures, plots and pages. matplotlib is first imported here, regardless of MPLBACKEND.
 
-A notebook hands its own backend to the programs that it starts, and matplotlib refuses to be imported where a
-named backend is not installed. The plots of gsjax need none: they are drawn without pyplot.
+A notebook passes its own backend on to the programs that it starts, and matplotlib cannot be imported if the
+named backend is not installed. The plots of gsjax need no backend: they are drawn without pyplot.
 """
 
 import os
@@ -10,7 +10,7 @@ from contextlib import suppress
 
 
 def _load_matplotlib() -> None:
-    """Import matplotlib, with the backend that MPLBACKEND names if it is there, else with its own choice."""
+    """Import matplotlib, with the backend that MPLBACKEND names if available, else with its own choice."""
     name = os.environ.pop("MPLBACKEND", None)
     try:
         import matplotlib

@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float, Integer, Num, UInt8
 BACKGROUND = (158, 160, 164)  # label 0
 INVALID = (38, 40, 44)  # pixels without depth
 _INK = (245, 245, 245)
-_CHIP = (22, 24, 28)  # behind it
+_CHIP = (22, 24, 28)  # behind text
 _LARGE_ERROR, _LABEL_WEIGHT = 0.3, 0.65
 
 # Okabe and Ito's colours, then darker ones from Tol's muted scheme: any two neighbours are distinct to
@@ -37,8 +37,8 @@ _SHADES = ((0.9, 0.8), (0.55, 0.7), (0.75, 0.5))  # saturation and value
 
 
 def label_color(label: int) -> tuple[int, int, int]:
-    """The RGB colour, 0 to 255, of `label` in every picture; 0 is grey, and after the palette's ten, hues go
-    on by the golden section, so that labels a hundred apart differ too."""
+    """The RGB colour, 0 to 255, of `label` in every picture; 0 is grey. Beyond the palette's ten colours,
+    hues advance by the golden ratio, so that labels a hundred apart differ too."""
     if label <= len(PALETTE):
         return BACKGROUND if label == 0 else PALETTE[label - 1]
     red, green, blue = hsv_to_rgb(label * _GOLDEN % 1, *_SHADES[label % len(_SHADES)])
@@ -237,7 +237,7 @@ def overlay_labels(
 def numbered(
     picture: UInt8[np.ndarray, "h w 3"], labels: Integer[np.ndarray, "h w"]
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """The picture with the number of each label but 0 where the label is widest, if there is room for it.
+    """The picture with the number of each label above 0 where the label is widest, if there is room for it.
 
     Args:
         picture: colours.

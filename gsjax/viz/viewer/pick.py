@@ -48,7 +48,7 @@ def pick(
         direction: direction of the ray, of any length but 0.
 
     Raises:
-        ValueError: `direction` has no length.
+        ValueError: `direction` has zero length.
     """
     origin, direction = np.asarray(origin, np.float64), np.asarray(direction, np.float64)
     length = np.linalg.norm(direction)

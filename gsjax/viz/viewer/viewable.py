@@ -29,7 +29,7 @@ class Shots:
         Ks: intrinsics in pixels, [T,V,3,3].
         sizes: width and height in pixels, [V,2].
         load_image: (t, v) -> RGB, [H,W,3] uint8; None if there are no pictures to show.
-        near: distance of their near planes, metres: what is nearer was not fitted, and hides the rest.
+        near: distance of their near planes, metres: anything nearer was not fitted, and would hide the rest.
 
     Raises:
         ValueError: shapes disagree.
@@ -151,7 +151,7 @@ class Asking:
         like: (row of a Gaussian, frame, level) -> the answer to "what is similar to it".
         save: (selected Gaussians [N], name, frame) -> the path of a PLY file with the Gaussians as they are
             in that frame; nothing is overwritten.
-        levels: levels of the features, the smallest first; none where there is one alone.
+        levels: levels of the features, the smallest first; empty if there is only one.
     """
 
     hint: str
@@ -177,7 +177,7 @@ class Viewable:
         background: RGB behind the scene, 0 to 1.
         antialiased: whether the scene was fitted with `rasterize_mode="antialiased"`.
         unit: unit of lengths, such as "m"; empty if the scale is unknown.
-        origin: what places are relative to, [3] float64, where the data lie far from 0.
+        origin: the point that positions are relative to, [3] float64, if the data lie far from 0.
         editing: how the scene can be edited.
         asking: how the scene can be queried, if it cannot be edited.
 
