@@ -2,8 +2,8 @@
 
 import sys
 
-from gsjax.engine.interrupts import heard_interrupts
-from gsjax.engine.program import run_politely
+from gsjax.engine.interrupts import handled_interrupts
+from gsjax.engine.program import run_command
 from gsjax.engine.streams import say_error
 
 
@@ -11,8 +11,8 @@ def main() -> int:
     """Run the suite with the process's arguments; returns the exit code, as `gsjax bench` does."""
     does = "measure the rasterizer and every method's step here"
     try:
-        with heard_interrupts():
-            return run_politely("bench", sys.argv[1:], ("gsjax.engine.bench", does))
+        with handled_interrupts():
+            return run_command("bench", sys.argv[1:], ("gsjax.engine.bench", does))
     except KeyboardInterrupt:
         say_error("by Ctrl-C; what is on disk stays", word="stopped")
         return 130

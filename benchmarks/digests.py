@@ -63,20 +63,20 @@ def describe_text(text: str) -> dict[str, Any]:
         value = json.loads(text)
     except ValueError:
         return {"text": len(text)}
-    return {"text": steady(value, left_out=_OPTION_KEYS)}
+    return {"text": without_volatile(value, left_out=_OPTION_KEYS)}
 
 
-def steady(value: Any, left_out: Iterable[str] = ()) -> Any:
+def without_volatile(value: Any, left_out: Iterable[str] = ()) -> Any:
     """A value from JSON without times, rates, machines and paths; of sentences only the numbers remain, since
     wording is not a result."""
     if isinstance(value, Mapping):
         return {
-            key: steady(item, left_out)
+            key: without_volatile(item, left_out)
             for key, item in value.items()
             if not (key in left_out or key in _UNSTEADY_KEYS or key.endswith(_UNSTEADY_ENDINGS))
         }
     if isinstance(value, list):
-        return [steady(item, left_out) for item in value if not _is_after_a_time(item)]
+        return [without_volatile(item, left_out) for item in value if not _is_after_a_time(item)]
     if not isinstance(value, str):
         return value
     if value.startswith("/"):
@@ -118,9 +118,13 @@ def describe_file(path: Path) -> dict[str, Any]:
             }
         }
     if path.suffix == ".json":
-        return {"says": steady(json.loads(path.read_text(encoding="utf-8")))}
+        return {"says": without_volatile(json.loads(path.read_text(encoding="utf-8")))}
     if path.suffix == ".jsonl":
-        return {"says": [steady(json.loads(line)) for line in path.read_text(encoding="utf-8").splitlines()]}
+        return {
+            "says": [
+                without_volatile(json.loads(line)) for line in path.read_text(encoding="utf-8").splitlines()
+            ]
+        }
     return {}
 
 

@@ -164,7 +164,7 @@ def _work(name: str, first: int, end: int, seed: int, pipe: Connection) -> None:
     pipe.send(None)
 
 
-def try_apart(name: str, first: int, end: int, seed: int) -> Iterator[Case]:
+def try_in_process(name: str, first: int, end: int, seed: int) -> Iterator[Case]:
     """Cases of a reader, in a separate process, which is replaced whenever a case ends it.
 
     Args:
@@ -212,7 +212,7 @@ def main() -> None:
     for name in arguments.only:
         count = max(1, round(arguments.count * READERS[name].share))
         begun, counts, faults = time.perf_counter(), collections.Counter(), []
-        for case in try_apart(name, arguments.first, arguments.first + count, arguments.seed):
+        for case in try_in_process(name, arguments.first, arguments.first + count, arguments.seed):
             counts[case.outcome] += 1
             if case.outcome == "fault":
                 faults.append(case._asdict())

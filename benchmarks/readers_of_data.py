@@ -27,7 +27,7 @@ from gsjax.data import (
     read_open3d,
 )
 from gsjax.data.clouds import read_cloud
-from gsjax.data.files import background_behind, picture_size, read_depth, read_image
+from gsjax.data.files import find_background, picture_size, read_depth, read_image
 from gsjax.data.masks import read_mask, read_shades
 from gsjax.io.labels import write_labels
 from gsjax.io.scenes import read_gaussians, write_gaussians
@@ -192,7 +192,7 @@ def _picture(name: str) -> Reader:
 
     def read(root: Path) -> Arrays:
         path = root / name
-        picture_size(path), background_behind([path])
+        picture_size(path), find_background([path])
         return (read_image(path, WIDTH, HEIGHT),)
 
     return Reader(build, read)

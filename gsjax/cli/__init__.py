@@ -99,13 +99,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
         hint = f"did you mean {meant[0]}? There are" if meant else "there are"
         say_error(f"no command {command!r}; {hint}: {known}")
         return 2
-    from gsjax.engine.interrupts import heard_interrupts
+    from gsjax.engine.interrupts import handled_interrupts
 
     try:
-        with heard_interrupts():
-            from gsjax.engine.program import run_politely
+        with handled_interrupts():
+            from gsjax.engine.program import run_command
 
-            return run_politely(command, rest, COMMANDS[command])
+            return run_command(command, rest, COMMANDS[command])
     except KeyboardInterrupt as interrupt:
         from gsjax.engine.messages import reason
 

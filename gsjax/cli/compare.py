@@ -9,7 +9,7 @@ import tyro
 from gsjax.engine.compare.comparison import compare
 from gsjax.engine.compare.pictures import shows_the_same
 from gsjax.engine.compare.results import FOLDERS, as_json, summarize
-from gsjax.engine.folder import expect_ours, holds_something, is_run
+from gsjax.engine.folder import expect_replaceable, is_nonempty, is_run
 from gsjax.engine.locks import lock, releasing_locks
 from gsjax.engine.options import Common
 from gsjax.engine.records import read_record
@@ -56,11 +56,11 @@ def run(options: Options) -> int:
 def _check_folder(out: Path) -> None:
     """Locks the folder; raises FileExistsError if it holds something other than a comparison."""
     lock(out)
-    if holds_something(out) and (is_run(out) or not (out / _JSON).is_file()):
+    if is_nonempty(out) and (is_run(out) or not (out / _JSON).is_file()):
         what = "a run" if is_run(out) else "other files"
         raise FileExistsError(
             f"--out {out}: expected a new folder, an empty one or an earlier comparison, found {what}; "
             "name another"
         )
     for name, written in FOLDERS.items():
-        expect_ours(out / name, (written,))
+        expect_replaceable(out / name, (written,))

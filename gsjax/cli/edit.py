@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.progress import track
 
 from gsjax.data.text import decoded
-from gsjax.engine.folder import SCRIPT, holds_something
+from gsjax.engine.folder import SCRIPT, is_nonempty
 from gsjax.engine.locks import lock, releasing_locks
 from gsjax.engine.messages import Notes, counted, stage
 from gsjax.engine.options import Common, Overwriting
@@ -158,7 +158,7 @@ def _folder(options: Options) -> Path:
     name = _UNNAMED if options.script is None else options.script.stem
     folder = options.run / "edit" / name if options.out is None else options.out
     lock(folder)
-    if holds_something(folder):
+    if is_nonempty(folder):
         if not (folder / SCRIPT).is_file():
             raise FileExistsError(
                 f"{folder}: expected a new or empty folder, or that of an earlier film (with "

@@ -22,7 +22,7 @@ from gsjax.engine.photographs import photographs_of_run, read_frames, split
 from gsjax.engine.records import EVALUATION, Record, digest, read_record
 from gsjax.engine.report import write_report
 from gsjax.engine.scores import mean_scores
-from gsjax.engine.summary import Card, Column, Media, Summary, Table, in_title
+from gsjax.engine.summary import Card, Column, Media, Summary, Table, title_of
 from gsjax.engine.terminal import print_summary
 from gsjax.io.atomic import write_json
 from gsjax.io.brief import shortened
@@ -104,7 +104,7 @@ def run(options: Options) -> int:
                 write_panel(new / picture, seen)
                 row = {"view": photographs.names[indices[i]], "split": _HELD_OUT if held_out[i] else _TRAIN}
                 rows.append(row | scores(seen, weights, exposed) | {"picture": picture.as_posix()})
-            _say_what_is_missing(notes, record, rows, frames, weights)
+            _note_missing(notes, record, rows, frames, weights)
             known = None if weights is None else {"network": weights.network, "weights": fingerprint(weights)}
             found = {
                 "kind": "eval",
@@ -203,7 +203,7 @@ def _compared(
         yield judge.compare(gaussians, frame)
 
 
-def _say_what_is_missing(
+def _note_missing(
     notes: Notes,
     record: Record,
     rows: list[dict[str, Any]],
@@ -242,7 +242,7 @@ def _summarize(folder: Path, record: Record, found: dict[str, Any]) -> Summary:
     split = [Column("split", "split")] if len(means) > 1 else []
     return Summary(
         title=f"Scores of {record.path.resolve().name}",
-        subtitle=f"{in_title(found['dataset'])}: {counted(len(rows), 'view')}, "
+        subtitle=f"{title_of(found['dataset'])}: {counted(len(rows), 'view')}, "
         f"{found['num_gaussians']:,} Gaussians"
         + ("" if found["complete"] else ", of a run that was not finished"),
         cards=[

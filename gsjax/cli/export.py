@@ -16,7 +16,7 @@ from gsjax.engine.messages import Notes, counted, reason, stage
 from gsjax.engine.options import Common
 from gsjax.engine.recording import parse_frames
 from gsjax.engine.show import files_of, page_options
-from gsjax.engine.terminal import in_bytes
+from gsjax.engine.terminal import format_bytes
 from gsjax.engine.viewables import UP, Up, open_viewable
 from gsjax.io.labels import labels_beside
 from gsjax.io.scene_file import spatial_order
@@ -91,7 +91,7 @@ def run(options: Options) -> int:
             left_out = write_gaussians(options.out, _at(scene, rows[0]), **look)
         _warn(notes, options.out, written, left_out)
     text = f"{scene.gaussians.num:,} Gaussians, {written.name}{f' of {len(rows)} frames' if plays else ''}"
-    _tell(options.out, f"{text}, {in_bytes(options.out.stat().st_size)}")
+    _tell(options.out, f"{text}, {format_bytes(options.out.stat().st_size)}")
     return 0
 
 
@@ -120,7 +120,7 @@ def _write_frames(
         )
     part = "" if stopped is None else f" of {len(files)} (stopped by {stopped})"
     text = f"{counted(len(sizes), 'file')}{part} of {scene.gaussians.num:,} Gaussians, {written.name}"
-    _tell(options.out, f"{text}, {in_bytes(sum(sizes))}")
+    _tell(options.out, f"{text}, {format_bytes(sum(sizes))}")
     return 0 if stopped is None else 130
 
 

@@ -13,7 +13,7 @@ from rich.console import Console
 
 from gsjax.engine.distill.file import FOLDER
 from gsjax.engine.distill.saved import Locations, field_of, open_field_run
-from gsjax.engine.folder import DEFORMATION, OF_QUERY, expect_folder, expect_ours, is_run
+from gsjax.engine.folder import DEFORMATION, OF_QUERY, expect_folder, expect_replaceable, is_run
 from gsjax.engine.messages import Notes, describe, stage
 from gsjax.engine.options import Common, ObjectText
 from gsjax.engine.program import USER_ERRORS
@@ -163,7 +163,7 @@ def _expect_place(out: Path | None) -> None:
     if out.resolve() in (here := Path.cwd().resolve(), *here.parents):
         raise ValueError(f"--out {out}: expected a folder of its own, found the current one; name another")
     try:
-        expect_ours(out, OF_QUERY)
+        expect_replaceable(out, OF_QUERY)
     except FileExistsError as error:
         raise ValueError(
             f"--out {out}: expected a new folder, or one with an earlier answer, found other files; "
@@ -346,7 +346,7 @@ def _numbers(option: str, text: str | None, wanted: str) -> Any:
 
 def _query_objects(options: Options, console: Console) -> None:
     """Query a tracked run for an object."""
-    from gsjax.engine.track.query import ObjectQuery, ask_for_object
+    from gsjax.engine.track.query import ObjectQuery, answer_query
 
     _expect_none_of(
         f"{options.run} has no field that could be queried so; gsjax distill {options.run} makes one",
@@ -368,4 +368,4 @@ def _query_objects(options: Options, console: Console) -> None:
         debug=options.debug,
         **vars(options.track),
     )
-    ask_for_object(query, console, _folder(options), pictures=options.pictures)
+    answer_query(query, console, _folder(options), pictures=options.pictures)

@@ -34,7 +34,7 @@ from gsjax.data.validation import check_intrinsics, check_poses
 from gsjax.io.brief import shortened
 
 CAMERAS, POSES = "scene_camera.json", "scene_gt.json"
-_STANDING = "camera"
+_CAMERA = "camera"
 
 
 class _View(NamedTuple):
@@ -85,7 +85,7 @@ def read_bop(path: str | Path, *, world: str | None = None, depth_unit_m: float 
     parts = {"a camera": views, "an image": images, "depth": depths or None}
     parts |= {"annotations": instances if annotated else None, "a pose of the camera": viewmats}
     numbers = _complete_frames(root, sorted(views.keys() | images.keys()), parts)
-    followed = _Followed.over([instances.get(n, []) for n in numbers], [viewmats[n] for n in numbers])
+    followed = _Tracks.over([instances.get(n, []) for n in numbers], [viewmats[n] for n in numbers])
     Ks = np.stack([views[n].K for n in numbers])[:, None]
     check_intrinsics(Ks, lambda t, _: f"frame {numbers[t]} in {root / CAMERAS}")
     width, height = image_size(images[numbers[0]])
@@ -182,12 +182,12 @@ def _viewmats(
 ) -> dict[int, Float[np.ndarray, "4 4"]]:
     """World to camera, metres, in each frame where it is known."""
     objects = sorted({instance.number for some in instances.values() for instance in some})
-    if world == _STANDING:
+    if world == _CAMERA:
         return {number: np.eye(4) for number in views}
     if world is not None:
         if not world.isdecimal() or int(world) not in objects:
             listed = f"the number of an object ({shortened(map(str, objects), 8)})"
-            raise ValueError(f"{root}: world must be {_STANDING} or {listed}, got {world!r}")
+            raise ValueError(f"{root}: world must be {_CAMERA} or {listed}, got {world!r}")
         own = {n: [i.pose for i in some if i.number == int(world)] for n, some in instances.items()}
         if several := [n for n, poses in own.items() if len(poses) > 1]:
             expected = f"one object {world}, as it is to be the world"
@@ -198,7 +198,7 @@ def _viewmats(
     known = {n: view.viewmat for n, view in views.items() if view.viewmat is not None}
     if views and not known:
         choices = f" or an object that does ({shortened(map(str, objects), 8)})" if objects else ""
-        advice = f"Set world (--read.world) to what stands still: {_STANDING}{choices}."
+        advice = f"Set world (--read.world) to what stands still: {_CAMERA}{choices}."
         raise DataError(root / CAMERAS, "poses of the camera (cam_R_w2c, cam_t_w2c)", "none", advice)
     _check(root / CAMERAS, {n: [pose] for n, pose in known.items()}, "Correct it, or remove that frame.")
     return known
@@ -241,7 +241,7 @@ def _masks(root: Path, counts: list[tuple[int, int]]) -> list[list[Path | None]]
     return [[folder / name if name in known else None for name in some] for some in names]
 
 
-class _Followed(NamedTuple):
+class _Tracks(NamedTuple):
     """Instances tracked over frames, with labels that they keep.
 
     Attributes:
@@ -259,7 +259,7 @@ class _Followed(NamedTuple):
     frames: int
 
     @classmethod
-    def over(cls, frames: list[list[_Instance]], viewmats: list[np.ndarray]) -> "_Followed":
+    def over(cls, frames: list[list[_Instance]], viewmats: list[np.ndarray]) -> "_Tracks":
         """Track the instances of each object over frames."""
         tracks: dict[int, list[dict[int, int]]] = {}  # by object: position of the frame -> place in its list
         worlds = [

@@ -21,7 +21,9 @@ from gsjax.data.validation import check_poses
 
 MM = 0.001
 MODELS, INFO = "models_eval", "models_info.json"
-_TURNS = 315  # rotations of a continuous symmetry: BOP's ceil(pi / 0.01), about 1 % of the diameter apart
+_NUM_ROTATIONS = (
+    315  # rotations of a continuous symmetry: BOP's ceil(pi / 0.01), about 1 % of the diameter apart
+)
 
 
 def by_number(path: Path, parse: Callable[[Any], Any], what: str = "frame") -> dict[int, Any]:
@@ -63,7 +65,7 @@ def read_models(dataset: Path, numbers: Collection[int]) -> dict[int, ObjectMode
     folder = dataset / MODELS
     if not (folder / INFO).is_file():
         return {}
-    described, models = by_number(folder / INFO, _described, "object"), {}
+    described, models = by_number(folder / INFO, _model_info, "object"), {}
     for number in sorted(described.keys() & set(numbers)):
         file = folder / f"obj_{number:06d}.ply"
         if not file.is_file():
@@ -75,7 +77,7 @@ def read_models(dataset: Path, numbers: Collection[int]) -> dict[int, ObjectMode
     return models
 
 
-def _described(entry: dict[str, Any]) -> tuple[float, Float[np.ndarray, "symmetries 4 4"]]:
+def _model_info(entry: dict[str, Any]) -> tuple[float, Float[np.ndarray, "symmetries 4 4"]]:
     """The diameter of a model, metres, and its symmetries."""
     diameter = MM * float(entry["diameter"])
     if not 0 < diameter < np.inf:
@@ -92,21 +94,21 @@ def _symmetries(entry: dict[str, Any]) -> Float[np.ndarray, "symmetries 4 4"]:
         motion[:3, 3] *= MM
         discrete.append(motion)
     check_poses("symmetry", np.stack(discrete)[:, None], lambda i, _: f"place {i - 1}", "Use rigid motions.")
-    turns = [_turns(symmetry) for symmetry in entry.get("symmetries_continuous", [])]
+    turns = [_rotations(symmetry) for symmetry in entry.get("symmetries_continuous", [])]
     if not turns:
         return np.stack(discrete)
     return (np.concatenate(turns)[:, None] @ np.stack(discrete)).reshape(-1, 4, 4)
 
 
-def _turns(symmetry: dict[str, Any]) -> Float[np.ndarray, "turns 4 4"]:
+def _rotations(symmetry: dict[str, Any]) -> Float[np.ndarray, "turns 4 4"]:
     """Rotations about an axis in equal steps of a full turn, the identity first."""
     axis = np.array(symmetry["axis"], np.float64).reshape(3)
     offset = MM * np.array(symmetry.get("offset", [0, 0, 0]), np.float64).reshape(3)
     length = np.linalg.norm(axis)
     if not (0 < length < np.inf and np.isfinite(offset).all()):
         raise ValueError(f"axis is {axis}, offset is {offset}")
-    angles = np.linspace(0, 2 * np.pi, _TURNS, endpoint=False)
-    motions = np.tile(np.eye(4), (_TURNS, 1, 1))
+    angles = np.linspace(0, 2 * np.pi, _NUM_ROTATIONS, endpoint=False)
+    motions = np.tile(np.eye(4), (_NUM_ROTATIONS, 1, 1))
     motions[:, :3, :3] = Rotation.from_rotvec(angles[:, None] * axis / length).as_matrix()
     motions[:, :3, 3] = offset - motions[:, :3, :3] @ offset
     return motions

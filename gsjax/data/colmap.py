@@ -19,13 +19,13 @@ import numpy as np
 from gsjax.data.clouds import find_cloud, read_cloud
 from gsjax.data.colmap_files import AGAIN, CameraEntry, ImageEntry, read_cameras, read_images, read_points
 from gsjax.data.errors import DataError, DataWarning
-from gsjax.data.files import BLACK, background_behind, picture_size, read_image
+from gsjax.data.files import BLACK, find_background, picture_size, read_image
 from gsjax.data.lens import scaled_intrinsics
 from gsjax.data.masks import read_shades
 from gsjax.data.names import find_file, portable
 from gsjax.data.origin import near_origin
 from gsjax.data.photographs import Cloud, Photographs
-from gsjax.data.pictures import refuse_unread
+from gsjax.data.pictures import reject_unread
 from gsjax.data.through_lenses import Fisheye, through_lenses
 from gsjax.io.brief import shortened
 
@@ -92,7 +92,7 @@ def read_colmap(
     kept = [(image, file) for image, file in zip(usable, files, strict=True) if file is not None]
     if not kept:
         if (root / images).is_dir():
-            refuse_unread(root / images, "registered photographs", (root / images).rglob("*"))
+            reject_unread(root / images, "registered photographs", (root / images).rglob("*"))
         found = f"{len(registered)} registered, {' and '.join(left_out)}"
         advice = "Did the reconstruction fail? Give another model, or reconstruct again."
         if missing:
@@ -218,7 +218,7 @@ def _photographs(
     ]
     seen = through_lenses(lenses, sizes, root, fisheye)
     masks = [_mask_of(root / "masks", image.name) for image in entries]
-    background = background_behind(paths)
+    background = find_background(paths)
     behind = background or BLACK
 
     def load_mask(i: int) -> np.ndarray | None:

@@ -27,12 +27,12 @@ _MOST_VIEWS, _MOST_PAIRS = 4, 3
 _POINTS = 600  # per view
 _FACTORS = np.geomspace(1e-3, 1e3, 271)  # 5 % apart
 _AGREES = 0.05  # relative difference of two depths of one surface
-_RIGHT = 1.25  # a smaller factor may be noise, or a calibration that is slightly off
+_TOLERATED = 1.25  # a smaller factor may be noise, or a calibration that is slightly off
 _LEAST_SHARE = 0.2  # of the points must agree with some factor, for a verdict
-_TIMES_AS_MANY = 2.0  # points that agree, relative to no factor or to the poses as given
+_LEAST_RATIO = 2.0  # points that agree, relative to no factor or to the poses as given
 _ANGLE = np.deg2rad(40)  # between views that may see the same surface
 _FLIP = np.diag([1.0, -1.0, -1.0, 1.0])  # between the axes of OpenCV's and of OpenGL's cameras
-_MISREAD = {
+_CONVENTIONS = {
     "from the camera to the world": np.linalg.inv,
     "in OpenGL's axes": lambda viewmats: _FLIP @ viewmats,
     "from the camera to the world, in OpenGL's axes": lambda viewmats: _FLIP @ np.linalg.inv(viewmats),
@@ -62,12 +62,12 @@ def check_recording(sequence: Sequence) -> None:
     _check_clock(name, sequence)
     _check_files(name, sequence)
     if cameras > 1:
-        _check_places(name, sequence.viewmats[0], "cameras")
+        _check_positions(name, sequence.viewmats[0], "cameras")
     if sequence.load_depth is None:
         return
     Ks, viewmats, load = sequence.Ks, sequence.viewmats, sequence.load_depth
     pairs = list(
-        _moved_pairs(Ks[:, 0], viewmats[:, 0], partial(_at, load))
+        _nearby_pairs(Ks[:, 0], viewmats[:, 0], partial(_at, load))
         if cameras == 1
         else _simultaneous_pairs(Ks[0], viewmats[0], partial(load, 0))
     )
@@ -83,7 +83,7 @@ def check_photographs(photographs: Photographs) -> None:
     everything.
     """
     name, cloud, load = photographs.name, photographs.cloud, photographs.load_depth
-    _check_places(name, photographs.viewmats, "photographs")
+    _check_positions(name, photographs.viewmats, "photographs")
     points = np.zeros((0, 3)) if cloud is None else cloud.points
     if len(points):
         _check_directions(photographs, points)
@@ -96,7 +96,7 @@ def check_photographs(photographs: Photographs) -> None:
     views = [_View(Ks[i], viewmats[i], depth) for i, depth in depths if depth is not None]
     factor, others = _factor_of_points(views, points), "the points that come with the poses"
     if factor is None:
-        pairs = _moved_pairs(Ks, viewmats, load)
+        pairs = _nearby_pairs(Ks, viewmats, load)
         factor, others = _factor_of_pairs(list(pairs)), "that of other views"
     _warn_of_factor(name, factor, others)
 
@@ -133,7 +133,7 @@ def _depth(load: Callable[[], np.ndarray | None]) -> Float[np.ndarray, "height w
     return np.where(valid, depth, 0)
 
 
-def _moved_pairs(
+def _nearby_pairs(
     Ks: Float[np.ndarray, "n 3 3"],
     viewmats: Float[np.ndarray, "n 4 4"],
     load: Callable[[int], np.ndarray | None],
@@ -175,9 +175,9 @@ def _are_misread(name: str, pairs: list[tuple[_View, _View]]) -> bool:
         both = [(a, b) for pair in views for a, b in (pair, pair[::-1])]
         return float(np.mean([_shares(a, b, np.ones(1)) for a, b in both])) if both else 0.0
 
-    as_they_are, shares = agree(np.asarray), {what: agree(mended) for what, mended in _MISREAD.items()}
+    as_they_are, shares = agree(np.asarray), {what: agree(mended) for what, mended in _CONVENTIONS.items()}
     what = max(shares, key=lambda what: shares[what])
-    if shares[what] < max(_LEAST_SHARE, _TIMES_AS_MANY * as_they_are):
+    if shares[what] < max(_LEAST_SHARE, _LEAST_RATIO * as_they_are):
         return False
     found = f"depth of the cameras agrees in {as_they_are:.0%} of the pixels, and in {shares[what]:.0%}"
     advice = "give poses from the world to the camera, in OpenCV's axes (x right, y down, z forward)"
@@ -187,10 +187,10 @@ def _are_misread(name: str, pairs: list[tuple[_View, _View]]) -> bool:
 
 def _verdict(best: float, shares: Float[np.ndarray, "factors"]) -> float | None:
     """The best factor if it explains the data much better than 1 does, else 1; None if none explains them."""
-    near_one = shares[(_FACTORS < _RIGHT) & (_FACTORS > 1 / _RIGHT)].max()
+    near_one = shares[(_FACTORS < _TOLERATED) & (_FACTORS > 1 / _TOLERATED)].max()
     if shares.max() < _LEAST_SHARE:
         return None
-    return best if shares.max() > _TIMES_AS_MANY * near_one and max(best, 1 / best) > _RIGHT else 1.0
+    return best if shares.max() > _LEAST_RATIO * near_one and max(best, 1 / best) > _TOLERATED else 1.0
 
 
 def _shares(
@@ -244,7 +244,7 @@ def _warn_of_factor(name: str, factor: float | None, others: str) -> None:
     warnings.warn(f"{message}; {advice}", DataWarning, stacklevel=4)
 
 
-def _check_places(name: str, viewmats: Float[np.ndarray, "n 4 4"], noun: str) -> None:
+def _check_positions(name: str, viewmats: Float[np.ndarray, "n 4 4"], noun: str) -> None:
     """Warns if all views share one position, or all look away from the point that they surround."""
     centers, axes = np.linalg.inv(viewmats)[:, :3, 3], viewmats[:, 2, :3]
     if len(centers) < 2:

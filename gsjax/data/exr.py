@@ -59,7 +59,7 @@ def read_exr_depth(path: Path) -> Float[np.ndarray, "height width"]:
         header = _header(content)
     except (ValueError, IndexError, struct.error, KeyError) as error:
         raise DataError(path, _KIND, f"something else ({error})", _FETCH) from None
-    name = _checked(path, header)
+    name = _depth_channel(path, header)
     if not _is_complete(content, header):
         raise DataError(path, _KIND, f"a file that is cut off ({len(content)} bytes)", _FETCH)
     try:
@@ -70,7 +70,7 @@ def read_exr_depth(path: Path) -> Float[np.ndarray, "height width"]:
     return depth.astype(np.float32)
 
 
-def _checked(path: Path, header: _Header) -> str:
+def _depth_channel(path: Path, header: _Header) -> str:
     """The name of the depth channel, after a check that the header is plausible."""
     width, height, channels = header.width, header.height, header.channels
     if min(width, height) < 1 or width * height * max(1, len(channels)) > MOST_VALUES:

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from gsjax.data.errors import COMPLETE, DataError, MissingFile
-from gsjax.data.pictures import is_cut_off, is_raw, unread_format
+from gsjax.data.pictures import is_raw, is_truncated, unread_format
 from gsjax.data.text import decoded
 from gsjax.io.arrays import ArraysError, load_arrays
 from gsjax.io.pictures import PictureError, pillow_errors
@@ -23,7 +23,7 @@ Color = tuple[float, float, float]
 """RGB, 0 to 1."""
 
 _HEAD = 32  # bytes that identify a format
-_LOOKED_AT = 4
+_NUM_CHECKED = 4
 BLACK: Color = (0.0, 0.0, 0.0)
 WHITE: Color = (1.0, 1.0, 1.0)
 _LONE_BACKSLASH = re.compile(r'(?<!\\)\\(?![\\"])')
@@ -144,7 +144,7 @@ def picture_size(path: Path) -> tuple[int, int]:
         raise _not_read(path, "an image", head, f"{path.stat().st_size} bytes; {error}") from None
 
 
-def background_behind(paths: list[Path], background: Color = WHITE) -> Color | None:
+def find_background(paths: list[Path], background: Color = WHITE) -> Color | None:
     """The background to composite photographs on: `background` if some are transparent, else None.
 
     Only a few of the photographs are decoded, and only those with transparency according to their header.
@@ -157,7 +157,7 @@ def background_behind(paths: list[Path], background: Color = WHITE) -> Color | N
         DataError: one of those decoded is unreadable.
     """
     able = [path for path in paths if _has_transparency(path)]
-    some = able[:: max(1, len(able) // _LOOKED_AT)]
+    some = able[:: max(1, len(able) // _NUM_CHECKED)]
     return background if any(_is_transparent(_read_channels(path)) for path in some) else None
 
 
@@ -326,7 +326,7 @@ def read_complete(path: Path, kind: str) -> bytes:
         raise _no_such_file(path, kind) from None
     if is_raw(path, content[:_HEAD]):
         raise _not_read(path, kind, content[:_HEAD])
-    if not content or is_cut_off(content):
+    if not content or is_truncated(content):
         what = "a file that is cut off" if content else "something else"
         raise DataError(path, kind, f"{what} ({len(content)} bytes)", "Fetch the file again.")
     return content

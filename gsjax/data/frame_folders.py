@@ -6,7 +6,7 @@ from pathlib import Path
 
 from gsjax.data.errors import COMPLETE, DataError, DataWarning
 from gsjax.data.files import picture_size
-from gsjax.data.pictures import SUFFIXES, is_picture, refuse_unread
+from gsjax.data.pictures import SUFFIXES, is_picture, reject_unread
 
 DEFAULT_RATE_HZ = 30.0
 """Frame rate assumed if the data has no times."""
@@ -24,7 +24,7 @@ def pictures(folder: Path) -> list[Path]:
     """
     files = [path for path in folder.iterdir() if path.is_file()] if folder.is_dir() else []
     found = sorted(path for path in files if is_picture(path))
-    refuse_unread(folder, "pictures", files, others=len(found))
+    reject_unread(folder, "pictures", files, others=len(found))
     return found
 
 

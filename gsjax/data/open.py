@@ -18,7 +18,7 @@ from gsjax.data.layouts import PHOTOGRAPHS, RECORDINGS, Layout, in_words, layout
 from gsjax.data.open3d_rgbd import without_poses
 from gsjax.data.paris import Split
 from gsjax.data.photographs import Photographs, photographs_of
-from gsjax.data.pictures import is_picture, refuse_unread
+from gsjax.data.pictures import is_picture, reject_unread
 from gsjax.data.realsense import read_realsense
 from gsjax.data.record3d import EXPORT_THIS
 from gsjax.data.sequence import Sequence
@@ -273,7 +273,7 @@ def _unknown(root: Path, layouts: tuple[Layout, ...], options: ReadOptions) -> D
         count = sum(map(is_picture, files))
         if count and count >= len(scenes):
             return DataError(root, expected, f"{count} photographs without poses", _find_poses(folder))
-        refuse_unread(folder, expected, files)
+        reject_unread(folder, expected, files)
     if scenes:
         advice = "Give a file, or a folder of nothing but numbered ones, to gsjax view, info or export."
         return DataError(root, "a dataset", scenes_in_words(scenes), advice)

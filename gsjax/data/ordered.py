@@ -24,7 +24,7 @@ def open_as_sequence(dataset: str, read: ReadOptions | None = None) -> Sequence:
     return open_sequence(dataset, read)
 
 
-def _by_numbers(name: str) -> list[tuple[int, str]]:
+def _natural_key(name: str) -> list[tuple[int, str]]:
     """Sort key by which frame_2 comes before frame_10."""
     return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", name)]
 
@@ -46,7 +46,7 @@ def sequence_of(photographs: Photographs) -> Sequence:
         )
     times, names = photographs.times, photographs.names
     if times is None:
-        order = sorted(range(len(names)), key=lambda i: _by_numbers(names[i]))
+        order = sorted(range(len(names)), key=lambda i: _natural_key(names[i]))
     else:
         order = np.argsort(np.asarray(times), kind="stable").tolist()
     width, height = (int(side) for side in photographs.sizes[order[0]])

@@ -18,7 +18,7 @@ from gsjax.scene.origin import about, far_origin, in_words
 Data = TypeVar("Data", Photographs, Sequence)
 Given = ParamSpec("Given")
 _FARTHEST = 1e30  # squares of it are still finite
-_LEAST = 1.0  # assumed size of what static cameras see
+_MIN_EXTENT = 1.0  # assumed size of what static cameras see
 _STILL = 1e-9  # movement, relative to the distance from 0
 
 
@@ -44,7 +44,7 @@ def near_origin(read: Callable[Given, Data]) -> Callable[Given, Data]:
             expected, found = f"cameras within {_FARTHEST:g} of 0", f"one at {np.abs(centers).max():g}"
             raise DataError(args[0] if args else data.name, expected, found, "Correct its pose.")
         cloud = data.cloud if isinstance(data, Photographs) else None
-        least = _LEAST if _stand_still(centers) else 0.0
+        least = _MIN_EXTENT if _are_static(centers) else 0.0
         origin = far_origin(centers.reshape(-1, 3), [] if cloud is None else [cloud.points], least)
         if origin is None:
             return data
@@ -55,7 +55,7 @@ def near_origin(read: Callable[Given, Data]) -> Callable[Given, Data]:
     return reader
 
 
-def _stand_still(centers: Float[np.ndarray, "frames *cameras 3"]) -> bool:
+def _are_static(centers: Float[np.ndarray, "frames *cameras 3"]) -> bool:
     """Whether no camera moves: then the baseline of a pair or a rig says nothing about the scene's size."""
     return bool(np.ptp(centers, axis=0).max() <= _STILL * np.abs(centers).max())
 

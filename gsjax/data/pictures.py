@@ -86,7 +86,7 @@ def is_raw(path: Path, head: bytes) -> bool:
     return (unread_format(path, head) or ("",))[0] == "camera raw"
 
 
-def refuse_unread(where: Path, expected: str, paths: Iterable[Path], *, others: int = 0) -> None:
+def reject_unread(where: Path, expected: str, paths: Iterable[Path], *, others: int = 0) -> None:
     """Report pictures in formats that are not read: with a DataWarning if others can be read.
 
     Args:
@@ -110,7 +110,7 @@ def refuse_unread(where: Path, expected: str, paths: Iterable[Path], *, others: 
     warnings.warn(message, DataWarning, stacklevel=3)
 
 
-def warn_of_cut_off(where: object, paths: Iterable[Path]) -> None:
+def warn_of_truncated(where: object, paths: Iterable[Path]) -> None:
     """Warn with DataWarning about JPEG and PNG files that end before the picture does, without decoding them.
 
     Args:
@@ -134,10 +134,10 @@ def _ends_early(path: Path) -> bool:
         if size > _LARGE and end in file.read():
             return False
         file.seek(0)
-        return is_cut_off(file.read())
+        return is_truncated(file.read())
 
 
-def is_cut_off(content: bytes) -> bool:
+def is_truncated(content: bytes) -> bool:
     """Whether the bytes of a JPEG or PNG picture end before the picture does; other formats give False.
 
     Whatever follows the end does not matter: the video of a motion photo, further pictures of MPO, padding.

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from gsjax.data.errors import COMPLETE, DataError, DataWarning
-from gsjax.data.files import BLACK, background_behind, picture_size, read_arrays, read_image
+from gsjax.data.files import BLACK, find_background, picture_size, read_arrays, read_image
 from gsjax.data.frame_folders import pictures
 from gsjax.data.lens import scaled_intrinsics
 from gsjax.data.origin import near_origin
@@ -55,7 +55,7 @@ def read_llff(path: str | Path, axes: Axes, images: str = "images") -> Photograp
         expected, found = f"{len(viewmats)} photographs in {folder}, one per row", f"{len(paths)}"
         raise DataError(file, expected, found, "Give the name of their folder, or fetch them again.")
     actual = np.array([picture_size(photograph) for photograph in paths])
-    background = background_behind(paths)
+    background = find_background(paths)
     return Photographs(
         name=root.resolve().name,
         names=tuple(photograph.name for photograph in paths),

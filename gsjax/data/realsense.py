@@ -25,7 +25,7 @@ from gsjax.data.association import associate
 from gsjax.data.errors import DataError, DataWarning
 from gsjax.data.files import SATURATED_DEPTH
 from gsjax.data.lens import Lens, intrinsics_matrix, undistort
-from gsjax.data.registration import registered
+from gsjax.data.registration import register_depth
 from gsjax.data.rosbag import Bag, Message
 from gsjax.data.sequence import Sequence
 from gsjax.data.validation import check_quaternions
@@ -94,7 +94,7 @@ def read_realsense(
 
     def load_depth(t: int, c: int) -> Float[np.ndarray, "height width"]:
         measured = depth_as_pinhole(_read_depth(bag, depth, of_depth[t], unit), cv2.INTER_NEAREST)
-        return registered(measured, depth_K, K, to_color, color.width, color.height)
+        return register_depth(measured, depth_K, K, to_color, color.width, color.height)
 
     def locate(kind: str, t: int, c: int) -> str:
         return _where(bag, *((depth, of_depth[t]) if kind == "depth" else (color, numbers[t])))
@@ -188,7 +188,7 @@ def _from_reference(bag: Bag, stream: _Stream) -> Float[np.ndarray, "4 4"]:
 
 def _recorded_unit(bag: Bag, depth: _Stream) -> float:
     """Metres per depth step."""
-    stated = _stated_unit(bag, _message(bag, depth, 0)) or 0.0
+    stated = _appended_unit(bag, _message(bag, depth, 0)) or 0.0
     option = bag.first(f"{depth.name.rpartition('/')[0]}/option/Depth_Units/value", _FLOAT)
     for unit in (stated, 0.0 if option is None else float(option.data)):
         if 0 < unit < np.inf:
@@ -204,7 +204,7 @@ def _message(bag: Bag, stream: _Stream, number: int) -> Message:
     return next(bag.messages([stream.topic], _IMAGE, at, at + 1))
 
 
-def _stated_unit(bag: Bag, message: Message) -> float | None:
+def _appended_unit(bag: Bag, message: Message) -> float | None:
     """The depth unit appended to an image, metres; None if there is none."""
     marked = message.content[_FRAME_ID_AT : _FRAME_ID_AT + len(_ENDS_WITH_UNIT)] == _ENDS_WITH_UNIT
     return _unpacked(bag, "<f", message.content[-4:], 0)[0] if marked else None
@@ -235,7 +235,7 @@ def _pixels(
 ) -> tuple[UInt8[np.ndarray, "height width bytes"], str, bool]:
     """The bytes of each pixel, the encoding in lower case, and whether values are big-endian."""
     message, where = _message(bag, stream, number), _where(bag, stream, number)
-    end = None if _stated_unit(bag, message) is None else -4
+    end = None if _appended_unit(bag, message) is None else -4
     image = bag.decoded(message.content[:end], _IMAGE)
     if (encoding := image.encoding.lower()) not in encodings:
         raise DataError(where, f"one of {', '.join(encodings)}", image.encoding, _RECORD)

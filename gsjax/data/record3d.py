@@ -73,7 +73,7 @@ def read_record3d(path: str | Path) -> Sequence:
         MissingExtra: the package OpenEXR is not installed.
     """
     root = Path(path)
-    folder = _the_one(root)
+    folder = _single_export(root)
     extras.load("OpenEXR", "record3d", "a recording by Record3D")
     images, depths = numbered(folder / "rgb"), numbered(folder / "depth", (".exr",))
     meta = _Metadata(_metadata_of(folder))
@@ -86,7 +86,7 @@ def read_record3d(path: str | Path) -> Sequence:
     to_world[:, :3, :3], to_world[:, :3, 3] = Rotation.from_quat(quats).as_matrix(), places
 
     def load_depth(t: int, c: int) -> Float[np.ndarray, "height width"]:
-        return _of_shape(depths[numbers[t]], size)
+        return _read_depth(depths[numbers[t]], size)
 
     return Sequence(
         name=(folder.resolve().parent if folder.name == _FOLDER else folder.resolve()).name,
@@ -103,7 +103,7 @@ def read_record3d(path: str | Path) -> Sequence:
     )
 
 
-def _the_one(root: Path) -> Path:
+def _single_export(root: Path) -> Path:
     exports = _exports(root)
     if len(exports) == 1:
         return exports[0]
@@ -142,13 +142,13 @@ class _Metadata:
         self.size = (self._number("w"), self._number("h"))
         frames = len(self.poses)
         if self.values.get("perFrameIntrinsicCoeffs"):
-            coefficients = _of_length(self._rows("perFrameIntrinsicCoeffs", 4), frames)
+            coefficients = _padded(self._rows("perFrameIntrinsicCoeffs", 4), frames)
             self.Ks = np.stack([intrinsics_matrix(row) for row in coefficients])
         else:
             K = self._rows("K", 9).reshape(-1, 3, 3)[0].T
             self.Ks = np.tile(K, (frames, 1, 1))
         if self.values.get("frameTimestamps"):
-            self.times = _of_length(self._rows("frameTimestamps", 1), frames)[:, 0]
+            self.times = _padded(self._rows("frameTimestamps", 1), frames)[:, 0]
         else:
             self.times = np.arange(frames) / self._number("fps", DEFAULT_RATE_HZ)
 
@@ -177,7 +177,7 @@ class _Metadata:
         return DataError(self.path, expected, text, "Correct it, or export the recording again.")
 
 
-def _of_length(rows: Float[np.ndarray, "n k"], frames: int) -> Float[np.ndarray, "frames k"]:
+def _padded(rows: Float[np.ndarray, "n k"], frames: int) -> Float[np.ndarray, "frames k"]:
     """The rows, truncated or padded with NaN to the number of frames."""
     padded = np.full((frames, rows.shape[1]), np.nan)
     padded[: len(rows)] = rows[:frames]
@@ -222,7 +222,7 @@ def _usable(folder: Path, meta: _Metadata, images: dict[int, Path], depths: dict
     return kept
 
 
-def _of_shape(path: Path, size: tuple[int, int]) -> Float[np.ndarray, "height width"]:
+def _read_depth(path: Path, size: tuple[int, int]) -> Float[np.ndarray, "height width"]:
     """The stored depth, after a check that its aspect ratio is that of the pictures."""
     depth = read_exr_depth(path)
     rows, columns = depth.shape

@@ -7,7 +7,7 @@ _FINEST = 16  # parts of a pixel per side: more than cameras beside each other n
 _AT_ONCE = 2**20  # points: about 100 MB
 
 
-def registered(
+def register_depth(
     depth: Float[np.ndarray, "rows columns"],
     K: Float[np.ndarray, "3 3"],
     other_K: Float[np.ndarray, "3 3"],

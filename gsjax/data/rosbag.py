@@ -44,7 +44,7 @@ class Bag:
         if not path.is_file():
             raise DataError(path, "a rosbag", "no such file", "Check the name.")
         self._types = typing.get_typestore(typing.Stores.ROS1_NOETIC)
-        with self._telling_of_damage():
+        with self._wrapping_errors():
             self._reader = reading.Reader(path)
             self._reader.open()
         self._of: dict[str, list[Any]] = {}
@@ -70,7 +70,7 @@ class Bag:
         connections = [connection for connection in of_topics if connection.msgtype == kind]
         if not connections:  # the library takes an empty list for all
             return
-        with self._lock, self._telling_of_damage():
+        with self._lock, self._wrapping_errors():
             for connection, recorded, content in self._reader.messages(connections, start, stop):
                 yield Message(connection.topic.replace(" ", "_"), recorded, content)
 
@@ -91,11 +91,11 @@ class Bag:
             content: its bytes.
             kind: the type, one of ROS 1's own.
         """
-        with self._telling_of_damage():
+        with self._wrapping_errors():
             return self._types.deserialize_ros1(content, kind)
 
     @contextmanager
-    def _telling_of_damage(self) -> Iterator[None]:
+    def _wrapping_errors(self) -> Iterator[None]:
         """Raise a DataError instead of the many kinds of errors that rosbags raises for damaged files."""
         try:
             yield

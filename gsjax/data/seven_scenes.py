@@ -24,7 +24,7 @@ from gsjax.data.lens import intrinsics_matrix
 from gsjax.data.names import find_file
 from gsjax.data.origin import near_origin
 from gsjax.data.pictures import SUFFIXES
-from gsjax.data.registration import registered
+from gsjax.data.registration import register_depth
 from gsjax.data.sequence import Sequence
 from gsjax.data.text import fields
 from gsjax.data.validation import check_poses
@@ -87,7 +87,7 @@ def read_seven_scenes(
         depth = read_depth(depths[t], depth_unit_m, width, height)
         if not register:
             return depth
-        return registered(depth, depth_K, matrix, from_depth, width, height)
+        return register_depth(depth, depth_K, matrix, from_depth, width, height)
 
     files = {"image": images, "depth": depths}
     return Sequence(

@@ -74,7 +74,7 @@ class NewestSnapshots:
     def __init__(self, source: Iterable[Snapshot], *, max_skew: float = 0.02, patience: float = 10.0):
         self.counts = Counts()
         self._source, self._max_skew, self._patience = source, max_skew, patience
-        self._news = threading.Condition()
+        self._condition = threading.Condition()
         self._waiting: Arrival | None = None
         self._ended, self._error, self._closed = False, None, False
 
@@ -89,8 +89,8 @@ class NewestSnapshots:
 
     def _take(self) -> Arrival | None:
         """The newest arrival, or None if the source has ended."""
-        with self._news:
-            ready = self._news.wait_for(lambda: self._waiting or self._ended, self._patience)
+        with self._condition:
+            ready = self._condition.wait_for(lambda: self._waiting or self._ended, self._patience)
             arrival, self._waiting = self._waiting, None
         if arrival is not None:
             return arrival
@@ -119,18 +119,18 @@ class NewestSnapshots:
                     counts.out_of_sync += 1
                 else:
                     newest = snapshot.stamp
-                    with self._news:
+                    with self._condition:
                         counts.dropped += self._waiting is not None
                         self._waiting = Arrival(snapshot, now)
-                        self._news.notify()
+                        self._condition.notify()
                 if self._closed:
                     break
         except BaseException as error:
             self._error = error
         finally:
-            with self._news:
+            with self._condition:
                 self._ended = True
-                self._news.notify()
+                self._condition.notify()
 
 
 def back_and_forth(length: int) -> Iterator[int]:

@@ -20,7 +20,7 @@ import numpy as np
 from gsjax import extras
 from gsjax.data.errors import DataError, DataWarning
 from gsjax.data.files import WHITE, picture_size, read_image
-from gsjax.data.pictures import SUFFIXES, is_picture, is_web_format, refuse_unread
+from gsjax.data.pictures import SUFFIXES, is_picture, is_web_format, reject_unread
 
 _SMALLEST_MODEL = 3  # photographs: two fix no scale, and almost any two have some matches
 _ENOUGH_FOR_CENTER = 20  # photographs per camera
@@ -111,7 +111,7 @@ def list_photographs(folder: Path) -> list[str]:
     files = [path for path in folder.rglob("*") if path.is_file()]
     names = sorted(path.relative_to(folder).as_posix() for path in files if is_picture(path))
     expected = f"{_SMALLEST_MODEL} photographs or more ({', '.join(SUFFIXES)})"
-    refuse_unread(folder, expected, files, others=len(names))
+    reject_unread(folder, expected, files, others=len(names))
     bad = {name: reason for name in names if (reason := _unreadable(folder / name)) is not None}
     good = [name for name in names if name not in bad]
     if len(good) < _SMALLEST_MODEL:

@@ -16,12 +16,12 @@ from gsjax.geometry.sight import rays
 
 Fisheye = Literal["undistort", "keep"]
 
-_MUCH = 0.25  # share of a photograph's pixels: losing more causes a warning
+_MAX_LOSS = 0.25  # share of a photograph's pixels: losing more causes a warning
 _GRID = 64  # samples along each side of a photograph
 
 
 @dataclass(frozen=True, eq=False)
-class ThroughLenses:
+class LensViews:
     """The cameras that see N photographs, and the maps from their files to the views of these cameras.
 
     Attributes:
@@ -34,12 +34,12 @@ class ThroughLenses:
     Ks: Float[np.ndarray, "n 3 3"]
     fisheye: Float[np.ndarray, "n 4"] | None
     views: Sequence[Callable[[np.ndarray, int], np.ndarray]] = field(repr=False)
-    reaches: Sequence[Bool[np.ndarray, "height width"] | None] = field(repr=False)
+    coverage: Sequence[Bool[np.ndarray, "height width"] | None] = field(repr=False)
 
     @property
     def has_edges(self) -> bool:
         """Whether some photograph has pixels that its lens does not cover."""
-        return any(reached is not None for reached in self.reaches)
+        return any(reached is not None for reached in self.coverage)
 
     def image(
         self, i: int, picture: UInt8[np.ndarray, "height width 3"]
@@ -51,7 +51,7 @@ class ThroughLenses:
         self, i: int, shades: Integer[np.ndarray, "height width"] | None
     ) -> Bool[np.ndarray, "height width"] | None:
         """Which pixels count: those whose shade is not 0 and that the lens covers; None if all."""
-        reached = self.reaches[i]
+        reached = self.coverage[i]
         if shades is None:
             return reached
         counts = self.views[i]((shades != 0).astype(np.uint8), cv2.INTER_NEAREST) > 0
@@ -68,7 +68,7 @@ class ThroughLenses:
 
 def through_lenses(
     lenses: Sequence[Lens], sizes: Sequence[tuple[int, int]], where: object, fisheye: Fisheye
-) -> ThroughLenses:
+) -> LensViews:
     """Undistort photographs to pinhole views, or keep them as fisheyes took them.
 
     Warns with DataWarning if undistorting loses more than a quarter of a fisheye photograph.
@@ -88,12 +88,12 @@ def through_lenses(
             advice = "Leave out fisheye (--read.fisheye), and all are undistorted."
             raise DataError(where, "photographs that are all by fisheyes", found, advice)
         coeffs = np.array([lens.coeffs for lens in lenses])
-        seen = [_reach(lens, *size) for lens, size in zip(lenses, sizes, strict=True)]
-        return ThroughLenses(np.stack([lens.K for lens in lenses]), coeffs, [_as_taken] * len(lenses), seen)
+        seen = [_coverage(lens, *size) for lens, size in zip(lenses, sizes, strict=True)]
+        return LensViews(np.stack([lens.K for lens in lenses]), coeffs, [_as_taken] * len(lenses), seen)
     ideal = [undistort(lens, *size) for lens, size in zip(lenses, sizes, strict=True)]
     distinct = {(str(lens), size): (lens, K) for lens, (K, _), size in zip(lenses, ideal, sizes, strict=True)}
-    least = min((_shown(*seen, *size) for (_, size), seen in distinct.items()), default=1.0)
-    if least < 1 - _MUCH:
+    least = min((_kept_share(*seen, *size) for (_, size), seen in distinct.items()), default=1.0)
+    if least < 1 - _MAX_LOSS:
         message = f"{where}: undistorting keeps {least:.0%} of a photograph by a fisheye"
         warnings.warn(
             f"{message}; to fit all of it, set fisheye to keep (--read.fisheye keep)",
@@ -101,7 +101,7 @@ def through_lenses(
             stacklevel=4,
         )
     views = [view for _, view in ideal]
-    return ThroughLenses(np.stack([K for K, _ in ideal]), None, views, [None] * len(lenses))
+    return LensViews(np.stack([K for K, _ in ideal]), None, views, [None] * len(lenses))
 
 
 def _as_taken(picture: np.ndarray, interpolation: int) -> np.ndarray:
@@ -114,12 +114,12 @@ def _rays(K, coeffs, width: int, height: int) -> Float[np.ndarray, "height width
     return rays(np.stack([x, y], axis=-1), K, np.asarray(coeffs))
 
 
-def _reach(lens: Lens, width: int, height: int) -> Bool[np.ndarray, "height width"] | None:
+def _coverage(lens: Lens, width: int, height: int) -> Bool[np.ndarray, "height width"] | None:
     reached = np.isfinite(_rays(lens.K, lens.coeffs, width, height)[..., 0])
     return None if reached.all() else reached
 
 
-def _shown(lens: Lens, K: Float[np.ndarray, "3 3"], width: int, height: int) -> float:
+def _kept_share(lens: Lens, K: Float[np.ndarray, "3 3"], width: int, height: int) -> float:
     """Share of what a fisheye photograph shows that its pinhole view shows too."""
     if not lens.fisheye:
         return 1.0

@@ -29,7 +29,7 @@ from gsjax.data.files import (
     BLACK,
     WHITE,
     Color,
-    background_behind,
+    find_background,
     picture_size,
     read_depth,
     read_image,
@@ -40,7 +40,7 @@ from gsjax.data.masks import read_shades
 from gsjax.data.names import find_file, portable
 from gsjax.data.origin import near_origin
 from gsjax.data.photographs import Photographs
-from gsjax.data.pictures import SUFFIXES, refuse_unread
+from gsjax.data.pictures import SUFFIXES, reject_unread
 from gsjax.data.through_lenses import Fisheye, through_lenses
 from gsjax.data.transforms_keys import (
     DEPTH_UNIT_M,
@@ -329,7 +329,7 @@ def _report_left_out(
         left_out.append(f"{unnamed} in none of the train, val and test lists")
     if not kept:
         folder = (root / portable(missing[0])).parent if missing else root
-        refuse_unread(folder, "photographs", folder.iterdir() if folder.is_dir() else ())
+        reject_unread(folder, "photographs", folder.iterdir() if folder.is_dir() else ())
         found = f"{listed} listed, {' and '.join(left_out)}"
         raise DataError(root, "a photograph with a pose", found, "Check the folder.")
     if left_out:
@@ -339,7 +339,7 @@ def _report_left_out(
 
 def _photographs(root, frames, cloud, background, fisheye: Fisheye) -> Photographs:
     seen = through_lenses([frame.lens for frame in frames], [frame.size for frame in frames], root, fisheye)
-    shown_before = background_behind([frame.image for frame in frames], background)
+    shown_before = find_background([frame.image for frame in frames], background)
     behind = shown_before or BLACK
 
     def load_image(i: int) -> np.ndarray:

@@ -87,7 +87,7 @@ def read_tum(
             or no frame has colour, depth and pose.
     """
     root = Path(path)
-    colors, depths = _Listed.read(root, "rgb.txt"), _Listed.read(root, "depth.txt")
+    colors, depths = _FileList.read(root, "rgb.txt"), _FileList.read(root, "depth.txt")
     stamps, poses = _read_poses(root / "groundtruth.txt")
     clocks = {"colour": colors.stamps, "depth": depths.stamps, "pose": stamps}
     matched = associate(root, clocks, max_skew)
@@ -124,7 +124,7 @@ def read_tum(
     )
 
 
-class _Listed(NamedTuple):
+class _FileList(NamedTuple):
     """The files named in a list, sorted by time, with their positions in it."""
 
     numbers: Int[np.ndarray, "n"]
@@ -132,7 +132,7 @@ class _Listed(NamedTuple):
     paths: list[Path]
 
     @classmethod
-    def read(cls, root: Path, name: str) -> "_Listed":
+    def read(cls, root: Path, name: str) -> "_FileList":
         """Read a list, leaving out files that do not exist, with a warning that counts them."""
         stamps, rows = _read_lines(root / name, "stamp file", columns=2)
         files = [find_file(root, row[0]) for row in rows]

@@ -37,7 +37,7 @@ class Budget:
         self.rest_s: Callable[[float], float] = lambda most: most
         self._begun, self._steps, self._most = begun - _LOADING_S, begun, 0.0
 
-    def expect_more_than(self, earlier: float) -> None:
+    def check_exceeds(self, earlier: float) -> None:
         """Raises ValueError if the `earlier` seconds of steps, of the run to resume, used up all the time."""
         if self.minutes is not None and earlier >= 60 * self.minutes:
             raise ValueError(

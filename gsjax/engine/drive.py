@@ -94,7 +94,7 @@ COMPILING = "/gsjax/compiling"
 """`jax.monitoring` event recorded when a step begins to compile: the first, and any with new array shapes."""
 
 
-def announced(tick: Tick) -> Tick:
+def announce(tick: Tick) -> Tick:
     """Record the event of a tick, and return the tick."""
     jax.monitoring.record_event_duration_secs(UPDATE, tick.seconds)
     return tick
@@ -174,7 +174,7 @@ class Drive(Iterator[Tick]):
         self.run = self.run.having(params=params, guard=guard, step=run.step + 1)
         if self._progress(self.run.step) >= 1:
             self.settle()
-        self.tick = announced(Tick(method, problem, self.run, info, *clock.read(), progress))
+        self.tick = announce(Tick(method, problem, self.run, info, *clock.read(), progress))
         return self.tick
 
 
@@ -210,7 +210,7 @@ def _guard_of(before: Run, run: Run) -> Guard:
     return run.guard if run.guard is not None and is_same else begun(run.params, before.guard)
 
 
-def warn_of_lost(after: Tick, extra_losses: ExtraLosses) -> None:
+def warn_of_lost_losses(after: Tick, extra_losses: ExtraLosses) -> None:
     """Warn if a continued run was trained with custom losses that are not given now."""
     lost = sorted({*(after.info.get("extra") or ())} - {*named_losses(extra_losses)})
     if lost:

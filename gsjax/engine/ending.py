@@ -10,7 +10,7 @@ from gsjax.engine.summary import Summary
 from gsjax.engine.terminal import print_summary
 
 
-def ended(stopped: BaseException | None, *, report: bool = True) -> dict[str, Any]:
+def completion(stopped: BaseException | None, *, report: bool = True) -> dict[str, Any]:
     """The part of metrics.json that says whether a run was completed.
 
     Args:

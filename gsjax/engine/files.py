@@ -186,7 +186,7 @@ def read_scene(
     return gaussians, report.origin
 
 
-def about_scene(recording: Recording, origin: Float[np.ndarray, "3"] | None) -> Recording:
+def relative_to_scene(recording: Recording, origin: Float[np.ndarray, "3"] | None) -> Recording:
     """The recording with coordinates relative to the origin of its scene."""
     tracked, judged = (relative_to_origin(each, origin) for each in (recording.tracked, recording.judged))
     return replace(recording, tracked=tracked, judged=judged)

@@ -92,7 +92,7 @@ def placed(masks: str | Path) -> str | Path:
     return masks.expanduser().resolve() if isinstance(masks, Path) else masks
 
 
-def without_truth(recording: Recording) -> Recording:
+def without_own_objects(recording: Recording) -> Recording:
     """The recording without its own masks, ground truth and label names: a picture defines the objects."""
     tracked, judged = (
         replace(sequence, load_mask=None, truth=None, label_names={})

@@ -36,9 +36,9 @@ OF_QUERY = ("query.json", "selection.npz", "over_time.npz", "masks", "frames", "
 OF_QUERY += ("object.ply", "without.ply", "recolored.ply", "moved.ply", f"*{ENDING}")
 """The files that `gsjax query` writes."""
 SCRIPT = "edit.yaml"  # the edits of a film of `gsjax edit`; it marks the film's folder
-_NOBODYS = (LOCK, ".*.partial*", ".DS_Store", "._*", ".nfs*", ".directory")
+_DISPOSABLE = (LOCK, ".*.partial*", ".DS_Store", "._*", ".nfs*", ".directory")
 """Hidden files that may be deleted: of killed commands, and of file managers and file systems."""
-_ANEW = "restore it, or replace the run with --overwrite"
+_ADVICE = "restore it, or replace the run with --overwrite"
 SIGNATURE = "# gsjax run"  # the first line of config.yml, because other programs write files of that name too
 
 
@@ -55,9 +55,11 @@ def read_values(file: Path, parse: Callable[[str], Any]) -> dict[str, Any]:
     try:
         found = parse(file.read_text(encoding="utf-8"))
     except ValueError as error:
-        raise ValueError(f"{file}: expected what a run wrote, found other text ({error}); {_ANEW}") from error
+        raise ValueError(
+            f"{file}: expected what a run wrote, found other text ({error}); {_ADVICE}"
+        ) from error
     if not isinstance(found, dict):
-        raise ValueError(f"{file}: expected names and values, found {brief(repr(found))}; {_ANEW}")
+        raise ValueError(f"{file}: expected names and values, found {brief(repr(found))}; {_ADVICE}")
     return found
 
 
@@ -91,7 +93,7 @@ def expect_run(path: Path, made_by: str = "") -> None:
     """Raises FileNotFoundError if this is not the folder of a run (of the command `made_by`)."""
     expect_folder(path, made_by)
     if not is_run(path):
-        found, advice = "other files" if holds_something(path) else "an empty folder", "give a run's --out"
+        found, advice = "other files" if is_nonempty(path) else "an empty folder", "give a run's --out"
         if scenes := scenes_within(path):
             found, advice = scenes_in_words(scenes), "give a file, or a folder of nothing but numbered ones"
         raise FileNotFoundError(
@@ -190,7 +192,7 @@ class RunFolder:
             raise FileNotFoundError(f"{self.path}: expected a run to resume, found none; leave out --resume")
         if self.path.exists() and not self.path.is_dir():
             raise NotADirectoryError(f"{self.path}: expected a folder, found a file; name another folder")
-        if self.path.is_dir() and holds_something(self.path):
+        if self.path.is_dir() and is_nonempty(self.path):
             self._claim(overwrite, resume)
 
     @classmethod
@@ -312,7 +314,7 @@ def replaced_folder(path: Path, written: Sequence[str]) -> Iterator[Path]:
         FileExistsError: something else is there; nothing of it is touched.
         BlockingIOError: another process writes there.
     """
-    path = expect_ours(path, written)
+    path = expect_replaceable(path, written)
     with locked(path.parent, shared=True), locked(path.parent, path.name):
         yield from _replaced(path)
 
@@ -336,7 +338,7 @@ def _replaced(path: Path) -> Iterator[Path]:
             shutil.rmtree(old) if path.exists() else old.rename(path)
 
 
-def expect_ours(path: Path, written: Sequence[str]) -> Path:
+def expect_replaceable(path: Path, written: Sequence[str]) -> Path:
     """The folder, with links resolved, if it may be replaced.
 
     Raises:
@@ -346,7 +348,7 @@ def expect_ours(path: Path, written: Sequence[str]) -> Path:
     if not path.exists():
         return path
     entries = sorted(entry.name for entry in path.iterdir()) if path.is_dir() else []
-    others = [name for name in entries if not any(fnmatch(name, each) for each in (*written, *_NOBODYS))]
+    others = [name for name in entries if not any(fnmatch(name, each) for each in (*written, *_DISPOSABLE))]
     if path.is_dir() and not others and (not entries or any(fnmatch(n, written[0]) for n in entries)):
         return path
     found = "a file" if not path.is_dir() else (others or [f"no {written[0]}"])[0]
@@ -355,7 +357,7 @@ def expect_ours(path: Path, written: Sequence[str]) -> Path:
     )
 
 
-def holds_something(folder: Path) -> bool:
+def is_nonempty(folder: Path) -> bool:
     """Whether a folder holds anything but the lock of a command that is running or was killed."""
     return any(entry.name != LOCK for entry in folder.iterdir())
 

@@ -17,7 +17,7 @@ from gsjax.data import Photographs, Sequence, open_photographs, open_sequence, p
 from gsjax.data.consistency import check_photographs, check_recording
 from gsjax.data.errors import MissingFile
 from gsjax.data.open import SIMULATED_PREFIX, ReadOptions, is_dataset_file, is_photographs, is_recording
-from gsjax.data.pictures import warn_of_cut_off
+from gsjax.data.pictures import warn_of_truncated
 from gsjax.engine.folder import SCRIPT, is_of_run, is_run
 from gsjax.engine.info_picture import by_camera, by_split, write_picture
 from gsjax.engine.info_run import describe_film, describe_run
@@ -84,7 +84,7 @@ def run(options: Options) -> int:
             facts, table = describe_sequence(sequence, masks), mask_table(masks, sequence)
             photographs, groups = photographs_of(sequence), lambda _: by_camera(sequence)
         some = np.linspace(0, photographs.num - 1, min(photographs.num, _MOST_CHECKED)).astype(int).tolist()
-        warn_of_cut_off(photographs.name, [Path(photographs.where("image", i)) for i in some])
+        warn_of_truncated(photographs.name, [Path(photographs.where("image", i)) for i in some])
         if options.picture is not None:
             write_picture(options.picture, photographs, groups(photographs))
     print_facts(facts, title=photographs.name)

@@ -9,7 +9,7 @@ from jaxtyping import Float, Int
 
 from gsjax.engine.files import read_frames
 from gsjax.engine.messages import describe
-from gsjax.engine.terminal import in_bytes
+from gsjax.engine.terminal import format_bytes
 from gsjax.io.brief import shortened
 from gsjax.io.scene_file import SceneReport
 from gsjax.io.scenes import read_gaussians
@@ -30,7 +30,7 @@ def describe_scene(file: Path) -> dict[str, str]:
 
 def _facts_of(file: Path, gaussians: Gaussians, report: SceneReport) -> dict[str, str]:
     parts = file.parent.iterdir() if file.name == "meta.json" else [file]  # of a SOG in a folder
-    size = in_bytes(sum(part.stat().st_size for part in parts if part.is_file()))
+    size = format_bytes(sum(part.stat().st_size for part in parts if part.is_file()))
     facts = {"file": f"{report.format}, {size}", "Gaussians": f"{gaussians.num:,}"}
     if report.stored != gaussians.num:
         facts["Gaussians"] += f" of {report.stored:,}"
@@ -70,7 +70,7 @@ def describe_frames(files: Sequence[Path]) -> dict[str, str]:
             pass
     except (ValueError, OSError) as error:
         warnings.warn(describe(error), UserWarning, stacklevel=1)
-    size = in_bytes(sum(file.stat().st_size for file in files))
+    size = format_bytes(sum(file.stat().st_size for file in files))
     frames = f"{len(files)}, {files[0].name} to {files[-1].name}, {size}"
     return {"frames": frames} | _facts_of(files[0], *first)
 

@@ -17,7 +17,7 @@ from typing import Any, no_type_check
 UNINTERRUPTIBLE = frozenset({"called_by_xla", "shielded"})
 """Functions that Ctrl-C waits for: callbacks of XLA, which drops exceptions, and `shielded` calls."""
 RETRY_S = 0.01
-_HEARD = ("SIGINT", "SIGTERM", "SIGHUP")
+_SIGNALS = ("SIGINT", "SIGTERM", "SIGHUP")
 _waiting = threading.Event()  # one per process, as signals are
 _newest = ["SIGINT"]
 
@@ -34,11 +34,11 @@ def raise_if_interrupted() -> None:
     """Raises KeyboardInterrupt if Ctrl-C is pending: the gaps between shielded calls are too short for the
     timer."""
     if _waiting.is_set():
-        _forget()
+        _clear()
         raise KeyboardInterrupt(*_newest)
 
 
-def _forget() -> None:
+def _clear() -> None:
     """Clear what is pending: once raised, Ctrl-C must not be raised again during the clean-up."""
     signal.setitimer(signal.ITIMER_REAL, 0)
     _waiting.clear()
@@ -54,14 +54,14 @@ def is_uninterruptible(frame: FrameType | None) -> bool:
 
 
 @contextmanager
-def heard_interrupts() -> Iterator[None]:
+def handled_interrupts() -> Iterator[None]:
     """While the block runs, Ctrl-C, SIGTERM and SIGHUP raise KeyboardInterrupt with the signal's name, if
     necessary delayed until it gets through.
 
     A signal that is ignored (`nohup`) or handled by something else stays so. On systems without timers,
     nothing changes.
     """
-    heard = [signal.Signals[name] for name in _HEARD if name in signal.Signals.__members__]
+    heard = [signal.Signals[name] for name in _SIGNALS if name in signal.Signals.__members__]
     usual = (signal.default_int_handler, signal.SIG_DFL)
     before = {number: handler for number in heard if (handler := signal.getsignal(number)) in usual}
     main = threading.current_thread() is threading.main_thread()
@@ -75,7 +75,7 @@ def heard_interrupts() -> Iterator[None]:
         if is_uninterruptible(frame):
             try_again()
         else:
-            _forget()
+            _clear()
             raise KeyboardInterrupt(*_newest)
 
     def try_again() -> None:
@@ -95,7 +95,7 @@ def heard_interrupts() -> Iterator[None]:
     try:
         yield
     finally:
-        _forget()
+        _clear()
         for number, handler in before.items():
             signal.signal(number, handler)
         sys.unraisablehook = print_dropped

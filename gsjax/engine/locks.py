@@ -128,7 +128,7 @@ def locked(folder: Path, part: str = "", *, shared: bool = False) -> Iterator[No
     path = folder.resolve() / (f".{part}{LOCK}" if part else LOCK)
     held = _held.get(path)
     if held is None:
-        held = _taken(folder, path, shared)
+        held = _acquired(folder, path, shared)
     elif held.writer.shared and not shared:
         alone = replace(held.writer, shared=False)
         try:
@@ -149,7 +149,7 @@ def locked(folder: Path, part: str = "", *, shared: bool = False) -> Iterator[No
                 _release(path, held)
 
 
-def _taken(folder: Path, path: Path, shared: bool) -> _Held | None:
+def _acquired(folder: Path, path: Path, shared: bool) -> _Held | None:
     """Acquire the lock for this process; None if a shared one cannot be written."""
     writer, made = Writer(shared=shared), []
     while True:

@@ -25,7 +25,7 @@ MAX_VIDEO_HZ = 60.0
 MIN_VIDEO_HZ = 1.0
 MARK = (255, 70, 160)
 """RGB colour of the outline around what a query found."""
-MOST = 0.5
+MIN_SHARE = 0.5
 """A pixel shows what was found if more than this share of its light comes from there."""
 _VIDEO_HEIGHT = 480  # smaller pictures are enlarged
 
@@ -36,7 +36,7 @@ def frame_rate(times: Float[np.ndarray, "t"]) -> float:
     return float(np.clip(1 / np.median(steps), MIN_VIDEO_HZ, MAX_VIDEO_HZ)) if len(steps) else MIN_VIDEO_HZ
 
 
-def lit(
+def spotlight(
     image: Num[np.ndarray, "h w 3"], mask: Bool[np.ndarray, "h w"], color: tuple[int, int, int]
 ) -> UInt8[np.ndarray, "H W 3"]:
     """The image of a camera with what was found in its own colours and the rest dimmed; small images are

@@ -19,7 +19,7 @@ _FETCHED = ("http", "https", "ftp", "s3", "gs")
 _COMPILE_ANEW = ("bench", "experiment")  # they measure compile time, and may set up JAX themselves
 
 
-def run_politely(command: str, arguments: list[str], entry: tuple[str, str]) -> int:
+def run_command(command: str, arguments: list[str], entry: tuple[str, str]) -> int:
     """Parse the options of a command and run it. A user's mistake becomes a sentence and exit code 2.
 
     Args:
@@ -56,7 +56,7 @@ def parse_options(command: str, arguments: list[str], entry: tuple[str, str]) ->
     """The options of a command, without running it.
 
     Args:
-        command, arguments, entry: as for `run_politely`.
+        command, arguments, entry: as for `run_command`.
 
     Raises:
         ValueError: an option does not exist, or one that takes a list has no values.

@@ -18,7 +18,7 @@ from rich.progress import Progress as Bar
 
 from gsjax.engine.budget import Budget
 from gsjax.engine.drive import COMPILING, Drive, Tick
-from gsjax.engine.ending import ended
+from gsjax.engine.ending import completion
 from gsjax.engine.folder import RunFolder
 from gsjax.engine.interrupts import raise_if_interrupted, shielded
 from gsjax.engine.messages import Notes, counted, reason
@@ -98,7 +98,7 @@ class Progress:
             begun: start time of the command, by `time.perf_counter`.
         """
         return {
-            **ended(self.stopped),
+            **completion(self.stopped),
             "steps": steps,
             **self.mishaps,
             "seconds": {

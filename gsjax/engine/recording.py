@@ -49,7 +49,7 @@ class Recording:
         return self.judged.camera_ids[self.tracked.num_cameras :]
 
 
-def located(dataset: str) -> str:
+def absolute_path(dataset: str) -> str:
     """The absolute path of a dataset, by which a run finds it again from elsewhere; for a built-in scene, its
     name."""
     return dataset if dataset.startswith(SIMULATED_PREFIX) else os.path.abspath(dataset)

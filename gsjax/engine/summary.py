@@ -193,7 +193,7 @@ def minutes(stage: str = "steps") -> Callable[[Metrics], float]:
     return value
 
 
-def in_title(dataset: str) -> str:
+def title_of(dataset: str) -> str:
     """The name of a dataset for people: "tabletop, seed 0" for the built-in scene tabletop_seed0."""
     return re.sub(rf"^({'|'.join(SIMULATED_SCENES)})(.*)_seed(\d+)$", r"\1\2, seed \3", dataset)
 

@@ -62,7 +62,7 @@ def print_facts(facts: Mapping[str, str], title: str = "") -> None:
     console.print(_facts(facts))
 
 
-def in_bytes(size: int) -> str:
+def format_bytes(size: int) -> str:
     """A size in bytes as text: "12.3 MB"."""
     return f"{size / 1e6:.1f} MB" if size >= 1e5 else f"{size / 1e3:.1f} kB"
 

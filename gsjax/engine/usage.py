@@ -14,7 +14,7 @@ from tyro.constructors import ConstructorRegistry, StructConstructorSpec, Struct
 
 _NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
 _NUMBERS = re.compile(rf"{_NUMBER}(?:,{_NUMBER})+")
-_UNSAID = (None, False, ())  # defaults that the help text explains, or that mean "not given"
+_OMITTED = (None, False, ())  # defaults that the help text explains, or that mean "not given"
 
 
 def plain_help() -> ConstructorRegistry:
@@ -58,14 +58,14 @@ def expect_known(kind: Any, command: str, arguments: Sequence[str]) -> None:
             and not is_value
             and not given.startswith("--tyro")
         ):
-            meant = " or ".join(_meant(given, [*known]))
+            meant = " or ".join(_similar(given, [*known]))
             hint = f"; did you mean {meant}?" if meant else ";"
             raise ValueError(f"{given}: no such option{hint} gsjax {command} --help lists all")
 
 
 def _plain(field: StructFieldSpec) -> StructFieldSpec:
     """The field without the source's line breaks in its help text, or a default that says nothing."""
-    kind, unsaid = field.type, any(field.default is value for value in _UNSAID)
+    kind, unsaid = field.type, any(field.default is value for value in _OMITTED)
     if unsaid:
         kind = Annotated[kind, tyro.conf.arg(help_behavior_hint="")]
     if field.default is None:  # None means not given: nobody needs to write it
@@ -133,7 +133,7 @@ def _listed(hint: Any) -> Any:
     return next((each for each in inner if get_origin(each) is tuple), hint)
 
 
-def _meant(given: str, known: Sequence[str]) -> list[str]:
+def _similar(given: str, known: Sequence[str]) -> list[str]:
     """The known options most like the given one, with or without the names of their groups."""
     last = [f"--{name.removeprefix('--').split('.')[-1]}" for name in known]
     close = get_close_matches(given, [*known, *last], 1, 0.7)

@@ -15,7 +15,7 @@ import jax
 
 from gsjax.data.photographs import Photographs, photographs_of
 from gsjax.data.sequence import Sequence
-from gsjax.engine.drive import Drive, Tick, drive, warn_of_lost
+from gsjax.engine.drive import Drive, Tick, drive, warn_of_lost_losses
 from gsjax.engine.track.tracking import track as track
 from gsjax.losses.extra import ExtraLosses
 from gsjax.methods.deform import DeformConfig
@@ -61,7 +61,7 @@ def fit(
     config, cloud = start_from(photographs, frames, FitConfig() if config is None else config)
     method = Fit(config, extra_losses)
     problem, run = method.start(frames, cloud, photographs.background)
-    return drive(method, problem, run if after is None else _going_on(after, method, run))
+    return drive(method, problem, run if after is None else _continued(after, method, run))
 
 
 def deform(
@@ -110,7 +110,7 @@ def deform(
 
     given = (sequence, teacher, tools, tool_values, first, gaussians)
     method, problem, run = start_from(config, extra_losses, *given)
-    return drive(method, problem, run if after is None else _going_on(after, method, run))
+    return drive(method, problem, run if after is None else _continued(after, method, run))
 
 
 def distill(
@@ -151,7 +151,7 @@ def distill(
     teacher, source = teacher_for(photographs, teacher)
     cameras = [photographs.camera(i) for i in range(photographs.num)]
     problem, run = method.start(scene, cameras, teacher, rasterize_mode, source=source)
-    return drive(method, problem, run if after is None else _going_on(after, method))
+    return drive(method, problem, run if after is None else _continued(after, method))
 
 
 def parts(
@@ -199,7 +199,7 @@ def parts(
     tracked = sequence.select(cameras=[c for c in sequence.camera_ids if c not in eval_cameras])
     if after is not None:
         problem = PartsProblem(tracked, at_once=has_two_states(tracked))
-        return drive(method, problem, _going_on(after, method), headroom=config.headroom)
+        return drive(method, problem, _continued(after, method), headroom=config.headroom)
     if gaussians is not None and anchor is None:
         raise ValueError("anchor: expected the frame that the given Gaussians show, found none; name it")
     chosen, moved = detect_motion(tracked, config, anchor)
@@ -217,11 +217,11 @@ def parts(
 _TRAINED = {"exposures": "exposure", "twists": "refine_poses"}  # trained parameters: settings that add them
 
 
-def _going_on(after: Tick, method: Method, begun: Run | None = None) -> Run:
+def _continued(after: Tick, method: Method, begun: Run | None = None) -> Run:
     """A copy of an earlier tick's run, because steps donate its arrays, and a tick may be continued twice.
     With other settings or losses, new losses are not compared with earlier ones. The run must have the
     trained parameters that a new run would have."""
-    warn_of_lost(after, getattr(method, "extra_losses", ()))
+    warn_of_lost_losses(after, getattr(method, "extra_losses", ()))
     run = after.run
     held = run.params, run.state
     if any(leaf.is_deleted() for leaf in jax.tree.leaves(held) if isinstance(leaf, jax.Array)):

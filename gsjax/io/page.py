@@ -119,16 +119,16 @@ def _packed(film: Film) -> tuple[np.ndarray, dict[str, Any] | None, bytes]:
         return order, None, b""
     rows = order[: moves.sum()]
     ranges = _ranges(low[rows], high[rows])
-    grows = bool((low[rows, 8:] != high[rows, 8:]).any())
+    scales_vary = bool((low[rows, 8:] != high[rows, 8:]).any())
     times = np.asarray(film.times, np.float64) - film.times[0]
     motion = {
         "times": np.round(times, 6).tolist(),
         "step": float(max(np.median(np.diff(times)), _LEAST_STEP)),
         "moving": len(rows),
-        "texels": 2 + grows,
+        "texels": 2 + scales_vary,
         **{name: value.tolist() for name, value in ranges._asdict().items()},
     }
-    return order, motion, _deflated(film, rows, ranges, grows)
+    return order, motion, _compressed(film, rows, ranges, scales_vary)
 
 
 class _Ranges(NamedTuple):
@@ -163,19 +163,19 @@ def _logarithms(values: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
     return np.sign(values) * np.log1p(np.abs(values))
 
 
-def _deflated(film: Film, rows: Int[np.ndarray, "M"], ranges: _Ranges, grows: bool) -> bytes:
+def _compressed(film: Film, rows: Int[np.ndarray, "M"], ranges: _Ranges, scales_vary: bool) -> bytes:
     """The values of all frames, compressed.
 
     Raises:
         ValueError: they are more than a page can hold.
     """
     packer, packed, size = zlib.compressobj(6), [], 0
-    before = np.zeros((len(rows), 12 if grows else 8), np.uint16)
+    before = np.zeros((len(rows), 12 if scales_vary else 8), np.uint16)
     for frame in range(len(film.times)):
         values = _values(take(film.at(frame), rows)).astype(np.float64)
         logs = _logarithms((values[:, :3] - ranges.middle) / ranges.unit)
         fractions = [(logs - ranges.low) / ranges.span, values[:, 3:4], (values[:, 4:8] + 1) / 2]
-        if grows:
+        if scales_vary:
             fractions += [(values[:, 8:] - ranges.sizes[0]) / ranges.sizes[1], np.zeros((len(rows), 1))]
         steps = np.round(np.concatenate(fractions, axis=1) * _MOST).astype(np.uint16)
         packed.append(packer.compress(_differences(steps, before)))

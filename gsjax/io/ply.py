@@ -85,7 +85,7 @@ def write_ply(
                 f"{labels.shape}"
             )
     columns = _columns(gaussians, origin)
-    kind = "<f8" if origin is not None and _are_moved(_reach(columns), _size(gaussians)) else "<f4"
+    kind = "<f8" if origin is not None and _loses_precision(_reach(columns), _size(gaussians)) else "<f4"
     fields = [(name, kind if name in _PLACE else "<f4") for name in columns]
     vertices = np.empty(gaussians.num, dtype=fields)
     for name, column in columns.items():
@@ -114,7 +114,7 @@ def _size(gaussians: Gaussians) -> float:
         return float(np.exp(np.median(np.median(finite, axis=1)))) if len(finite) else 0.0
 
 
-def _are_moved(reach: float, size: float) -> bool:
+def _loses_precision(reach: float, size: float) -> bool:
     """Whether float32 moves Gaussians by more than a small part of their size."""
     return bool(np.spacing(np.float32(reach)) > _LOST * size)
 
@@ -174,7 +174,7 @@ def read_ply(path: str | os.PathLike) -> tuple[Gaussians, SceneReport]:
     if (origin := far_origin(places, least=size)) is not None:
         gaussians = eqx.tree_at(lambda g: g.means, gaussians, jnp.asarray(_relative(places, origin)))
         words = in_words(places, origin)
-        if "x" in names and vertices.dtype["x"].itemsize < 8 and _are_moved(np.abs(origin).max(), size):
+        if "x" in names and vertices.dtype["x"].itemsize < 8 and _loses_precision(np.abs(origin).max(), size):
             words += "; the file itself is of float32, which has lost what is smaller than these steps"
         warnings.warn(f"{path}: {words}", UserWarning, stacklevel=1)
     return drawable(
@@ -186,7 +186,7 @@ def read_ply(path: str | os.PathLike) -> tuple[Gaussians, SceneReport]:
         labels=np.asarray(vertices["label"]) if "label" in names else read_labels(path, len(vertices)),
         origin=origin,
         places=places,
-        antialiased=_says_antialiased([*ply.comments, *(c for e in ply.elements for c in e.comments)]),
+        antialiased=_antialiased_flag([*ply.comments, *(c for e in ply.elements for c in e.comments)]),
     )
 
 
@@ -197,7 +197,7 @@ def _relative(
         return (places if origin is None else places - origin).astype(np.float32)
 
 
-def _says_antialiased(comments: Iterable[str]) -> bool | None:
+def _antialiased_flag(comments: Iterable[str]) -> bool | None:
     """Whether the last comment on how to draw the scene asks for antialiasing; None if there is none."""
     said = [found for comment in comments if (found := _MODES.match(comment))]
     if not said:

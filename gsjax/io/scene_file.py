@@ -17,7 +17,7 @@ REST_SIZES = tuple(size - 1 for size in SH_SIZES)
 """Coefficients of a colour channel besides the constant one, by degree."""
 AGAIN = "It may be cut off or damaged: copy or export it again"
 SH_C0 = 0.5 / np.sqrt(np.pi)
-_ALWAYS_ROOM = 1 << 26
+_SMALL = 1 << 26
 _MOST_EXPANSION = 64
 _LEAST_OPACITY = 1e-6
 
@@ -174,7 +174,7 @@ def expect_room(path: Path, size: int, stored: int, what: str) -> None:
     Raises:
         SceneError: more than 64 MiB, and more than 64 times what is stored.
     """
-    if size > max(_ALWAYS_ROOM, _MOST_EXPANSION * stored):
+    if size > max(_SMALL, _MOST_EXPANSION * stored):
         raise SceneError(
             path, f"{what} of a size in keeping with its file", f"{size} bytes from {stored}", AGAIN
         )

@@ -39,7 +39,7 @@ class Format:
     options: tuple[str, ...] = ()
 
 
-_OF_PAGES = ("antialiased", "up", "background", "view", "near", "film")
+_PAGE_OPTIONS = ("antialiased", "up", "background", "view", "near", "film")
 FORMATS = {
     ".compressed.ply": Format("PlayCanvas's compressed PLY", write_compressed_ply, options=("order",)),
     ".ply": Format("PLY of 3DGS", ply.write_ply, options=("labels", "antialiased", "origin")),
@@ -47,13 +47,13 @@ FORMATS = {
     ".spz": Format("SPZ", spz.write_spz, options=("antialiased",)),
     ".sog": Format("SOG", sog.write_sog, options=("antialiased", "order")),
     ".glb": Format("glTF", glb.write_glb, options=("origin",)),
-    ".html": Format("a page", page.write_page, degree=0, options=_OF_PAGES),
+    ".html": Format("a page", page.write_page, degree=0, options=_PAGE_OPTIONS),
 }
 """The formats that can be written, by the ending of a file; of two that fit, the first counts."""
 
 READ = (".ply", ".compressed.ply", ".splat", ".spz", ".sog", ".ksplat")
 """Endings of files that can be read. Only .splat is recognised by its ending, since it has no header."""
-_BY_START: dict[bytes, Reader] = {
+_BY_MAGIC: dict[bytes, Reader] = {
     b"ply": ply.read_ply,
     spz.MAGIC: spz.read_spz,
     spz.GZIP: spz.read_spz,
@@ -97,7 +97,7 @@ def read_gaussians(path: str | os.PathLike) -> tuple[Gaussians, SceneReport]:
         raise FileNotFoundError(f"{path}: expected a file of Gaussians, found {found}. Check the path")
     with path.open("rb") as stream:
         start = stream.read(24)
-    for magic, read in _BY_START.items():
+    for magic, read in _BY_MAGIC.items():
         if start.startswith(magic):
             return read(path)
     if path.name == "meta.json":

@@ -44,7 +44,7 @@ MAGIC = b"NGSP"
 GZIP = b"\x1f\x8b"
 _HEADER = struct.Struct("<4sIIBBBB")
 _TABLE = struct.Struct("<4sIIBBBBI12x")  # the header of version 4
-_MOST_BEHIND = 1 << 20  # bytes that may follow the arrays: vendor extensions
+_MAX_TRAILING = 1 << 20  # bytes that may follow the arrays: vendor extensions
 _COLOR_SCALE = 0.15
 _ANTIALIASED = 1
 _MOST_FRACTIONAL, _FEWEST_FRACTIONAL = 16, 0
@@ -91,7 +91,7 @@ def read_spz(path: Path) -> tuple[Gaussians, SceneReport]:
     if header.version == 4:
         arrays = _streams(path, data, header)
     else:
-        body = _inflated(path, data, header) if packed else data[size:]
+        body = _gunzipped(path, data, header) if packed else data[size:]
         if len(body) < sum(header.sizes()):
             found = f"{len(body)} of {sum(header.sizes())} bytes"
             raise SceneError(path, f"{header.count} Gaussians", found, AGAIN)
@@ -119,14 +119,14 @@ def _parse(path: Path, head: bytes) -> _Header:
     return header
 
 
-def _inflated(path: Path, data: bytes, header: _Header) -> bytes:
+def _gunzipped(path: Path, data: bytes, header: _Header) -> bytes:
     """What follows the header in a gzip stream, whose checksum is verified."""
     needed = sum(header.sizes())
     expect_room(path, needed, len(data), f"{header.count} Gaussians")
     stream = zlib.decompressobj(31)
     try:
         body = stream.decompress(data, _HEADER.size + needed)
-        stream.decompress(stream.unconsumed_tail, _MOST_BEHIND)
+        stream.decompress(stream.unconsumed_tail, _MAX_TRAILING)
     except zlib.error as error:
         raise SceneError(path, "a gzip stream", f"a damaged one ({error})", AGAIN) from error
     if not stream.eof:

@@ -117,7 +117,7 @@ def _pictures(
     elif not any(files) and len(alone) == 1 and (maps := _mapped(alone[0])).ndim == 4:
         yield from _stacked(alone[0], maps, len(names), which)
     else:
-        _check_apart(files, names)
+        _check_unique(files, names)
         for i in which:
             name, file = names[i], files[i]
             if file is None:
@@ -149,7 +149,7 @@ def _file(folder: Path, name: PurePosixPath, level: str) -> _File | None:
     return None
 
 
-def _check_apart(files: Sequence[_File | None], names: Sequence[str]) -> None:
+def _check_unique(files: Sequence[_File | None], names: Sequence[str]) -> None:
     """Leading folders of a name are ignored, so one file could match the images of several cameras."""
     pictures: dict[Path, str] = {}
     for file, name in zip(files, names, strict=True):
@@ -188,7 +188,7 @@ def _channels_last(path: Path) -> PictureFeatures:
 
 
 def _archive(path: Path) -> PictureFeatures:
-    with _refusing(path, "plain arrays"), zipfile.ZipFile(path) as archive:
+    with _as_value_error(path, "plain arrays"), zipfile.ZipFile(path) as archive:
         entries = {entry.filename.removesuffix(".npy"): entry for entry in archive.infolist()}
         wanted = [entries[name] for name in ("features", "ids", "codebook") if name in entries]
         size = sum(entry.file_size for entry in wanted)
@@ -235,7 +235,7 @@ def _stacked(path: Path, maps: np.ndarray, count: int, which: Sequence[int]) -> 
 
 def _mapped(path: Path) -> np.ndarray:
     """A memory-mapped stack, so that only the wanted images are read."""
-    with _refusing(path, "a plain array"):
+    with _as_value_error(path, "a plain array"):
         return npy.open_memmap(path, mode="r")
 
 
@@ -244,12 +244,12 @@ def _load(path: Path) -> np.ndarray:
         return read_torch_array(path)
     if zipfile.is_zipfile(path):
         raise ValueError(f"{path}: expected a plain array, found an archive; name it {path.stem}.npz")
-    with _refusing(path, "a plain array"), path.open("rb") as file:
+    with _as_value_error(path, "a plain array"), path.open("rb") as file:
         return npy.read_array(file, allow_pickle=False)
 
 
 @contextmanager
-def _refusing(path: Path, expected: str) -> Iterator[None]:
+def _as_value_error(path: Path, expected: str) -> Iterator[None]:
     """Turn every error into a ValueError; numpy, zipfile and the decompressors raise all kinds of them."""
     try:
         yield

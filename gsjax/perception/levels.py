@@ -48,7 +48,7 @@ def labels_on_level(labels: Int[np.ndarray, "levels H W"], level: Level) -> Int[
         level: the level.
     """
     found = labels[LEVELS.index(level)].copy()
-    for other in _instead(LEVELS.index(level), len(labels)):
+    for other in _fallbacks(LEVELS.index(level), len(labels)):
         np.copyto(found, labels[other], where=found == 0)
     return found
 
@@ -71,7 +71,7 @@ def joined_levels(
     rows = np.where(known[rows], rows, -1)
     filled = rows.copy()
     for level, row in enumerate(filled):
-        for other in _instead(level, len(rows)):
+        for other in _fallbacks(level, len(rows)):
             np.copyto(row, rows[other], where=row < 0)
     key = np.zeros(rows.shape[1:], np.int64)  # one number per combination, which sorts faster than rows
     for row in filled:
@@ -84,7 +84,7 @@ def joined_levels(
     return joined, codebook.astype(np.float32), np.moveaxis((rows < 0) & (filled >= 0), 0, -1)
 
 
-def _instead(level: int, count: int) -> Iterator[int]:
+def _fallbacks(level: int, count: int) -> Iterator[int]:
     """The levels to fall back on, in order, where one has no mask."""
     yield from range(level + 1, count)
     yield from reversed(range(level))

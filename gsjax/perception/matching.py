@@ -20,8 +20,8 @@ _CONTRAST = 0.01  # threshold of a feature; OpenCV's 0.04 rejects weakly texture
 _NEIGHBORS = 6  # photographs with which each is matched
 _RATIO = 0.85  # of the distances of the best and the second-best match (Lowe 2004, section 7.1)
 _LEAST_PARALLAX = np.deg2rad(1.0)
-_MOST_TURNED = np.deg2rad(60.0)  # between two photographs; SIFT matches little beyond
-_MOST_OFF = 1.5  # pixels, from the epipolar line and of the reprojection
+_MAX_ANGLE = np.deg2rad(60.0)  # between two photographs; SIFT matches little beyond
+_MAX_ERROR = 1.5  # pixels, from the epipolar line and of the reprojection
 _NEAREST = 4  # points from which the depth of a pixel is interpolated
 
 
@@ -154,8 +154,8 @@ def _pairs(viewmats: Float[np.ndarray, "n 4 4"]) -> list[tuple[int, int]]:
     rotations = viewmats[:, :3, :3]
     centers = -np.einsum("nji,nj->ni", rotations, viewmats[:, :3, 3])
     apart = np.linalg.norm(centers[:, None] - centers, axis=-1)
-    turned = np.arccos(np.clip(rotations[:, 2] @ rotations[:, 2].T, -1, 1))
-    near = np.where((apart > 1e-9) & (turned < _MOST_TURNED), turned + apart / max(apart.max(), 1e-9), np.inf)
+    angles = np.arccos(np.clip(rotations[:, 2] @ rotations[:, 2].T, -1, 1))
+    near = np.where((apart > 1e-9) & (angles < _MAX_ANGLE), angles + apart / max(apart.max(), 1e-9), np.inf)
     best = np.argsort(near, axis=1)[:, :_NEIGHBORS]
     return [
         (i, j)
@@ -197,7 +197,7 @@ def _triangulated(
         for seen, viewmat, K in zip((here, there), viewmats, Ks, strict=True):
             local = points @ viewmat[:3, :3].T + viewmat[:3, 3]
             again = (local @ K.T)[:, :2] / local[:, 2:]
-            sound &= (local[:, 2] > 0) & (np.linalg.norm(again - seen, axis=1) <= _MOST_OFF)
+            sound &= (local[:, 2] > 0) & (np.linalg.norm(again - seen, axis=1) <= _MAX_ERROR)
             ways.append(points + viewmat[:3, :3].T @ viewmat[:3, 3])
         lengths = [np.linalg.norm(way, axis=1) for way in ways]
         angle = np.arccos(np.clip(np.sum(ways[0] * ways[1], axis=1) / (lengths[0] * lengths[1]), -1, 1))

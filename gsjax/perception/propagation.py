@@ -64,11 +64,11 @@ class FlowPropagator:
             lab_before, lab = lab, rgb2lab(unit_floats(image))
             backward = self.flow(image, before)
             certain = seen_in_both(backward, self.flow(before, image))
-            carried = self._carried(found[-1], backward, certain, lab_before, lab)
-            found.append(self._flooded(carried, lab))
+            carried = self._warped_labels(found[-1], backward, certain, lab_before, lab)
+            found.append(self._filled(carried, lab))
         return np.stack(found)
 
-    def _carried(
+    def _warped_labels(
         self,
         labels: Int[np.ndarray, "H W"],
         backward: Float[np.ndarray, "H W 2"],
@@ -87,7 +87,7 @@ class FlowPropagator:
         carried[certain] = np.where(alike, labels[origins], _UNKNOWN)
         return carried
 
-    def _flooded(
+    def _filled(
         self, carried: Int[np.ndarray, "H W"], lab: Float[np.ndarray, "H W 3"]
     ) -> Int[np.ndarray, "H W"]:
         """Labels of all pixels, the unknown ones filled from the others."""

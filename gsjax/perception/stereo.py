@@ -12,7 +12,7 @@ from gsjax.perception.pictures import to_bytes
 
 _FRACTION = 16  # OpenCV's disparities are integers in units of 1/16 pixel
 _ROUNDS, _WINDOW_PX = 3, 2.5  # iterations of the refinement; standard deviation of its window
-_LEAST_SLOPE = 0.3  # grey values per pixel; the level of noise
+_MIN_GRADIENT = 0.3  # grey values per pixel; the level of noise
 _LARGEST = 6  # largest area of a rectified image, relative to the original
 
 
@@ -59,14 +59,14 @@ def stereo_depth(
         raise ValueError(f"right: expected shape {left.shape} to match left, found {right.shape}")
     config = config or StereoConfig()
     pair = _rectified(left.shape[:2], viewmats, Ks)
-    cameras = list(zip(pair.turns, Ks, strict=True))
+    cameras = list(zip(pair.rotations, Ks, strict=True))
     images = zip((left, right), cameras, strict=True)
     seen = [_warped(to_bytes(image), *camera, pair) for image, camera in images]
     white = np.full(left.shape[:2], 255, np.uint8)
     inside = [_warped(white, *camera, pair) == 255 for camera in cameras]
     disparity = _refined(_disparity(*seen, config), *seen)
-    disparity[~inside[0] | ~_lands(disparity, inside[1]) | ~_textured(seen[0])] = 0
-    return _back(disparity, pair, Ks[0], left.shape[:2])
+    disparity[~inside[0] | ~_match_inside(disparity, inside[1]) | ~_textured(seen[0])] = 0
+    return _to_left_view(disparity, pair, Ks[0], left.shape[:2])
 
 
 class _Pair(NamedTuple):
@@ -79,7 +79,7 @@ class _Pair(NamedTuple):
         baseline: distance between the cameras, in the unit of the poses.
     """
 
-    turns: tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3 3"]]
+    rotations: tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3 3"]]
     K: Float[np.ndarray, "3 3"]
     size: tuple[int, int]
     baseline: float
@@ -103,10 +103,10 @@ def _rectified(
         raise ValueError("viewmats: expected cameras side by side, found one in front of the other")
     y /= np.linalg.norm(y)
     turn = np.stack([x, y, np.cross(x, y)])
-    turns, K = (turn, turn @ between.T), Ks[0].copy()
+    rotations, K = (turn, turn @ between.T), Ks[0].copy()
     height, width = shape
     corners = np.array([[0, 0, 1], [width, 0, 1], [0, height, 1], [width, height, 1]], float)
-    cameras = zip(turns, Ks, strict=True)
+    cameras = zip(rotations, Ks, strict=True)
     rays = np.concatenate([corners @ np.linalg.inv(own).T @ turn.T for turn, own in cameras])
     if (rays[:, 2] < 1e-3).any():
         raise ValueError(
@@ -121,7 +121,7 @@ def _rectified(
             f"{width}x{height} pixels would be {size[0]}x{size[1]} when rectified"
         )
     K[:2, 2] -= low
-    return _Pair(turns, K, (int(size[0]), int(size[1])), baseline)
+    return _Pair(rotations, K, (int(size[0]), int(size[1])), baseline)
 
 
 def _down(places: np.ndarray) -> np.ndarray:
@@ -176,7 +176,7 @@ def _refined(
     for _ in range(_ROUNDS):
         there = cv2.remap(theirs, columns - found, rows, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
         slopes = known * cv2.Scharr(ours + there, cv2.CV_32F, 1, 0) / 64
-        steps = _around((there - ours) * slopes) / (_around(slopes**2) + 1.0)
+        steps = _blur((there - ours) * slopes) / (_blur(slopes**2) + 1.0)
         found = np.clip(found + np.clip(steps, -0.5, 0.5), disparity - 1, disparity + 1).astype(np.float32)
     return np.where(known, np.maximum(found, 1 / _FRACTION), 0.0)
 
@@ -184,26 +184,28 @@ def _refined(
 def _textured(image: Num[np.ndarray, "h w 3"]) -> Bool[np.ndarray, "h w"]:
     """Where grey values vary along a row; elsewhere matches are ambiguous and follow the neighbours."""
     grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32)
-    return _around((cv2.Scharr(grey, cv2.CV_32F, 1, 0) / 32) ** 2) > _LEAST_SLOPE**2
+    return _blur((cv2.Scharr(grey, cv2.CV_32F, 1, 0) / 32) ** 2) > _MIN_GRADIENT**2
 
 
-def _around(values: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
+def _blur(values: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
     return cv2.GaussianBlur(values, (0, 0), _WINDOW_PX)
 
 
-def _lands(disparity: Float[np.ndarray, "h w"], inside: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
+def _match_inside(
+    disparity: Float[np.ndarray, "h w"], inside: Bool[np.ndarray, "h w"]
+) -> Bool[np.ndarray, "h w"]:
     """Pixels whose match lies inside the right image."""
     rows, columns = np.indices(disparity.shape)
     there: Int[np.ndarray, "h w"] = np.rint(columns - disparity).astype(int)
     return (disparity > 0) & (there >= 0) & inside[rows, np.maximum(there, 0)]
 
 
-def _back(
+def _to_left_view(
     disparity: Float[np.ndarray, "h w"], pair: _Pair, K: Float[np.ndarray, "3 3"], shape: tuple[int, int]
 ) -> Float[np.ndarray, "H W"]:
     """Depth at the left camera's own pixels, each taken from the rectified pixel into which it falls."""
     columns, rows = np.meshgrid(np.arange(shape[1]) + 0.5, np.arange(shape[0]) + 0.5)
-    rays = np.stack([columns, rows, np.ones_like(rows)], axis=-1) @ np.linalg.inv(K).T @ pair.turns[0].T
+    rays = np.stack([columns, rows, np.ones_like(rows)], axis=-1) @ np.linalg.inv(K).T @ pair.rotations[0].T
     places = rays @ pair.K.T / rays[..., 2:]
     x, y = (np.clip(places[..., i].astype(int), 0, pair.size[i] - 1) for i in range(2))
     found = disparity[y, x]

@@ -80,13 +80,13 @@ def load_model(transformers: ModuleType, kind: str, folder: Path, device: str, *
         half: keep weights of half precision as they are, except on a CPU, which is slower with them; the
             caller must pass inputs of the model's `dtype`. Otherwise they are converted to single precision.
     """
-    with _without_bars(transformers.utils.logging):
+    with _no_progress(transformers.utils.logging):
         model = getattr(transformers, kind).from_pretrained(folder, **LOCAL_WEIGHTS).eval()
     return (model if half and device != "cpu" else model.float()).to(device)
 
 
 @contextmanager
-def _without_bars(logging: Any) -> Iterator[None]:
+def _no_progress(logging: Any) -> Iterator[None]:
     """Hide the progress bars of transformers, which would mix with a command's own."""
     shown = logging.is_progress_bar_enabled()
     logging.disable_progress_bar()

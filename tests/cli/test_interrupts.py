@@ -7,7 +7,7 @@ import weakref
 
 import pytest
 
-from gsjax.engine.interrupts import heard_interrupts, raise_if_interrupted, shielded
+from gsjax.engine.interrupts import handled_interrupts, raise_if_interrupted, shielded
 from gsjax.engine.messages import reason
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="signals")
@@ -18,7 +18,7 @@ def interrupt(number: int = signal.SIGINT) -> None:
 
 
 def test_an_interrupt_is_raised_at_once():
-    with pytest.raises(KeyboardInterrupt), heard_interrupts():
+    with pytest.raises(KeyboardInterrupt), handled_interrupts():
         interrupt()
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
@@ -26,7 +26,7 @@ def test_an_interrupt_is_raised_at_once():
 @pytest.mark.parametrize("name", ["SIGTERM", "SIGHUP"])
 def test_a_signal_that_would_end_the_program_stops_it_as_ctrl_c_does(name):
     number = signal.Signals[name]
-    with pytest.raises(KeyboardInterrupt) as stopped, heard_interrupts():
+    with pytest.raises(KeyboardInterrupt) as stopped, handled_interrupts():
         interrupt(number)
     assert (str(stopped.value), reason(stopped.value)) == (name, name)
     assert signal.getsignal(number) is signal.SIG_DFL
@@ -36,7 +36,7 @@ def test_a_signal_that_would_end_the_program_stops_it_as_ctrl_c_does(name):
 def test_what_nohup_ignores_stays_ignored():
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
     try:
-        with heard_interrupts():
+        with handled_interrupts():
             interrupt(signal.SIGHUP)
     finally:
         signal.signal(signal.SIGHUP, before)
@@ -75,7 +75,7 @@ def test_an_interrupt_that_a_callback_drops_is_raised_again(callback):
         time.sleep(5)
 
     before = sys.unraisablehook
-    with pytest.raises(KeyboardInterrupt), heard_interrupts():
+    with pytest.raises(KeyboardInterrupt), handled_interrupts():
         call_and_wait()
     assert sys.unraisablehook is before
 
@@ -88,7 +88,7 @@ def test_other_exceptions_that_are_dropped_are_printed_as_before(monkeypatch):
         def __del__(self):
             raise ValueError
 
-    with heard_interrupts():
+    with handled_interrupts():
         Faulty()
     assert [each.exc_type for each in printed] == [ValueError]
 
@@ -106,7 +106,7 @@ def test_what_must_not_be_disturbed_ends_before_an_interrupt_is_raised():
         done.append(shielded(step, 3))
         time.sleep(5)
 
-    with pytest.raises(KeyboardInterrupt), heard_interrupts():
+    with pytest.raises(KeyboardInterrupt), handled_interrupts():
         step_and_wait()
     assert done == [3, 3]
 
@@ -129,7 +129,7 @@ def test_between_undisturbed_steps_an_interrupt_is_heard_at_once():
             steps.append(shielded(step, not steps))
             raise_if_interrupted()
 
-    with heard_interrupts():
+    with handled_interrupts():
         with pytest.raises(KeyboardInterrupt):
             walk()
         time.sleep(0.03)  # nothing is raised a second time
@@ -141,7 +141,7 @@ def test_somebody_elses_handler_stays():
     heard = []
     before = signal.signal(signal.SIGINT, lambda *_: heard.append(1))
     try:
-        with heard_interrupts():
+        with handled_interrupts():
             interrupt()
     finally:
         signal.signal(signal.SIGINT, before)

@@ -13,7 +13,7 @@ from PIL import Image
 from gsjax.data import DataError, DataWarning
 from gsjax.data.files import (
     as_numbers,
-    background_behind,
+    find_background,
     image_size,
     picture_size,
     read_image,
@@ -21,7 +21,7 @@ from gsjax.data.files import (
     read_rgba,
     read_text,
 )
-from gsjax.data.pictures import warn_of_cut_off
+from gsjax.data.pictures import warn_of_truncated
 
 WIDTH, HEIGHT = 12, 8
 RAMP = np.arange(WIDTH * HEIGHT * 3, dtype=np.uint16).reshape(HEIGHT, WIDTH, 3)
@@ -170,8 +170,8 @@ def test_what_is_transparent_shows_the_background(tmp_path, mode):
     assert read_image(tmp_path / "a.png", WIDTH, HEIGHT)[0, 0].tolist() == [0, 0, 0]
     picture.convert("RGB").save(tmp_path / "b.png")
     picture.convert("RGB").convert("RGBA").save(tmp_path / "c.png")
-    assert background_behind([tmp_path / "b.png", tmp_path / "a.png"]) == (1, 1, 1)
-    assert background_behind([tmp_path / "b.png", tmp_path / "c.png"]) is None
+    assert find_background([tmp_path / "b.png", tmp_path / "a.png"]) == (1, 1, 1)
+    assert find_background([tmp_path / "b.png", tmp_path / "c.png"]) is None
 
 
 HEIC = b"\0\0\0\x18ftypheic\0\0\0\0mif1heic" + bytes(99)
@@ -296,9 +296,9 @@ def test_pictures_that_are_cut_off_are_named_without_decoding_them(tmp_path):
             files[-1].write_bytes(content[: int(0.9 * len(content))] if cut else content + b"film")
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        warn_of_cut_off(tmp_path, [*files[::2], tmp_path / "none"])
+        warn_of_truncated(tmp_path, [*files[::2], tmp_path / "none"])
     with pytest.warns(
         DataWarning,
         match=rf"{len(contents)} of {len(files)} pictures that were checked are cut off \(.*1.jpg",
     ):
-        warn_of_cut_off(tmp_path, files)
+        warn_of_truncated(tmp_path, files)

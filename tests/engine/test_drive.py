@@ -14,7 +14,7 @@ import pytest
 import gsjax
 from gsjax.engine import interrupts
 from gsjax.engine.drive import Drive, drive
-from gsjax.engine.verbs import _going_on as going_on
+from gsjax.engine.verbs import _continued as going_on
 from gsjax.io.checkpoints import CheckpointError, load_checkpoint, save_checkpoint
 from gsjax.methods.fit import Fit
 from gsjax.optim.method import Run
@@ -178,7 +178,7 @@ def test_ctrl_c_waits_for_the_end_of_a_step():
         pytest.skip("signals reach the main thread")
     method = Interrupted()
     ticks = drive(method, *method.start())
-    with interrupts.heard_interrupts(), pytest.raises(KeyboardInterrupt):
+    with interrupts.handled_interrupts(), pytest.raises(KeyboardInterrupt):
         for _ in ticks:
             pass
     assert ticks.run.step in (3, 4)

@@ -2,7 +2,7 @@
 
 import pytest
 
-from gsjax.engine.summary import in_title
+from gsjax.engine.summary import title_of
 from gsjax.engine.track.results import SCORES
 
 
@@ -30,4 +30,4 @@ def test_the_tile_of_the_tracker_is_a_mean_and_says_so():
     ],
 )
 def test_a_built_in_scene_has_a_title_for_people(dataset, title):
-    assert in_title(dataset) == title
+    assert title_of(dataset) == title

@@ -57,7 +57,7 @@ def test_sizes_of_an_spz_of_version_4_are_compared_as_a_whole(tmp_path, monkeypa
     """Harmonics that are all 0 take no room in the file, whose other arrays do."""
     path, scene = tmp_path / "scene.spz", make_scene(20_000, 3)
     scene = eqx.tree_at(lambda g: g.shN, scene, 0 * scene.shN)
-    monkeypatch.setattr("gsjax.io.scene_file._ALWAYS_ROOM", 1 << 19)
+    monkeypatch.setattr("gsjax.io.scene_file._SMALL", 1 << 19)
     spz4(scene, path)
     assert read_gaussians(path)[0].num == 20_000
     spz4(jax.tree.map(jnp.ones_like, scene), path)

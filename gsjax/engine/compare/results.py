@@ -8,7 +8,7 @@ from typing import Any
 
 from gsjax.engine.compare.comparison import Comparison, Group
 from gsjax.engine.compare.pictures import write_strip
-from gsjax.engine.folder import expect_ours
+from gsjax.engine.folder import expect_replaceable
 from gsjax.engine.messages import counted
 from gsjax.engine.summary import Card, Column, Media, Summary, Table
 from gsjax.viz.plots import fit_curves, save
@@ -60,7 +60,7 @@ def _draw(found: Comparison, out: Path) -> tuple[list[Media], list[Media]]:
     plots, strips = [], []
     out.mkdir(parents=True, exist_ok=True)
     for name, written in FOLDERS.items():
-        folder = expect_ours(out / name, (written,))
+        folder = expect_replaceable(out / name, (written,))
         if folder.exists():
             shutil.rmtree(folder)
         folder.mkdir()

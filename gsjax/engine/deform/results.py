@@ -14,8 +14,8 @@ from gsjax.engine.summary import (
     Table,
     at,
     cards_of,
-    in_title,
     minutes,
+    title_of,
 )
 from gsjax.viz.colors import label_color
 from gsjax.viz.plots import losses_over_steps, save
@@ -67,7 +67,7 @@ def summarize(folder: RunFolder, found: Metrics) -> Summary:
         plots.append(Media(plot, "Weighted losses over steps"))
     names = [f"Names: {', '.join(found['names'])}."] if found["names"] else []
     return Summary(
-        title=f"{in_title(found['dataset'])} deforms",
+        title=f"{title_of(found['dataset'])} deforms",
         subtitle=(
             f"{_RECIPES[found['preset']]}; {counted(frames['learned'], 'frame')} learned, "
             f"{frames['held_out']} held out; scores are of frames {judged}"

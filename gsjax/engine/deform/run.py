@@ -40,7 +40,7 @@ from gsjax.engine.progress import (
     warn_of_mishaps,
     watch,
 )
-from gsjax.engine.recording import located, open_recording
+from gsjax.engine.recording import absolute_path, open_recording
 from gsjax.engine.teaching.choice import NO_TEACHER, TeacherChoice, TeacherOptions
 from gsjax.methods.deform import PRESETS, Deform, DeformConfig
 from gsjax.methods.deform.method import PLAN
@@ -103,7 +103,7 @@ def run(options: Options, by_preset: Callable[[str], Options]) -> int:
                     "The camera goes around the scene, but its pictures are not transparent, so the settings "
                     "are those of --preset surst. If they show one object, make them transparent around it."
                 )
-        settings = replace(options, dataset=located(options.dataset), **choice.located())
+        settings = replace(options, dataset=absolute_path(options.dataset), **choice.absolute_path())
         if options.resume:
             folder.check_config(settings, but=RESUME_MAY_CHANGE)
         how = (options.test_every, options.tools, choice, options.deform.channels)

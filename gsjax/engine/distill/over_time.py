@@ -15,7 +15,7 @@ from rich.progress import track
 from gsjax.data.photographs import photographs_of
 from gsjax.engine.distill.saved import FieldRun
 from gsjax.engine.messages import Notes, describe
-from gsjax.engine.pictures import MARK, MOST, frame_rate, lit
+from gsjax.engine.pictures import MARK, MIN_SHARE, frame_rate, spotlight
 from gsjax.engine.track.loop import Tracking
 from gsjax.engine.track.saved import SavedRun, open_run, read_tracking
 from gsjax.io.atomic import write_npz
@@ -124,9 +124,9 @@ class OverTime:
         with VideoWriter(path, frame_rate(sequence.times)) as video:
             for t in track(range(motion.num_frames), "filming", console=console, transient=True):
                 there = jax.tree.map(lambda a: a[None], photographs.camera(t))
-                mask = drawer(motion.at(t), there).colors[..., 0] > MOST
+                mask = drawer(motion.at(t), there).colors[..., 0] > MIN_SHARE
                 pixels.append(int(mask.sum()))
-                video.write(lit(photographs.image(t), mask, MARK))
+                video.write(spotlight(photographs.image(t), mask, MARK))
         return {"times": np.asarray(sequence.times), "pixels": np.array(pixels)}
 
 

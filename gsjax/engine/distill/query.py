@@ -19,7 +19,7 @@ from gsjax.data.photographs import Photographs
 from gsjax.engine.distill.file import NAME, read_field
 from gsjax.engine.distill.saved import FieldRun, short_names
 from gsjax.engine.messages import Notes, describe
-from gsjax.engine.pictures import MARK, MOST
+from gsjax.engine.pictures import MARK, MIN_SHARE
 from gsjax.engine.query import SCENE_CAPTIONS, Queryable, Question, Selection, write_mask
 from gsjax.geometry.cameras import Camera, camera_centers
 from gsjax.geometry.spherical_harmonics import evaluate_sh
@@ -162,7 +162,7 @@ class QueryableField(Queryable):
         best: tuple[float, int, np.ndarray] | None = None
         for v in track(which, "drawing", console=console, transient=True):
             drawn = drawer(values, _batched(photographs.camera(v))).colors
-            mask = drawn[..., 0] > MOST
+            mask = drawn[..., 0] > MIN_SHARE
             pixels[names[v]] = write_mask(folder, names[v], mask)
             if best is None or mask.mean() > best[0]:
                 best = (float(mask.mean()), v, drawn)
@@ -183,7 +183,7 @@ class QueryableField(Queryable):
         threshold = found.threshold.value
         scale = enlarged(heat(drawn[..., 1]), _PANEL_HEIGHT)
         panels = {
-            f"found in view {names[v]}": highlight(behind, drawn[..., 0] > MOST, MARK),
+            f"found in view {names[v]}": highlight(behind, drawn[..., 0] > MIN_SHARE, MARK),
             f"scores; found above {threshold:.2f}": with_heat_scale(scale, low, high, threshold),
         }
         for words, scene in shown.items():

@@ -11,8 +11,8 @@ from gsjax.engine.summary import (
     Table,
     at,
     cards_of,
-    in_title,
     minutes,
+    title_of,
 )
 from gsjax.viz.plots import losses_over_steps, save
 
@@ -53,7 +53,7 @@ def summarize(folder: RunFolder, found: Metrics) -> Summary:
         plots.append(Media(plot, "Losses, unweighted, over steps"))
     names = [f"Names: {', '.join(found['names'])}."] if found["names"] else []
     return Summary(
-        title=f"A field on {in_title(found['dataset'])}",
+        title=f"A field on {title_of(found['dataset'])}",
         subtitle=(
             f"{found['features_are']}; masks: {found['masks']}; {counted(views['taught'], 'view')} taught, "
             f"{views['held_out']} held out; scores are of views {judged}"

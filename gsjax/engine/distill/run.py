@@ -31,7 +31,7 @@ from gsjax.engine.progress import (
     warn_of_mishaps,
     watch,
 )
-from gsjax.engine.recording import located
+from gsjax.engine.recording import absolute_path
 from gsjax.engine.records import digest
 from gsjax.engine.teaching.cache import FeatureCache
 from gsjax.engine.teaching.choice import TeacherChoice
@@ -169,8 +169,10 @@ def _write(folder: RunFolder, result: DistillResult) -> None:
 
 def with_paths(options: Options) -> Options:
     """The options with paths that are valid from any folder."""
-    images = None if options.images is None else located(options.images)
-    return replace(options, **options.located(), scene=Path(located(str(options.scene))), images=images)
+    images = None if options.images is None else absolute_path(options.images)
+    return replace(
+        options, **options.absolute_path(), scene=Path(absolute_path(str(options.scene))), images=images
+    )
 
 
 def _note_unused(config: DistillConfig, notes: Notes) -> None:

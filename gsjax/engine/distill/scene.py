@@ -13,7 +13,7 @@ import tyro
 from gsjax.data.open import ReadOptions
 from gsjax.data.origin import relative_to_origin
 from gsjax.data.photographs import Photographs, photographs_of
-from gsjax.engine.files import about_scene, read_arrays, reopen
+from gsjax.engine.files import read_arrays, relative_to_scene, reopen
 from gsjax.engine.folder import expect_run
 from gsjax.engine.options import HeldOutFrames, Selection
 from gsjax.engine.photographs import choose_photographs, photographs_of_run, smaller, split
@@ -125,7 +125,7 @@ def scene_of_run(path: Path, images: str | None = None, read_scene: Read | None 
         if images is not None:
             raise ValueError("--images: a run of `gsjax track` knows its recording; leave it out")
         recording, _ = reopen(path / "config.yml", _AGAIN)
-        first = about_scene(recording, report.origin).judged.select(frames=slice(0, 1))
+        first = relative_to_scene(recording, report.origin).judged.select(frames=slice(0, 1))
         indices, count = list(range(first.num_cameras)), recording.tracked.num_cameras
         return FieldScene(file, gaussians, photographs_of(first), indices[:count], indices[count:])
     photographs = photographs_of_run(record.config, images)

@@ -71,7 +71,7 @@ def read_config(path: Path, root: Path) -> tuple[Config, tuple[Column, ...], Fig
     expect(within, f"{path}: script", f"a path within {root}", config.script)
     expect(script.is_file(), f"{path}: script", "a file", f"none at {script}")
     columns = tuple(_column(value, f"{path}: columns[{i}]") for i, value in enumerate(config.columns))
-    expect_unlike([column.key for column in columns], f"{path}: columns")
+    expect_unique([column.key for column in columns], f"{path}: columns")
     figure = _fields(Figure, config.figure, f"{path}: figure")
     fits = Path(figure.file).name == figure.file and Path(figure.file).suffix in FIGURES
     expect(fits, f"{path}: figure.file", f"a file name in {', '.join(FIGURES)}", figure.file)
@@ -114,7 +114,7 @@ def expect(holds: Any, where: str, expected: str, found: Any) -> None:
     raise ValueError(f"{where}: expected {expected}, found {text}")
 
 
-def expect_unlike(names: list[str], where: str) -> None:
+def expect_unique(names: list[str], where: str) -> None:
     """Raises a ValueError with the names that occur more than once."""
     twice = [name for name in dict.fromkeys(names) if names.count(name) > 1]
     expect(not twice, where, "each once", f"{', '.join(twice)} more than once")

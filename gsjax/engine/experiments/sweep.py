@@ -18,7 +18,7 @@ from gsjax.engine.experiments.config import (
     Config,
     Figure,
     expect,
-    expect_unlike,
+    expect_unique,
     read_config,
 )
 from gsjax.engine.experiments.records import RESULTS, committed_rows, read_record
@@ -185,7 +185,7 @@ def _cells(config: Config, path: Path) -> tuple[Cell, ...]:
     points = [dict(zip(config.grid, p, strict=True)) for p in itertools.product(*config.grid.values())]
     options = [{**case, **point} for case in config.cases or [{}] for point in points]
     cells = tuple(Cell(o, seed) for o in options for seed in config.seeds)
-    expect_unlike([str(cell) for cell in cells], f"{path}: grid, cases and seeds")
+    expect_unique([str(cell) for cell in cells], f"{path}: grid, cases and seeds")
     return cells
 
 

@@ -12,9 +12,9 @@ from gsjax.engine.summary import (
     Table,
     at,
     cards_of,
-    in_title,
     minutes,
     time_table,
+    title_of,
 )
 from gsjax.viz.plots import fit_curve, save
 
@@ -62,7 +62,7 @@ def summarize(folder: RunFolder, found: Metrics) -> Summary:
     shown = found["views"][:: max(1, len(found["views"]) // _SHOWN)][:_SHOWN]
     orbit = folder.video(ORBIT)
     return Summary(
-        title=in_title(found["dataset"]),
+        title=title_of(found["dataset"]),
         subtitle=f"{counted(photographs['fitted'], 'photograph')} fitted, {photographs['held_out']} held out",
         cards=cards_of(SCORES, found),
         tables=[

@@ -12,7 +12,7 @@ from rich.console import Console
 from gsjax.data.photographs import Photographs
 from gsjax.engine.budget import Budget
 from gsjax.engine.drive import Drive, drive
-from gsjax.engine.ending import ended, exit_code, finish
+from gsjax.engine.ending import completion, exit_code, finish
 from gsjax.engine.files import write_scene
 from gsjax.engine.fit.costs import settings_within
 from gsjax.engine.fit.ending import Ending, judged_subset
@@ -29,7 +29,7 @@ from gsjax.engine.messages import Notes, counted
 from gsjax.engine.options import RESUME_MAY_CHANGE, OfDataset, checked, expect_positive
 from gsjax.engine.photographs import choose_photographs, read_frames, smaller, split
 from gsjax.engine.progress import Progress, load_run, warn_of_mishaps, watch
-from gsjax.engine.recording import located
+from gsjax.engine.recording import absolute_path
 from gsjax.io.atomic import write_npz
 from gsjax.methods.fit import Fit, FitConfig, Model, Problem, refined_frames
 from gsjax.methods.fit.model import in_slots
@@ -91,7 +91,7 @@ def run(options: Options) -> int:
         if options.until_psnr is not None and not len(held_out):
             raise ValueError("--until-psnr: nothing is held out to judge by; see --test-every")
         folder = RunFolder.locked(options.out, overwrite=options.overwrite, resume=options.resume)
-        settings = replace(options, dataset=located(options.dataset))
+        settings = replace(options, dataset=absolute_path(options.dataset))
         is_default = options.fit == FitConfig(seed=options.fit.seed)  # so that --minutes decide
         if options.resume:
             differ = is_default and (folder.setting("minutes") is None) != (options.minutes is None)
@@ -142,7 +142,7 @@ def run(options: Options) -> int:
         found = {
             "kind": "fit",
             "dataset": photographs.name,
-            **ended(stopped),
+            **completion(stopped),
             "steps": run.step,
             **progress.mishaps,
             "num_gaussians": gaussians.num,

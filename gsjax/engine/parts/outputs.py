@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from rich.console import Console
 
-from gsjax.engine.ending import ended
+from gsjax.engine.ending import completion
 from gsjax.engine.files import write_scene
 from gsjax.engine.folder import RunFolder
 from gsjax.engine.machine import describe as describe_machine
@@ -81,7 +81,7 @@ def write_outputs(
     return {
         "kind": "parts",
         "dataset": sequence.name,
-        **ended(progress.stopped),
+        **completion(progress.stopped),
         "anchor": found.anchor,
         "steps": run.step,
         "frames": {

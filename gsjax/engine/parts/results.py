@@ -15,8 +15,8 @@ from gsjax.engine.summary import (
     Table,
     at,
     cards_of,
-    in_title,
     time_table,
+    title_of,
 )
 from gsjax.viz.colors import label_color
 
@@ -76,7 +76,7 @@ def summarize(folder: RunFolder, found: Metrics) -> Summary:
     frames, image = found["frames"], found["image"]
     cameras = camera_rows(found, "observed")
     return Summary(
-        title=in_title(found["dataset"]),
+        title=title_of(found["dataset"]),
         subtitle=(
             f"Parts found from motion (MotionSplicer), of {counted(found['pieces'], 'piece')}; "
             f"{counted(frames['followed'], 'frame')}, canonical {found['anchor']}; "

@@ -25,7 +25,7 @@ from gsjax.engine.parts.outputs import write_outputs
 from gsjax.engine.parts.results import summarize
 from gsjax.engine.parts.start import FIT, detect_motion, discover
 from gsjax.engine.progress import Progress, load_run
-from gsjax.engine.recording import Recording, chosen_recording, located, parse_frames
+from gsjax.engine.recording import Recording, absolute_path, chosen_recording, parse_frames
 from gsjax.engine.records import digest
 from gsjax.methods.fit import FitConfig
 from gsjax.methods.parts import (
@@ -78,7 +78,9 @@ def run(options: Options) -> int:
         _check(options, recording)
         segmenter: Segmenter = PieceSegmenter() if options.sam is None else load_sam(options.sam)
         folder = RunFolder.locked(options.out, overwrite=options.overwrite, resume=options.resume)
-        settings = replace(options, dataset=located(options.dataset), cameras=recording.tracked.camera_ids)
+        settings = replace(
+            options, dataset=absolute_path(options.dataset), cameras=recording.tracked.camera_ids
+        )
         if options.resume:
             folder.check_config(settings, but=RESUME_MAY_CHANGE)
         scene = None if options.scene is None else _ply_of(options.scene)

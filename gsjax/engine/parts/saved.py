@@ -10,7 +10,7 @@ import jaxlie
 import numpy as np
 from jaxtyping import Float
 
-from gsjax.engine.files import about_scene, check_arrays, chosen_camera, read_arrays, read_scene, reopen
+from gsjax.engine.files import check_arrays, chosen_camera, read_arrays, read_scene, relative_to_scene, reopen
 from gsjax.engine.folder import expect_run
 from gsjax.engine.recording import Recording
 from gsjax.io.brief import brief
@@ -72,7 +72,7 @@ def open_parts_run(path: Path) -> PartsRun:
     """
     layer, names, complete, origin = _read(path)
     recording, blend = reopen(path / "config.yml", _AGAIN, _blend)
-    return PartsRun(path, layer, names, complete, about_scene(recording, origin), blend)
+    return PartsRun(path, layer, names, complete, relative_to_scene(recording, origin), blend)
 
 
 def blend_of(path: Path) -> Blend:

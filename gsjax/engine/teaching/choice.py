@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from gsjax.engine.options import ClipWeights, SamWeights
-from gsjax.engine.recording import located
+from gsjax.engine.recording import absolute_path
 from gsjax.engine.teaching.source import KINDS
 from gsjax.perception.feature_files import EACH
 from gsjax.perception.levels import LEVELS, Level
@@ -62,11 +62,13 @@ class TeacherChoice(TeacherOptions):
         """Whether the features come from a folder of files."""
         return self.features not in ("auto", NO_TEACHER, *KINDS)
 
-    def located(self) -> dict[str, Any]:
+    def absolute_path(self) -> dict[str, Any]:
         """Its paths in a form that is valid from any folder, by the options that name them."""
         paths = {"sam": self.sam, "weights": self.weights}
-        found: dict[str, Any] = {name: path and Path(located(str(path))) for name, path in paths.items()}
-        return found | ({"features": located(self.features)} if self.of_files else {})
+        found: dict[str, Any] = {
+            name: path and Path(absolute_path(str(path))) for name, path in paths.items()
+        }
+        return found | ({"features": absolute_path(self.features)} if self.of_files else {})
 
     def check(self, *, optional: bool = False) -> None:
         """Check the choice, before anything slow begins.

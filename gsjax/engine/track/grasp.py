@@ -18,7 +18,7 @@ from rich.progress import track
 from gsjax.engine.folder import replaced_folder
 from gsjax.engine.messages import Notes
 from gsjax.engine.options import Seeded, checked
-from gsjax.engine.pictures import frame_rate, lit
+from gsjax.engine.pictures import frame_rate, spotlight
 from gsjax.engine.recording import Recording
 from gsjax.engine.track.query import Answer, ObjectQuery, ask, progress
 from gsjax.engine.track.saved import SavedRun
@@ -34,9 +34,9 @@ from gsjax.scene.origin import in_world
 from gsjax.viz.colors import captioned, label_color
 
 _WRITTEN = ("grasps.npz", "video.mp4", "frame_*.png")
-NOT_THERE = 3  # exit code: no frame has a feasible grasp
+NO_GRASP = 3  # exit code: no frame has a feasible grasp
 _REACH = 0.35  # metres; what stays farther from the object's centroid is no obstacle
-_FEASIBLE, _IN_THE_WAY = (84, 222, 130), (235, 110, 90)
+_FEASIBLE, _INFEASIBLE = (84, 222, 130), (235, 110, 90)
 
 
 @dataclass(frozen=True)
@@ -97,7 +97,7 @@ def _write(
     middle = saved.tracking.num_frames // 2
     with VideoWriter(folder / "video.mp4", frame_rate(times)) as video:
         for view in progress(views(saved.tracking, recording), saved, console):
-            picture = lit(view.image, view.groups == answer.group, label_color(answer.group))
+            picture = spotlight(view.image, view.groups == answer.group, label_color(answer.group))
             camera = recording.tracked.viewmats[view.t, 0], recording.tracked.Ks[view.t, 0]
             now = jax.tree.map(lambda a, t=view.t: a[t], grasps)
             zoom = picture.shape[1] / view.groups.shape[1]
@@ -181,7 +181,7 @@ def draw_grasp(
     wrist = back - gripper.palm_height
     corners = [(0, 0, wrist), (0, 0, back), (0, -half, gripper.tip), (0, -half, back), (0, half, back)]
     corners += [(0, half, gripper.tip), (0, -half, 0), (0, half, 0)]
-    color = _FEASIBLE if grasp.feasible else _IN_THE_WAY
+    color = _FEASIBLE if grasp.feasible else _INFEASIBLE
     words = f"score {grasp.score:.2f}   {1e3 * grasp.width:.0f} mm" if grasp.feasible else "no feasible grasp"
     picture = captioned(picture, words)
     pixels, depths = project(
@@ -219,4 +219,4 @@ def _report(grasps: Grasp, answer: Answer, folder: Path) -> int:
             f"{low if low == high else f'{low} to {high}'} mm wide"
         )
     print(f"grasp   {folder}")
-    return 0 if feasible.any() else NOT_THERE
+    return 0 if feasible.any() else NO_GRASP

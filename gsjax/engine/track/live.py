@@ -20,7 +20,7 @@ from gsjax.data.opencv_cameras import open_camera, snapshots
 from gsjax.data.realsense_camera import open_realsense
 from gsjax.data.stream import Arrival, NewestSnapshots, Snapshot, replay
 from gsjax.engine.drive import Tick
-from gsjax.engine.ending import ended, exit_code
+from gsjax.engine.ending import completion, exit_code
 from gsjax.engine.first_mask import first_mask, label_names, placed, warn_of_missing
 from gsjax.engine.folder import RunFolder
 from gsjax.engine.locks import releasing_locks
@@ -107,7 +107,7 @@ def run(options: Options) -> int:
         found = {
             "kind": "live",
             "source": options.source,
-            **ended(stopped, report=False),
+            **completion(stopped, report=False),
             **log.metrics(),
             "machine": describe_machine(),
             "notes": notes.all,

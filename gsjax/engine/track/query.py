@@ -16,7 +16,7 @@ from rich.table import Table
 from gsjax.engine.folder import OF_QUERY, replaced_folder
 from gsjax.engine.messages import Notes
 from gsjax.engine.options import ClipWeights, Common, ObjectText
-from gsjax.engine.pictures import frame_rate, lit
+from gsjax.engine.pictures import frame_rate, spotlight
 from gsjax.engine.query import write_mask
 from gsjax.engine.recording import Recording
 from gsjax.engine.track.saved import SavedRun, open_run
@@ -65,7 +65,7 @@ class Answer(NamedTuple):
     rows: Int[np.ndarray, "n"]
 
 
-def ask_for_object(options: ObjectQuery, console: Console, folder: Path, *, pictures: bool = True) -> None:
+def answer_query(options: ObjectQuery, console: Console, folder: Path, *, pictures: bool = True) -> None:
     """Answer a query, and write the folder of the answer.
 
     Args:
@@ -116,7 +116,7 @@ def _draw(folder: Path, saved: SavedRun, recording: Recording, group: int, conso
             mask = view.groups == group
             frame_id = recording.tracked.frame_ids[view.t]
             pixels.append(write_mask(folder, f"{frame_id:06d}", mask))
-            video.write(lit(view.image, mask, label_color(group)))
+            video.write(spotlight(view.image, mask, label_color(group)))
     return pixels
 
 
@@ -129,7 +129,7 @@ def ask(options: ObjectQuery, console: Console, notes: Notes) -> tuple[SavedRun,
         notes: for warnings.
 
     Raises:
-        ValueError, OSError: as for `ask_for_object`.
+        ValueError, OSError: as for `answer_query`.
     """
     _check_encoder(options)
     saved = open_run(options.run)

@@ -14,8 +14,8 @@ from gsjax.engine.summary import (
     Table,
     at,
     cards_of,
-    in_title,
     time_table,
+    title_of,
 )
 from gsjax.viz.colors import label_color
 
@@ -129,7 +129,7 @@ def summarize(folder: RunFolder, found: Metrics, plots: Sequence[Media], images:
     rows = _object_rows(found)
     colors = [label_color(row["label"]) for row in rows]
     return Summary(
-        title=in_title(found["dataset"]),
+        title=title_of(found["dataset"]),
         resumable=(folder.resume / "state.npz").is_file(),
         subtitle=_subtitle(found),
         cards=cards_of(SCORES, found),

@@ -9,7 +9,7 @@ from typing import Any, Literal
 import numpy as np
 from rich.console import Console
 
-from gsjax.engine.ending import ended, exit_code, finish
+from gsjax.engine.ending import completion, exit_code, finish
 from gsjax.engine.first_mask import (
     KEPT_MASK,
     PICTURE,
@@ -17,7 +17,7 @@ from gsjax.engine.first_mask import (
     first_mask,
     placed,
     warn_of_missing,
-    without_truth,
+    without_own_objects,
 )
 from gsjax.engine.folder import RunFolder, expect_dataset
 from gsjax.engine.locks import releasing_locks
@@ -32,7 +32,7 @@ from gsjax.engine.options import (
     preset_options,
 )
 from gsjax.engine.pictures import Film
-from gsjax.engine.recording import Recording, chosen_recording, draw_ahead, drawing_ahead, located
+from gsjax.engine.recording import Recording, absolute_path, chosen_recording, draw_ahead, drawing_ahead
 from gsjax.engine.scores import Scores
 from gsjax.engine.streams import say_error
 from gsjax.engine.summary import Media, format_number
@@ -93,7 +93,7 @@ def run(options: Options) -> int:
         folder = RunFolder.locked(options.out, overwrite=options.overwrite, resume=options.resume)
         settings = replace(
             options,
-            dataset=located(options.dataset),
+            dataset=absolute_path(options.dataset),
             cameras=recording.tracked.camera_ids,
             masks=placed(options.masks),
         )
@@ -104,7 +104,7 @@ def run(options: Options) -> int:
         mask = first_mask(recording.tracked, options.mask_camera, masks, options.scale)
         folder.write_config(settings)  # from here on an earlier run is gone
         if mask.source == PICTURE and mask.labels is not None:
-            recording = without_truth(recording)
+            recording = without_own_objects(recording)
             write_png(kept, mask.labels.astype(np.uint16))
         seconds = {"preparing": perf_counter() - begun}
         first = recording.tracked.frame(0)
@@ -127,7 +127,7 @@ def run(options: Options) -> int:
         seconds |= tracking.seconds()
         write_tracking(folder, tracking, recording.tracked.times, recording.tracked.origin)
         _note_if_stopped(tracking, recording, notes)
-        found, media, failed = _judge(
+        found, media, failed = _evaluate(
             folder, tracking, recording, mask, seconds, notes, console, options.budget_ms
         )
         seconds["total"] = perf_counter() - begun
@@ -164,7 +164,7 @@ def _start(
     return scene, seconds
 
 
-def _judge(
+def _evaluate(
     folder: RunFolder,
     tracking: Tracking,
     recording: Recording,
@@ -195,10 +195,10 @@ def _judge(
     motion = score_motion(tracking, recording, true_labels)
     names = object_names(tracking, recording, values)
     seconds["evaluation"] = perf_counter() - begun
-    found = _what_ran(tracking, recording, mask, scores, budget_ms)
+    found = _run_metrics(tracking, recording, mask, scores, budget_ms)
     found |= metrics(tracking, recording, mask, scores, motion, values, true_labels)
-    _note_what_is_missing(found, tracking, recording, mask, values, notes)
-    _note_what_was_lost(found, tracking, values, names, notes)
+    _note_unscored(found, tracking, recording, mask, values, notes)
+    _note_lost(found, tracking, values, names, notes)
     media = {
         "plots": write_plots(folder, tracking, recording, scores, motion, names, labels),
         "images": write_first_mask(folder, recording, mask),
@@ -206,7 +206,7 @@ def _judge(
     return found, media, failed
 
 
-def _what_ran(
+def _run_metrics(
     tracking: Tracking, recording: Recording, mask: FirstMask, scores: Scores, budget_ms: float | None
 ) -> dict[str, Any]:
     """The part of metrics.json about what ran, and how fast."""
@@ -222,7 +222,7 @@ def _what_ran(
     return {
         "kind": "track",
         "dataset": sequence.name,
-        **ended(tracking.stopped),
+        **completion(tracking.stopped),
         "complete": tracking.stopped is None and scores.num_frames == tracking.num_frames,
         "frames": {
             "tracked": tracking.num_frames,
@@ -260,7 +260,7 @@ def _note_if_stopped(tracking: Tracking, recording: Recording, notes: Notes) -> 
         say_error(f"by {why} {after}; scoring those (Ctrl-C again to skip that)", word="stopped")
 
 
-def _note_what_is_missing(
+def _note_unscored(
     found: dict[str, Any],
     tracking: Tracking,
     recording: Recording,
@@ -303,7 +303,7 @@ def _note_what_is_missing(
         notes.add(f"Skipped, as numbers were not finite: {counted(tracking.skipped, 'update')}.")
 
 
-def _note_what_was_lost(
+def _note_lost(
     found: dict[str, Any],
     tracking: Tracking,
     values: np.ndarray | None,

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from gsjax.engine.files import about_scene, chosen_camera, read_arrays, read_scene, reopen
+from gsjax.engine.files import chosen_camera, read_arrays, read_scene, relative_to_scene, reopen
 from gsjax.engine.first_mask import OWN_MASKS
 from gsjax.engine.folder import expect_run
 from gsjax.engine.recording import Recording
@@ -61,7 +61,7 @@ def open_run(path: Path) -> SavedRun:
     if missing:
         raise FileNotFoundError(f"{path}: expected a complete run, found no {missing[0]}; {_AGAIN}")
     tracking, origin = read_tracking(path)
-    recording = about_scene(reopen(path / "config.yml", _AGAIN)[0], origin)
+    recording = relative_to_scene(reopen(path / "config.yml", _AGAIN)[0], origin)
     if recording.tracked.num_frames < tracking.num_frames:
         found = f"{recording.tracked.num_frames} frames where the run has {tracking.num_frames}"
         raise ValueError(f"{path}: expected its recording as it was, found {found}; restore it, or {_AGAIN}")

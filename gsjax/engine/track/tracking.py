@@ -12,10 +12,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gsjax.engine.drive import Clock, Tick, announced, warn_of_lost
+from gsjax.engine.drive import Clock, Tick, announce, warn_of_lost_losses
 from gsjax.engine.interrupts import raise_if_interrupted, shielded
 from gsjax.losses.extra import ExtraLosses, UpToDate
-from gsjax.methods.track.budget import Costs, Governor, choose, ladder, not_used
+from gsjax.methods.track.budget import Costs, Governor, choose, ladder, unused_settings
 from gsjax.methods.track.config import TrackConfig
 from gsjax.methods.track.frames import FrameShape, shape_of
 from gsjax.methods.track.method import PLAN, Track
@@ -81,29 +81,29 @@ def track(
         )
     frames = iter(frames)
     if after is not None:
-        warn_of_lost(after, extra_losses)
+        warn_of_lost_losses(after, extra_losses)
     at = perf_counter()
     known, clock = like(), Clock()
     waited = perf_counter() - at  # for another thread that compiles
     if budget_ms is None:
         method = Track(config, extra_losses)
-        begun = _begun(method, scene, first, after, known)
+        begun = _started(method, scene, first, after, known)
         yield from _ticks(method, *begun, first, frames, None, waited + clock.read()[1])
         return
-    if unused := not_used(config):
+    if unused := unused_settings(config):
         named = ", ".join(unused)
         message = f"under a budget settings are chosen by their cost: {named} of yours will not be used"
         warnings.warn(message, UserWarning, stacklevel=2)
     count = (scene if after is None else after.run.params.scene).num_objects
     chosen = None if after is None else after.run.kept.chosen
-    start = partial(_begun, scene=scene, first=first, after=after, like=known, anew=chosen is None)
+    start = partial(_started, scene=scene, first=first, after=after, like=known, anew=chosen is None)
     if chosen is None:
         ahead = list(itertools.islice(frames, 1))
         frames = itertools.chain(ahead, frames)
         second = [*ahead, first][0]
         _check_alike(second, first, 1)
         rungs = ladder(config, len(first.images))
-        chosen = choose(rungs, partial(_measured, start, second), budget_ms / 1e3, count)
+        chosen = choose(rungs, partial(_measured_costs, start, second), budget_ms / 1e3, count)
     method = Track(chosen.config)
     shape, run = start(method)
     run = run.having(kept=run.kept._replace(chosen=chosen))
@@ -133,7 +133,7 @@ def _ticks(
         run, info, seconds, compile_seconds = shielded(advance, run, frame, everywhere)
         if governor is not None:
             governor.spent(seconds, int(info["looked_for"].sum()))
-        yield announced(Tick(method, shape, run, info, seconds, compiled + compile_seconds))
+        yield announce(Tick(method, shape, run, info, seconds, compiled + compile_seconds))
         compiled = 0.0
 
 
@@ -145,7 +145,7 @@ def first_update(scene: TrackedScene, first: Frame, config: TrackConfig) -> Tick
     return Tick(method, shape, run, info, *seconds)
 
 
-def _begun(
+def _started(
     method: Track,
     scene: TrackedScene,
     first: Frame,
@@ -157,26 +157,26 @@ def _begun(
     settings."""
     if after is None:
         shape, run = method.start(scene, first, like.run if like and like.method == method else None)
-        return shape, _looked(method, shape, run, first)
+        return shape, _initialised(method, shape, run, first)
     if anew:
         shape, run = method.start_at(after.run.params, first)
-        return shape, _looked(method, shape, run, first).having(step=after.run.step)
+        return shape, _initialised(method, shape, run, first).having(step=after.run.step)
     run = after.run
     if after.method.config != method.config:
         shape, planned = method.start_at(run.params, first)
-        if not _alike(planned.state, run.state):
-            return shape, _looked(method, shape, planned, first).having(step=run.step)
+        if not _same_shapes(planned.state, run.state):
+            return shape, _initialised(method, shape, planned, first).having(step=run.step)
         run = run.having(plans=planned.plans, kept=planned.kept)
     return shape_of(first), run
 
 
-def _alike(state: Any, other: Any) -> bool:
+def _same_shapes(state: Any, other: Any) -> bool:
     """Whether two states have the same structure and array shapes."""
     same = jax.tree.structure(state) == jax.tree.structure(other)
     return same and all(map(lambda a, b: a.shape == b.shape, *map(jax.tree.leaves, (state, other))))
 
 
-def _looked(method: Track, shape: FrameShape, run: Run, first: Frame) -> Run:
+def _initialised(method: Track, shape: FrameShape, run: Run, first: Frame) -> Run:
     """A run that had seen no frame yet, after an update to the first one."""
     return _Updates(method, shape, run)(run, first, 0)[0].having(step=run.step)
 
@@ -214,7 +214,9 @@ def _compiled(method: Track, shape: FrameShape, reduction: int, outside: tuple) 
     return jit_once(advance, (method, shape, reduction), compiler_options=host_options())
 
 
-def _measured(start: Callable[[Track], tuple[FrameShape, Run]], second: Frame, config: TrackConfig) -> Costs:
+def _measured_costs(
+    start: Callable[[Track], tuple[FrameShape, Run]], second: Frame, config: TrackConfig
+) -> Costs:
     """The cost of updates, measured on the second frame, which shows new background if cameras move."""
     method = Track(config)
     shape, run = start(method)

@@ -11,7 +11,7 @@ from gsjax.methods.parts.config import PartsConfig, StreamConfig
 from gsjax.methods.parts.discovery import Discovery
 from gsjax.methods.parts.pictures import Problem, coarse_frame, with_part_masks
 from gsjax.methods.parts.search import POINTS, color_differences, colors_of, most_visible
-from gsjax.methods.parts.stream import Canonical, picture_loss, posed
+from gsjax.methods.parts.stream import Canonical, image_loss, posed
 from gsjax.methods.parts.trajectory import BACKGROUND
 from gsjax.optim.compiler import host_jit
 from gsjax.rasterize.plan import Plan, with_room
@@ -19,9 +19,12 @@ from gsjax.scene.frame import Frame, one_camera
 from gsjax.scene.handles import skin
 from gsjax.scene.render import plan_render, render
 
-_ASTRAY = 1.5, 0.05  # factor on the anchor's colour difference, and offset, above which a part may be absent
+_MISMATCH = (
+    1.5,
+    0.05,
+)  # factor on the anchor's colour difference, and offset, above which a part may be absent
 _CAMERAS = 4  # of a frame, for which it is rendered with and without the part
-_LESS = 0.98  # share of the larger loss below which the smaller one is conclusive
+_CONCLUSIVE = 0.98  # share of the larger loss below which the smaller one is conclusive
 _FRAMES = 2  # in succession from which a part is absent, at least
 
 
@@ -42,7 +45,7 @@ def absences(problem: Problem, discovery: Discovery, config: PartsConfig) -> Boo
     labels = np.asarray(discovery.weights).argmax(-1)
     parts = [part for part in np.unique(labels).tolist() if part != BACKGROUND]
     rows = {part: np.resize(most_visible(canonical.movable, labels == part), POINTS) for part in parts}
-    colors, explained = colors_of(canonical.movable), _Explained(problem, discovery, config)
+    colors, explained = colors_of(canonical.movable), _AbsenceTest(problem, discovery, config)
     anchor = coarse_frame(problem, discovery, discovery.anchor)
     means = np.asarray(canonical.movable.means)
     usual = {part: color_differences(anchor, means[mine], colors[mine])[0] for part, mine in rows.items()}
@@ -54,14 +57,14 @@ def absences(problem: Problem, discovery: Discovery, config: PartsConfig) -> Boo
         places = np.asarray(moved.means)
         for part, mine in rows.items():
             here = color_differences(frame, places[mine], colors[mine])[0]
-            if here > _ASTRAY[0] * usual[part] + _ASTRAY[1]:
+            if here > _MISMATCH[0] * usual[part] + _MISMATCH[1]:
                 better = explained.without(frame, t, part)
                 absent[t, part] = absent[before, part] if better is None else better
-    absent = lasting(absent, discovery.done)
+    absent = without_blips(absent, discovery.done)
     return absent if absent.any() else None
 
 
-def lasting(absent: Bool[np.ndarray, "T P"], done: Bool[np.ndarray, "T"]) -> Bool[np.ndarray, "T P"]:
+def without_blips(absent: Bool[np.ndarray, "T P"], done: Bool[np.ndarray, "T"]) -> Bool[np.ndarray, "T P"]:
     """The absences without those of a single frame, between frames in which the part is present.
 
     Args:
@@ -94,7 +97,7 @@ def with_absences(discovery: Discovery, absent: Bool[np.ndarray, "T P"]) -> Disc
     return discovery._replace(quats=quats, translations=translations, absent=absent)
 
 
-class _Explained:
+class _AbsenceTest:
     """Whether pictures are explained better without a part."""
 
     def __init__(self, problem: Problem, discovery: Discovery, config: PartsConfig):
@@ -123,7 +126,7 @@ class _Explained:
             losses[opacity] = sum(
                 self._of(one_camera(seen, c), pose, jnp.asarray(shown)) for c in self._chosen(t)
             )
-        if min(losses.values()) > _LESS * max(losses.values()):
+        if min(losses.values()) > _CONCLUSIVE * max(losses.values()):
             return None
         return losses[0.0] < losses[1.0]
 
@@ -157,4 +160,4 @@ def loss_of_picture(
     """
     scene = posed(canonical, weights, pose, config.blend, opacities=opacities)
     drawn = render(scene, frame.cameras, plan, roi=frame.masks)
-    return picture_loss(drawn, frame, config), drawn.meta
+    return image_loss(drawn, frame, config), drawn.meta

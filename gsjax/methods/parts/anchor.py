@@ -20,7 +20,7 @@ _NOISE_FACTOR = 4.0  # differences above this many times the noise level are mot
 _MOST_FRAMES = 16  # compared with the anchor at full size
 _NEARER = 0.02  # by which an occluder is nearer, at least, relative to the depth behind it
 _AS_FAR = 0.01  # by which the depth of the same surface may differ, relative to it
-_PATTERNED = 0.01  # least contrast of a pattern, relative to the brightness around it
+_LEAST_CONTRAST = 0.01  # least contrast of a pattern, relative to the brightness around it
 _SAME_PATTERN, _OF_CONTRAST = 0.03, 0.7  # by which a pattern may differ: always, and per its contrast
 _SAME_HUE = 0.03  # by which the shares of red, green and blue may differ
 _WINDOW, _AROUND = 7, 5  # pixels over which brightness, and differences, are averaged
@@ -125,7 +125,7 @@ def moved_pixels(
             different = difference_image(now, here) > limit
             if surface is not None and (after := deep(t, c)) is not None:
                 different &= ~_is_covered(surface.depth, after)
-                different &= ~_is_lit_otherwise(surface, _Surface.of(now, after))
+                different &= ~_is_relit(surface, _Surface.of(now, after))
             changed.append(different)
         moved.append(np.array(changed))
     share = np.mean(np.any(moved, axis=1))
@@ -169,13 +169,13 @@ def _is_covered(before: Float[np.ndarray, "H W"], now: Float[np.ndarray, "H W"])
     return (now > 0) & (now < (1 - _NEARER) * before)
 
 
-def _is_lit_otherwise(here: _Surface, now: _Surface) -> Bool[np.ndarray, "H W"]:
+def _is_relit(here: _Surface, now: _Surface) -> Bool[np.ndarray, "H W"]:
     """Where the same surface is seen in other light: as far away, of the same hue, and with the same pattern.
     Surfaces without a pattern are left out, because two of them cannot be told apart."""
     same = (here.depth > 0) & (now.depth > 0) & (np.abs(now.depth - here.depth) < _AS_FAR * here.depth)
     unlike = cv2.blur(np.abs(here.pattern - now.pattern).mean(-1), (_AROUND, _AROUND))
     contrast = np.minimum(here.contrast, now.contrast)
-    alike = (contrast > _PATTERNED) & (unlike < _SAME_PATTERN + _OF_CONTRAST * contrast)
+    alike = (contrast > _LEAST_CONTRAST) & (unlike < _SAME_PATTERN + _OF_CONTRAST * contrast)
     return same & alike & (np.abs(here.hue - now.hue).max(-1) < _SAME_HUE)
 
 

@@ -12,9 +12,9 @@ from gsjax.geometry.cameras import Camera
 from gsjax.methods.parts.anchor import Anchor
 from gsjax.methods.parts.config import PartsConfig
 from gsjax.methods.parts.exposure import AS_GIVEN, exposures_of
-from gsjax.methods.parts.lift import drawn_features, label_votes, lift_masks
+from gsjax.methods.parts.lift import label_votes, lift_masks, render_features
 from gsjax.methods.parts.masks import propagate_masks, view_order
-from gsjax.methods.parts.motion import changes_of, changing_views, divided_where_apart, with_what_moves
+from gsjax.methods.parts.motion import assign_moving_strays, changes_of, changing_views, split_disconnected
 from gsjax.methods.parts.sizes import pixel_width
 from gsjax.methods.parts.stream import Canonical
 from gsjax.methods.parts.trajectory import BACKGROUND
@@ -114,8 +114,8 @@ def begin(
     )
     weights = softmax(np.asarray(logits), axis=-1)
     if moves is not None:
-        weights = with_what_moves(weights, gaussians, moves)
-    weights = divided_where_apart(weights, gaussians)
+        weights = assign_moving_strays(weights, gaussians, moves)
+    weights = split_disconnected(weights, gaussians)
     exposures = exposures_of(drawn, frame) if config.exposures else np.tile(AS_GIVEN, (len(drawn), 1, 1))
     return start_from(anchor, gaussians, weights, frame.cameras, exposures, masks, config, key, lifting)
 
@@ -206,7 +206,7 @@ def _find_masks(
         sums = total.sum(-1, keepdims=True)
         used = np.union1d([BACKGROUND], np.flatnonzero(total.any(0)))
         shares = np.where(sums > 1e-2, total[:, used] / np.maximum(sums, 1e-6), 0.0)
-        shown = drawn_features(gaussians, one_camera(frame.cameras, c), plan, shares)[0]
+        shown = render_features(gaussians, one_camera(frame.cameras, c), plan, shares)[0]
         return np.where(shown.max(-1) > _LEAST_SHOWN, used[shown.argmax(-1)], -1)
 
     return propagate_masks(

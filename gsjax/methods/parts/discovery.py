@@ -223,7 +223,7 @@ def join_parts(
     return _with_parts(discovery, weights, left)._replace(joined=(*discovery.joined, *pairs)), weights
 
 
-def touched_parts(discovery: Discovery, weights: Float[np.ndarray, "M P"], part: int) -> list[int]:
+def adjacent_parts(discovery: Discovery, weights: Float[np.ndarray, "M P"], part: int) -> list[int]:
     """The background, and the parts that a part touches: at least 5 % of its neighbours belong to them.
 
     Args:

@@ -13,7 +13,7 @@ from gsjax.geometry.rotations import quats_to_matrices
 from gsjax.methods.parts.absence import absences, loss_of_picture, with_absences
 from gsjax.methods.parts.config import PartsConfig
 from gsjax.methods.parts.discover import centers_of
-from gsjax.methods.parts.discovery import Discovery, join_parts, touched_parts, weights_of_run
+from gsjax.methods.parts.discovery import Discovery, adjacent_parts, join_parts, weights_of_run
 from gsjax.methods.parts.pictures import Problem, coarse_frame, with_part_masks
 from gsjax.methods.parts.refine import RefineParams, refine_step
 from gsjax.methods.parts.stream import posed
@@ -71,7 +71,7 @@ def prune_parts(
     while before is None or (into != before).any():
         before = into.copy()
         for part in _smallest_first(weights.argmax(-1)):
-            options = {q: moved_weights(weights, part, q) for q in touched_parts(discovery, weights, part)}
+            options = {q: moved_weights(weights, part, q) for q in adjacent_parts(discovery, weights, part)}
             losses = {q: mean_loss(changed) for q, changed in options.items()}
             best = min(losses, key=losses.__getitem__)
             if losses[best] <= (1 + config.unify.least_gain) * here:

@@ -46,7 +46,7 @@ def pixel_votes(
     return np.concatenate(votes, axis=-1)[:, : values.shape[-1]]
 
 
-def drawn_features(
+def render_features(
     gaussians: Gaussians, camera: Camera, plan: Plan, features: Float[np.ndarray, "N K"]
 ) -> Float[np.ndarray, "1 H W K"]:
     """Features of Gaussians rendered for one camera, sum_i w_i f_i; the transpose of `pixel_votes`."""

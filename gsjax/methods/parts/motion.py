@@ -12,7 +12,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from gsjax.geometry.cameras import Camera
-from gsjax.methods.parts.lift import drawn_features, pixel_votes
+from gsjax.methods.parts.lift import pixel_votes, render_features
 from gsjax.methods.parts.trajectory import BACKGROUND
 from gsjax.rasterize.plan import Plan
 from gsjax.scene.frame import one_camera
@@ -20,7 +20,7 @@ from gsjax.scene.gaussians import Gaussians
 from gsjax.scene.render import Rendered
 
 _SMOOTH = 8  # neighbouring Gaussians that are judged together
-_OFTEN = 8  # what may move changes in at least one of so many frames
+_ONE_FRAME_IN = 8  # what may move changes in at least one of so many frames
 _SEEN = 1e-3  # pixels that a Gaussian must cover to provide evidence
 _TOUCHING = 16  # neighbours that may touch a Gaussian
 _LEAST_WEIGHT = 0.1  # of all parts together, below which the masks do not determine the part
@@ -61,7 +61,7 @@ def changes_of(
     seen = votes[:, -1:]
     shares = np.where(seen > _SEEN, votes[:, :-1] / np.maximum(seen, _SEEN), 0.0)
     shares, frames = np.sort(shares, axis=1), moved.shape[1]
-    return Changes(shares[:, -max(1, frames // _OFTEN)], shares[:, (frames - 1) // 2])
+    return Changes(shares[:, -max(1, frames // _ONE_FRAME_IN)], shares[:, (frames - 1) // 2])
 
 
 def changing_views(
@@ -79,12 +79,12 @@ def changing_views(
     """
     views = []
     for c, view in enumerate(drawn):
-        most = drawn_features(gaussians, one_camera(cameras, c), plan, changes.most[:, None])
+        most = render_features(gaussians, one_camera(cameras, c), plan, changes.most[:, None])
         views.append(most[0, ..., 0] >= _LEAST_CHANGE * np.asarray(view.alphas[0]))
     return np.stack(views)
 
 
-def with_what_moves(
+def assign_moving_strays(
     weights: Float[np.ndarray, "N P"], gaussians: Gaussians, moves: Bool[np.ndarray, "N"]
 ) -> Float[np.ndarray, "N P"]:
     """The weights of parts, after moving Gaussians that no mask shows have joined the nearest part that they
@@ -106,7 +106,7 @@ def with_what_moves(
     return weights / weights.sum(-1, keepdims=True)
 
 
-def divided_where_apart(weights: Float[np.ndarray, "N P"], gaussians: Gaussians) -> Float[np.ndarray, "N P"]:
+def split_disconnected(weights: Float[np.ndarray, "N P"], gaussians: Gaussians) -> Float[np.ndarray, "N P"]:
     """The weights of parts, after splitting parts that are not connected: each further connected component
     becomes a part of its own, the largest first, while slots are free. Masks that agree between views by
     chance may tie a ball to somebody's head; no rigid motion fits both.

@@ -20,7 +20,7 @@ from gsjax.methods.parts.stream import (
     Canonical,
     PosedScene,
     StreamParams,
-    picture_loss,
+    image_loss,
     pose_after,
     posed,
     stream_step,
@@ -110,7 +110,7 @@ def refine_step(config: PartsConfig, extra_losses: ExtraLosses = ()) -> Step:
             moved = posed(canonical, batch.weights, pose, config.stream.blend, opacities=batch.shown)
             drawn = render(moved, batch.frame.cameras, batch.plan)
             info: dict[str, Any] = {"overflow": drawn.meta.overflow.any(), "needed": drawn.meta.needed.max()}
-            value = picture_loss(drawn, batch.frame, config.stream)
+            value = image_loss(drawn, batch.frame, config.stream)
             if extra_losses:
                 scene = PosedScene(moved, batch.weights, pose)
                 context = {"index": batch.t, "camera": batch.camera, "progress": batch.progress}

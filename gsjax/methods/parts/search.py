@@ -13,7 +13,7 @@ from scipy.sparse.csgraph import connected_components
 
 from gsjax.geometry.cameras import Camera, project
 from gsjax.geometry.spherical_harmonics import SH_C0
-from gsjax.methods.parts.discovery import Discovery, touched_parts
+from gsjax.methods.parts.discovery import Discovery, adjacent_parts
 from gsjax.methods.parts.trajectory import BACKGROUND
 from gsjax.optim.compiler import host_jit
 from gsjax.scene.frame import Frame
@@ -23,7 +23,7 @@ from gsjax.scene.handles import Blend, HandlePose, skin
 POINTS = 64
 """Number of Gaussians by which a part, or a group of parts, is recognised."""
 _MOST = 0.3  # difference of colours, 0 to 1, that counts as entirely wrong
-_ASTRAY = 1.25, 0.02  # factor on the anchor's difference, and offset, above which a group is searched for
+_MISMATCH = 1.25, 0.02  # factor on the anchor's difference, and offset, above which a group is searched for
 _LEFT = 0.3  # share of the excess over the anchor's difference that may remain at a better place
 _GRIDS = (6.0, 1.0), (1.0, 0.5), (0.5, 0.25)  # reach and spacing of the search grids, in radii of the group
 _NOWHERE = np.zeros((1, 3), np.float32)
@@ -55,7 +55,7 @@ def groups_of(discovery: Discovery) -> list[Group]:
     parts = np.setdiff1d(labels, [BACKGROUND])
     if not len(parts):
         return []
-    touching = [np.isin(parts, touched_parts(discovery, weights, part)) for part in parts.tolist()]
+    touching = [np.isin(parts, adjacent_parts(discovery, weights, part)) for part in parts.tolist()]
     count, group_of = connected_components(coo_array(touching), directed=False)
     means = np.asarray(canonical.movable.means)
     groups = []
@@ -118,7 +118,7 @@ def searched(discovery: Discovery, now: Frame, anchor: Frame, blend: Blend) -> H
         rows = np.resize(group.rows, POINTS)
         usual = color_differences(anchor, means[rows], colors[rows])[0]
         here = color_differences(now, moved[rows], colors[rows])[0]
-        if here <= _ASTRAY[0] * usual + _ASTRAY[1]:
+        if here <= _MISMATCH[0] * usual + _MISMATCH[1]:
             continue
         best, there = _NOWHERE, here
         for reach, spacing in _GRIDS:

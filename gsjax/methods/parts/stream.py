@@ -154,7 +154,7 @@ def valid_pixels(frame: Frame) -> Bool[Array, "C H W"]:
     return jnp.ones(frame.images.shape[:-1], bool) if frame.masks is None else jnp.asarray(frame.masks)
 
 
-def picture_loss(drawn: Rendered, frame: Frame, config: StreamConfig) -> Float[Array, ""]:
+def image_loss(drawn: Rendered, frame: Frame, config: StreamConfig) -> Float[Array, ""]:
     """lambda L1 + (1 - lambda)(1 - SSIM) over the pixels that count, and where cameras measure depth, the
     depth error, which saturates at a limit.
 
@@ -228,7 +228,7 @@ def stream_loss(config: StreamConfig, extra_losses: ExtraLosses = ()) -> Callabl
         weights = skinning_weights(params.field, batch.canonical)
         gaussians = posed(batch.canonical, weights, params.pose, config.blend, params.nudges)
         drawn = render(gaussians, batch.now.cameras, batch.plan, roi=batch.now.masks)
-        value = picture_loss(drawn, batch.now, config)
+        value = image_loss(drawn, batch.now, config)
         fixed = jax.lax.stop_gradient(weights)  # the tear penalty moves handles and leaves weights alone
         scale = config.tear_scale * batch.canonical.pixel
         info: dict[str, Any] = {
@@ -245,7 +245,7 @@ def stream_loss(config: StreamConfig, extra_losses: ExtraLosses = ()) -> Callabl
             for frame, pose in batch.past:
                 then = posed(batch.canonical, weights, jax.lax.stop_gradient(pose), config.blend)
                 before = render(then, frame.cameras, batch.past_plan, roi=frame.masks)
-                past.append(picture_loss(before, frame, config))
+                past.append(image_loss(before, frame, config))
                 overflow.append(before.meta.overflow.any())
                 needed.append(before.meta.needed.max())
             info["past"] = jnp.stack(past).mean()

@@ -209,7 +209,7 @@ def align(
     return best.twist
 
 
-def align_from_afar(
+def align_coarse_to_fine(
     twist: Float[Array, "6"],
     points: Points,
     center: Float[Array, "3"],
@@ -246,7 +246,7 @@ def principal_axes(points: Points, center: Float[Array, "3"]) -> Float[Array, "3
     return vectors.T
 
 
-def turn_hypotheses(
+def rotation_hypotheses(
     twist: Float[Array, "6"], axes: Float[Array, "3 3"], angles: tuple[float, ...]
 ) -> Float[Array, "h 6"]:
     """The twist itself, and the twist after a rotation by plus or minus each angle about each of the axes."""

@@ -56,7 +56,7 @@ def ladder(config: TrackConfig, num_cameras: int) -> dict[str, TrackConfig]:
     return rungs
 
 
-def not_used(config: TrackConfig) -> list[str]:
+def unused_settings(config: TrackConfig) -> list[str]:
     """Names of settings that are not the default and that no rung of `ladder` adopts."""
     mine, usual = _flat(config), _flat(TrackConfig())
     differ = [name for name in mine if mine[name] != usual[name]]

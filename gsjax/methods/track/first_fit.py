@@ -13,7 +13,7 @@ import numpy as np
 from gsjax.geometry.neighbors import on_surfaces
 from gsjax.losses.photometric import photometric_loss, truncated_l1
 from gsjax.methods.track.config import TrackConfig
-from gsjax.methods.track.frames import first_seen
+from gsjax.methods.track.frames import prepared_first
 from gsjax.methods.track.lost import MIN_POINTS
 from gsjax.methods.track.scene import TrackedScene, labelled_cloud, scene_from_cloud
 from gsjax.optim.compiler import host_options
@@ -52,7 +52,7 @@ def start_scene(
         ValueError: there is no depth, the mask does not fit the images, or cameras are fisheyes.
     """
     config = TrackConfig() if config is None else config
-    frame = first_seen(frame)
+    frame = prepared_first(frame)
     if frame.depths is not None:
         frame = eqx.tree_at(lambda f: f.depths, frame, jnp.asarray(_surfaces(np.asarray(frame.depths))))
     scene = scene_from_cloud(labelled_cloud(frame, mask, mask_camera, config.start), config.start)

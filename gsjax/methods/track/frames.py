@@ -37,7 +37,7 @@ def expect_pinholes(frame: Frame) -> None:
         )
 
 
-def first_seen(frame: Frame) -> Frame:
+def prepared_first(frame: Frame) -> Frame:
     """The first frame, from which a scene starts, as floats and without pixels that are not finite; a warning
     reports their number. On the host.
 

@@ -74,7 +74,7 @@ def tones(colors: Float[Array, "*n 3"], shading: float) -> Float[Array, "*n 3"]:
     return logs - (1 - shading) * mean[..., None]
 
 
-def where_groups(chosen: Bool[Array, "k"], a: Shaped[Array, "k *d"], b: Shaped[Array, "k *d"]):
+def select_groups(chosen: Bool[Array, "k"], a: Shaped[Array, "k *d"], b: Shaped[Array, "k *d"]):
     """The rows of `a` for the chosen groups and of `b` for the others."""
     return jnp.where(chosen.reshape(-1, *[1] * (a.ndim - 1)), a, b)
 
@@ -177,7 +177,7 @@ def first_keyframe(pixels: Points) -> Keyframe:
     return Keyframe(pixels, unturned)
 
 
-def turn_since(keyframe: Keyframe) -> Float[Array, "k"]:
+def angle_since(keyframe: Keyframe) -> Float[Array, "k"]:
     """Angle by which each group has rotated since its keyframe, radians."""
     return 2 * jnp.arccos(jnp.clip(jnp.abs(keyframe.turned[:, 0]), 0.0, 1.0))
 
@@ -185,7 +185,7 @@ def turn_since(keyframe: Keyframe) -> Float[Array, "k"]:
 def faded(keyframe: Keyframe, max_turn: float) -> Points:
     """The keyframe's points, with weights that fade to 0 as a group rotates by `max_turn`, radians, because
     it is then lit differently."""
-    share = jnp.clip(1 - turn_since(keyframe) / max(max_turn, 1e-9), 0.0, 1.0)
+    share = jnp.clip(1 - angle_since(keyframe) / max(max_turn, 1e-9), 0.0, 1.0)
     return keyframe.points._replace(seen=keyframe.points.seen * share[:, None, None])
 
 
@@ -194,9 +194,9 @@ def renewed(
 ) -> Keyframe:
     """The keyframe, replaced by `pixels` for groups that have rotated by more than `max_turn`, radians, and
     so show other sides, and for `relocated` ones, whose keyframe shows something else."""
-    old = turn_since(keyframe) > max_turn
+    old = angle_since(keyframe) > max_turn
     old = old if relocated is None else old | relocated
-    return jax.tree.map(lambda new, kept: where_groups(old, new, kept), first_keyframe(pixels), keyframe)
+    return jax.tree.map(lambda new, kept: select_groups(old, new, kept), first_keyframe(pixels), keyframe)
 
 
 def carry_keyframe(keyframe: Keyframe, twists: Float[Array, "k 6"], centers: Float[Array, "k 3"]) -> Keyframe:

@@ -18,11 +18,11 @@ from jaxtyping import Array, Bool, Float, Key
 
 from gsjax.methods.track.align import (
     align,
-    align_from_afar,
+    align_coarse_to_fine,
     coarse_shifts,
     compose,
     principal_axes,
-    turn_hypotheses,
+    rotation_hypotheses,
 )
 from gsjax.methods.track.config import AlignConfig
 from gsjax.methods.track.layers import Shown
@@ -125,11 +125,11 @@ def recover(
         """The best of the twists tried so far, and rotations of these."""
         twists, confidence = places(tried, few, partial(align, widen=config.widen))
         best = best_distinct(beam, twists, evidence(confidence), config)
-        turned = [turn_hypotheses(twist, axes, turns) if turns else twist[None] for twist in best]
+        turned = [rotation_hypotheses(twist, axes, turns) if turns else twist[None] for twist in best]
         return padded(jnp.concatenate(turned))
 
     tried = jax.lax.fori_loop(0, 1 + (_ROUNDS if turns else 0), one_round, padded(tried))
-    twists, confidence = places(jnp.stack([guess, tried[0]]), reference, align_from_afar)
+    twists, confidence = places(jnp.stack([guess, tried[0]]), reference, align_coarse_to_fine)
     best = jnp.argmax(evidence(confidence))
     of_guess = jnp.argmax(evidence(confidence).at[1::2].set(-1.0))  # the guess as it is, and aligned
     of_best = jax.tree.map(lambda a: a[best], confidence)
@@ -252,12 +252,12 @@ def guesses_spun(
     flips, spins = turns * flips[index // 3 % 4], turns * angles * axes[index % 3]
     last = jaxlie.SO3.exp(guess[3:])
     spun = last @ jaxlie.SO3.exp(flips) @ jaxlie.SO3.exp(spins)
-    arm = middle_of_solid(reference) - center
+    arm = solid_center(reference) - center
     stays = guess[:3] + last.apply(arm) - spun.apply(jnp.broadcast_to(arm, (count, 3)))
     return jnp.concatenate([stays, spun.log()], axis=1)
 
 
-def middle_of_solid(reference: ReferencePoints) -> Float[Array, "3"]:
+def solid_center(reference: ReferencePoints) -> Float[Array, "3"]:
     """The middle of an object of which some sides are known, metres: the point at the same distance below all
     of them, by least squares over the point and the distance. Without normals, their centroid."""
     weights = reference.real / jnp.maximum(reference.real.sum(), 1)

@@ -122,7 +122,7 @@ def _thin(cloud: Cloud, chosen: np.ndarray, pixels: float) -> np.ndarray:
     return np.concatenate(kept)
 
 
-def _bodies(cloud: Cloud, config: StartConfig) -> list[tuple[int, np.ndarray]]:
+def _rigid_parts(cloud: Cloud, config: StartConfig) -> list[tuple[int, np.ndarray]]:
     """(mask value, mask of its points) of every rigid body; the background comes last.
 
     Objects too large to be rigid are divided by k-means into parts, which keep the mask value.
@@ -148,7 +148,7 @@ def _bodies(cloud: Cloud, config: StartConfig) -> list[tuple[int, np.ndarray]]:
 def scene_from_cloud(cloud: Cloud, config: StartConfig) -> TrackedScene:
     """Thin the cloud, objects less than the background, and turn each point into a disc on its surface."""
     parts, labels, towards, label_ids = [], [], [], [0]
-    for value, chosen in _bodies(cloud, config):
+    for value, chosen in _rigid_parts(cloud, config):
         kept = _thin(cloud, chosen, config.object_pixels if value else config.background_pixels)
         part = gaussians_from_points(cloud.points[kept], cloud.colors[kept], normals="pca")
         if value:

@@ -18,11 +18,11 @@ from jaxtyping import Array, Bool, Float, Int
 
 from gsjax.methods.track.align import (
     align,
-    align_from_afar,
+    align_coarse_to_fine,
     coarse_shifts,
     disagreement,
     principal_axes,
-    turn_hypotheses,
+    rotation_hypotheses,
 )
 from gsjax.methods.track.config import AlignConfig
 from gsjax.methods.track.lost import Confidence
@@ -35,13 +35,13 @@ _DOUBT_WEIGHT = 0.5  # urgency of being in doubt, relative to a residual at its 
 _WAIT_WEIGHT = 0.05  # urgency of each frame of waiting, relative to a residual at its usual value
 _FIRST_WEIGHT = 1e3  # urgency of groups that must not wait, likewise
 _RELOCATION_COST = 2  # a relocation takes as long as trying the rotations of two to three groups
-_DISTINCT_TURN = 0.14  # radians; orientations further apart than this are distinct
+_DISTINCT_ANGLE = 0.14  # radians; orientations further apart than this are distinct
 _IMPROVED = 0.9  # a search found a better place if it lowered the residual by this factor
 _MAX_OWN_RESIDUAL = 0.5  # above this a group is occluded or elsewhere, and its orientation is not known
 
 
-align_groups = jax.vmap(align_from_afar, in_axes=(0, 0, 0, None, None))
-"""`align_from_afar` of many groups, each from its own start."""
+align_groups = jax.vmap(align_coarse_to_fine, in_axes=(0, 0, 0, None, None))
+"""`align_coarse_to_fine` of many groups, each from its own start."""
 disagreements = jax.vmap(disagreement, in_axes=(0, 0, 0, None, None))
 """`disagreement` of many groups, each after its own twist."""
 
@@ -59,13 +59,13 @@ def _every(step: int, points: Points) -> Points:
     return jax.tree.map(lambda a: a[..., ::step], points)
 
 
-def _judged(twists: Float[Array, "h 6"], *where, widen: float = 1.0) -> Float[Array, "h"]:
+def _residuals_at(twists: Float[Array, "h 6"], *where, widen: float = 1.0) -> Float[Array, "h"]:
     """`disagreement` of one group after each of many twists; `where` has its other arguments."""
     return jax.vmap(lambda twist: disagreement(twist, *where, widen))(twists)
 
 
 def _better(known: Estimate, twist: Float[Array, "6"], *where) -> Estimate:
-    """`known` or, if that agrees better, the estimate after `twist`; `where` as for `_judged`."""
+    """`known` or, if that agrees better, the estimate after `twist`; `where` as for `_residuals_at`."""
     residuals = jnp.stack([known.residuals, disagreement(twist, *where)])
     return best_of(residuals, jnp.stack([known.twists, twist]))
 
@@ -95,15 +95,17 @@ def search_shifts(
     few, count = _every(4, points), len(starts)
     shifted = [starts[i] + shifts[i::count] for i in range(count)]
     ends = np.cumsum([*map(len, shifted)])[:-1]
-    residuals = _judged(jnp.concatenate(shifted), few, center, images, config, widen=config.widen)
+    residuals = _residuals_at(jnp.concatenate(shifted), few, center, images, config, widen=config.widen)
     parts = jnp.split(residuals, ends)
     tried = jnp.stack([best_of(*part).twists for part in zip(parts, shifted, strict=True)])
-    tried = jax.vmap(align_from_afar, in_axes=(0, None, None, None, None))(tried, few, center, images, config)
-    best = best_of(_judged(tried, few, center, images, config), tried)
+    tried = jax.vmap(align_coarse_to_fine, in_axes=(0, None, None, None, None))(
+        tried, few, center, images, config
+    )
+    best = best_of(_residuals_at(tried, few, center, images, config), tried)
     return _better(known, align(best.twists, points, center, images, config), points, center, images, config)
 
 
-def search_turns(
+def search_rotations(
     known: Estimate,
     starts: Float[Array, "h 6"],
     points: Points,
@@ -136,15 +138,15 @@ def search_turns(
         return over_twists(twists, half, center, images, config, config.widen)
 
     tried = aligned(jnp.concatenate([starts, known.twists[None]]))
-    residuals = _judged(tried, half, center, images, config)
+    residuals = _residuals_at(tried, half, center, images, config)
     if config.max_turn and config.turns:
         axes = principal_axes(points, center)
-        tried = aligned(turn_hypotheses(best_of(residuals, tried).twists, axes, config.turns))
-        residuals = _judged(tried, half, center, images, config)
+        tried = aligned(rotation_hypotheses(best_of(residuals, tried).twists, axes, config.turns))
+        residuals = _residuals_at(tried, half, center, images, config)
     last = align(best_of(residuals, tried).twists, points, center, images, config)
     best = _better(known, last, points, center, images, config)
     apart = jaxlie.SO3.exp(best.twists[3:]).inverse() @ jaxlie.SO3.exp(tried[:, 3:])
-    distinct = jnp.linalg.norm(apart.log(), axis=-1) > _DISTINCT_TURN
+    distinct = jnp.linalg.norm(apart.log(), axis=-1) > _DISTINCT_ANGLE
     rival = jnp.min(jnp.where(distinct, residuals, 1.0))
     own = disagreement(best.twists, half, center, images, config)
     return best, jnp.where(own < _MAX_OWN_RESIDUAL, (rival - own) / (1 - own), jnp.inf)
@@ -247,7 +249,7 @@ def search(
 
         def turned():
             known, own = jax.tree.map(lambda a: a[group], (estimate, points))
-            better, lead = search_turns(known, starts[:, group], own, centers[group], images, config)
+            better, lead = search_rotations(known, starts[:, group], own, centers[group], images, config)
             return _with_group(estimate, group, better), leads.at[group].set(lead)
 
         if relocate is None:

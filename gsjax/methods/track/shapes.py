@@ -25,7 +25,7 @@ from gsjax.geometry.spherical_harmonics import rgb_to_sh0
 from gsjax.methods.track.align import bilinear, pixel_position
 from gsjax.methods.track.config import TrackConfig
 from gsjax.methods.track.first_fit import fit_scene
-from gsjax.methods.track.frames import first_seen
+from gsjax.methods.track.frames import prepared_first
 from gsjax.methods.track.layers import render_labels
 from gsjax.methods.track.motion import Motion, first_pose, move, place
 from gsjax.methods.track.refine import RefineBatch, refine
@@ -109,7 +109,7 @@ def scene_from_shapes(
             no pose, or cameras are fisheyes.
     """
     config = TrackConfig() if config is None else config
-    frame = first_seen(frame)
+    frame = prepared_first(frame)
     background = [s for s in shapes if not s.label]
     if len(background) == len(shapes):
         raise ValueError("shapes: expected an object, a shape with a label above 0, found none")

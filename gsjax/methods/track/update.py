@@ -16,8 +16,8 @@ from gsjax.methods.track.motion import group_means
 from gsjax.methods.track.points import tone_images
 from gsjax.methods.track.reference import reference_points
 from gsjax.methods.track.stages.context import UpdateContext
-from gsjax.methods.track.stages.follow import align_and_search, look_back, refine_motion, starting_points
-from gsjax.methods.track.stages.settle import detect_lost, remember
+from gsjax.methods.track.stages.follow import align_and_search, last_view, motion_hypotheses, refine_motion
+from gsjax.methods.track.stages.settle import detect_lost, store_state
 from gsjax.methods.track.state import TrackBatch, Tracked, TrackState, blank_state
 from gsjax.optim.step import Step, all_finite, keep_if
 
@@ -84,12 +84,12 @@ def track_step(
             images = tone_images(frame, config.align.shading)
             reference = reference_points(scene, pose, config.align)
             now = UpdateContext(scene, pose, state, frame, batch.plan, images, centers, reference)
-            past = look_back(now, config)
-            starts = starting_points(now, past, config, reduction)
+            past = last_view(now, config)
+            starts = motion_hypotheses(now, past, config, reduction)
             alignment = align_and_search(now, past, starts, everywhere, key, config)
             refined = refine_motion(now, past, starts, alignment, config, extra_losses)
             settled = detect_lost(now, past, alignment, refined, config)
-            pose, new_state, shown, needed = remember(now, past, alignment, refined, settled, config)
+            pose, new_state, shown, needed = store_state(now, past, alignment, refined, settled, config)
 
         overflow = needed.exceeds(batch.plan)
         readable = (broken < frame.images.size // 3) & all_finite((frame.cameras.viewmat, frame.cameras.K))

@@ -27,9 +27,9 @@ MOVED_FACTOR = 2.0
 """The same above which it has just moved."""
 _CALM_FACTOR = 1.25  # the same below which it agrees as usual
 _FAR_OFF_FACTOR, _FAR_OFF = 4.0, 0.3  # the same, and the residual itself, above which it is far off
-TURN_KNOWN = 0.045
+MIN_LEAD = 0.045
 """Lead above which a group's orientation is known; docs/results-hard-cases.md has leads of both kinds."""
-_FOUND_TURN_AGREEMENT = 0.65  # agreement above which the orientation of a group that was found is trusted
+_TRUSTED_AGREEMENT = 0.65  # agreement above which the orientation of a group that was found is trusted
 
 
 class Estimate(NamedTuple):
@@ -113,12 +113,12 @@ class Watch(NamedTuple):
         lost = jnp.where(conclusive, lost, self.lost)
 
         confirmed = (self.probation == 1) & jnp.isfinite(result.leads) & conclusive
-        confirmed &= agreement > _FOUND_TURN_AGREEMENT
+        confirmed &= agreement > _TRUSTED_AGREEMENT
         passed = (self.probation > 1) & result.relocation_tried & ~elsewhere
         probation = self.probation - (passed | confirmed)
         probation = jnp.where(self.lost | relocated, 1.0 + searches, probation)
         probation = jnp.where(lost, 0.0, probation)
-        turn_known = (self.turn_known | confirmed) & (probation == 0) & (result.leads > TURN_KNOWN) & ~lost
+        turn_known = (self.turn_known | confirmed) & (probation == 0) & (result.leads > MIN_LEAD) & ~lost
 
         found_elsewhere = elsewhere & is_found(result.relocation.confidence, self.showed)
         residuals = jnp.maximum(residuals, _RESIDUAL_FLOOR)

@@ -6,7 +6,7 @@ import jax
 import numpy as np
 import pytest
 
-from gsjax.engine.files import about_scene
+from gsjax.engine.files import relative_to_scene
 from gsjax.engine.parts.films import edited
 from gsjax.engine.parts.saved import open_parts_run
 from gsjax.methods.parts.timeline import parse_script
@@ -28,7 +28,7 @@ def test_points_are_in_the_coordinates_of_the_data_also_far_from_0(tmp_path):
     """
     near = open_parts_run(write_run(tmp_path / "run"))
     origin = np.array([5e6, 0.0, 0.0])
-    far = replace(near, recording=about_scene(near.recording, origin))
+    far = replace(near, recording=relative_to_scene(near.recording, origin))
     other = write_run(tmp_path / "other")
     far_other = write_run(tmp_path / "far", origin=origin)
     expected, _ = edited(parse_script(text % (0.5, other, 1.5, 0.25)), near)

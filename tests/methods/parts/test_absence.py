@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from gsjax.engine.drive import drive
 from gsjax.methods.parts import RefineConfig
-from gsjax.methods.parts.absence import lasting
+from gsjax.methods.parts.absence import without_blips
 from tests.methods.parts.moving_boxes import Box, MovingBoxes, linear
 from tests.methods.parts.test_follow import CONFIG, begun
 
@@ -73,7 +73,7 @@ def test_it_can_be_left_alone():
 @given(st.lists(st.booleans(), min_size=3, max_size=12))
 def test_what_lasts_for_a_frame_alone_is_no_absence(there):
     absent = np.array(there)[:, None]
-    kept = lasting(absent, np.ones(len(there), bool))
+    kept = without_blips(absent, np.ones(len(there), bool))
     assert not (kept & ~absent).any()
     padded = np.concatenate([[False], absent[:, 0], [False]])
     alone = padded[1:-1] & ~padded[:-2] & ~padded[2:]

@@ -24,7 +24,7 @@ from gsjax.methods.parts import (
     order_of_frames,
     prune_parts,
 )
-from gsjax.methods.parts.discovery import close_frame, join_parts, touched_parts, weights_of_run
+from gsjax.methods.parts.discovery import adjacent_parts, close_frame, join_parts, weights_of_run
 from gsjax.methods.parts.finish import cut_weights, moved_weights
 from gsjax.methods.parts.pictures import Problem
 from gsjax.methods.parts.timeline import apply, parse_script
@@ -213,8 +213,8 @@ def test_parts_that_are_touched(halves):
     parts, weights = halves.parts, halves.weights
     labels = weights.argmax(-1)
     one, other = sorted(set(np.unique(labels).tolist()) - {BACKGROUND})
-    assert touched_parts(parts, weights, one) == [BACKGROUND]  # the boxes do not touch each other
-    assert other not in touched_parts(parts, weights, one)
+    assert adjacent_parts(parts, weights, one) == [BACKGROUND]  # the boxes do not touch each other
+    assert other not in adjacent_parts(parts, weights, one)
     np.testing.assert_allclose(moved_weights(weights, one, other).sum(-1), 1, rtol=1e-5)
     assert (moved_weights(weights, one, other)[:, one] == 0).all()
 

@@ -9,7 +9,7 @@ from gsjax.methods.parts import BACKGROUND, DiscoverConfig, PartsConfig, begin, 
 from gsjax.methods.parts.anchor import Anchor
 from gsjax.methods.parts.discovery import initial_run
 from gsjax.methods.parts.exposure import corrected, exposures_of
-from gsjax.methods.parts.motion import changes_of, changing_views, divided_where_apart, with_what_moves
+from gsjax.methods.parts.motion import assign_moving_strays, changes_of, changing_views, split_disconnected
 from gsjax.methods.parts.search import groups_of, searched
 from gsjax.scene.feature_grid import FeatureGridConfig
 from gsjax.scene.frame import Frame, one_camera
@@ -60,18 +60,18 @@ def test_what_leaves_changes_and_what_is_covered_for_a_while_does_not(boxes, cha
 def test_what_does_not_hang_together_is_not_one_part(boxes):
     moving = (boxes.bodies > 0).astype(int)  # two boxes as one part, by mistake
     weights = np.eye(4, dtype=np.float32)[moving] * 0.9 + 0.025
-    divided = divided_where_apart(weights, boxes.gaussians)
+    divided = split_disconnected(weights, boxes.gaussians)
     np.testing.assert_allclose(divided.sum(-1), 1, rtol=1e-6)
     labels = divided.argmax(-1)
     assert ((labels == BACKGROUND) == (boxes.bodies == 0)).all()
     assert all(len(np.unique(labels[boxes.bodies == body])) == 1 for body in (1, 2))
     assert len(np.unique(labels)) == 3
-    np.testing.assert_array_equal(divided_where_apart(divided, boxes.gaussians), divided)
+    np.testing.assert_array_equal(split_disconnected(divided, boxes.gaussians), divided)
     full = weights[:, :2] / weights[:, :2].sum(-1, keepdims=True)
-    np.testing.assert_array_equal(divided_where_apart(full, boxes.gaussians), full)  # no slot is free
+    np.testing.assert_array_equal(split_disconnected(full, boxes.gaussians), full)  # no slot is free
     few = np.flatnonzero(boxes.bodies == 2)[15:]
     weights[few] = np.eye(4)[BACKGROUND]
-    assert divided_where_apart(weights, boxes.gaussians)[boxes.bodies == 2].argmax(-1)[:15].max() == 1
+    assert split_disconnected(weights, boxes.gaussians)[boxes.bodies == 2].argmax(-1)[:15].max() == 1
 
 
 @pytest.mark.thorough
@@ -88,7 +88,7 @@ def test_what_moves_joins_the_part_that_it_touches(boxes):
     left = np.asarray(boxes.gaussians.means)[:, 1] < boxes.boxes[0].center[1]
     known = (boxes.bodies == 1) & left
     weights = np.eye(4, dtype=np.float32)[np.where(known, 1, 0)]
-    found = with_what_moves(weights, boxes.gaussians, boxes.bodies > 0)
+    found = assign_moving_strays(weights, boxes.gaussians, boxes.bodies > 0)
     np.testing.assert_allclose(found.sum(-1), 1, rtol=1e-6)
     labels = found.argmax(-1)
     assert set(labels[boxes.bodies == 1]) == {1}

@@ -9,7 +9,7 @@ from gsjax.geometry.cameras import Camera, intrinsics
 from gsjax.methods.parts.anchor import Anchor, choose_anchor, difference_image, moved_pixels
 from gsjax.methods.parts.config import DiscoverConfig, PartsConfig
 from gsjax.methods.parts.discover import begin
-from gsjax.methods.parts.lift import drawn_features, label_votes, lift_masks, pixel_votes
+from gsjax.methods.parts.lift import label_votes, lift_masks, pixel_votes, render_features
 from gsjax.methods.parts.masks import (
     masks_from_labels,
     moving_segments,
@@ -193,7 +193,7 @@ def test_many_labels_are_voted_for_and_drawn_like_few(boxes):
             votes[:, some], pixel_votes(boxes.gaussians, view, plan, values), atol=1e-6
         )
     features = np.random.default_rng(1).random((boxes.gaussians.num, count), np.float32)
-    drawn = drawn_features(boxes.gaussians, view, plan, features)
+    drawn = render_features(boxes.gaussians, view, plan, features)
     values = np.random.default_rng(2).random(drawn.shape, np.float32)
     there = (pixel_votes(boxes.gaussians, view, plan, values) * features).sum()
     assert there == pytest.approx((drawn * values).sum(), rel=1e-4)  # one is the other's transpose

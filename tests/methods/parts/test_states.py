@@ -22,16 +22,16 @@ from gsjax.methods.parts.states.registration import (
     matched,
     moved,
     registered,
-    turned,
+    rotated_normals,
 )
 from gsjax.methods.parts.states.surfaces import (
     Surface,
     around,
+    color_distance,
+    denoised,
     evidence,
     pixel_width,
-    steadied,
     surface_of,
-    unlike,
 )
 from gsjax.metrics.tracking import relative_motion
 from gsjax.scene.initialize import gaussians_from_points
@@ -121,12 +121,12 @@ def test_depth_may_be_noisy(cabinet):
     found = states_of(*frames)
     assert len(found.motions) == 3
     assert worst_gap(found, cabinet) < 0.5
-    steady, exact = np.asarray(steadied(frames[0]).depths), np.asarray(cabinet.frame(0).depths)
+    steady, exact = np.asarray(denoised(frames[0]).depths), np.asarray(cabinet.frame(0).depths)
     off = [
         np.median(np.abs(depths[exact > 0] / exact[exact > 0] - 1)) for depths in (steady, frames[0].depths)
     ]
     assert off[0] < 0.7 * off[1]
-    np.testing.assert_array_equal(steadied(cabinet.frame(0)).depths, exact)
+    np.testing.assert_array_equal(denoised(cabinet.frame(0)).depths, exact)
 
 
 def test_where_nothing_has_moved_that_is_said(cabinet):
@@ -149,8 +149,8 @@ def test_what_is_lit_otherwise_after_its_motion_is_as_like_as_before(corner):
     lit = np.array([2.0, 1.0, 0.5])[np.abs(corner.normals).argmax(-1)]
     after = part._replace(colors=lit[:, None] * colors, brightness=lit * part.brightness)
     target = Target(after, 0.005, after.points.min(0) - 0.1, after.points.max(0) + 0.1)
-    assert np.median(matched(np.eye(4), part, target, 0.01).unlike) < 0.01
-    assert np.median(unlike(part.colors, after.colors)) > 0.1
+    assert np.median(matched(np.eye(4), part, target, 0.01).color_distance) < 0.01
+    assert np.median(color_distance(part.colors, after.colors)) > 0.1
 
 
 def test_edges_tell_where_a_plain_plate_lies_within_its_plane(corner):
@@ -220,7 +220,7 @@ def test_a_motion_near_a_guess_is_found(corner, seed):
     true[:3, 3] = random.normal(size=3)
     off[:3, :3] = Rotation.from_rotvec(0.03 * random.normal(size=3)).as_matrix()
     off[:3, 3] = 0.01 * random.normal(size=3)
-    after = corner._replace(points=moved(true, corner.points), normals=turned(true, corner.normals))
+    after = corner._replace(points=moved(true, corner.points), normals=rotated_normals(true, corner.normals))
     target = Target(after, 0.005, after.points.min(0) - 0.1, after.points.max(0) + 0.1)
     result = registered(true @ off, corner, target, 0.05, 0.01, rounds=25)
     assert gap(result, true, corner.points) < 1.5e-3
@@ -232,7 +232,7 @@ def test_a_plate_that_may_slide_along_its_hinge_does_not(corner):
     true, guess = np.eye(4), np.eye(4)
     true[:3, :3] = Rotation.from_rotvec([0, 0, 1.0]).as_matrix()
     guess[:3, :3], guess[:3, 3] = true[:3, :3], (0, 0, 0.03)
-    after = face._replace(points=moved(true, face.points), normals=turned(true, face.normals))
+    after = face._replace(points=moved(true, face.points), normals=rotated_normals(true, face.normals))
     target = Target(after, 0.005, after.points.min(0) - 0.1, after.points.max(0) + 0.1)
     assert abs(registered(guess, face, target, 0.05, 0.01, rounds=30)[2, 3]) < 2e-3
 

@@ -12,7 +12,7 @@ from gsjax.methods.track.align import (
     ball_grid,
     bilinear,
     pixel_position,
-    turn_hypotheses,
+    rotation_hypotheses,
 )
 from gsjax.methods.track.points import Points, carry
 from tests.methods.track.carton import CONFIG, SIZE, error, gap, see
@@ -141,7 +141,7 @@ def test_a_ball_grid_holds_the_origin_and_nothing_outside():
 @pytest.mark.thorough
 def test_turn_hypotheses_hold_the_start_and_turns_about_its_own_axes():
     twist = np.float32([0.1, 0.2, 0.3, 0.0, 0.0, 0.4])
-    turned = jax.jit(turn_hypotheses, static_argnums=2)
+    turned = jax.jit(rotation_hypotheses, static_argnums=2)
     hypotheses = np.asarray(turned(twist, np.eye(3, dtype=np.float32), (0.2, 0.6)))
     assert hypotheses.shape == (13, 6)
     np.testing.assert_allclose(hypotheses[0], twist, atol=1e-6)

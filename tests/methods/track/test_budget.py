@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 
 from gsjax import track
 from gsjax.methods.track import PRESETS, GrowConfig, StartConfig, TrackConfig
-from gsjax.methods.track.budget import Costs, Governor, choose, ladder, not_used
+from gsjax.methods.track.budget import Costs, Governor, choose, ladder, unused_settings
 
 RUNGS = ladder(TrackConfig(), 3)
 NAMES = list(RUNGS)
@@ -109,12 +109,12 @@ def test_a_budget_of_nothing_is_refused(table, started):
 
 
 def test_settings_that_a_budget_does_not_use_are_named():
-    assert not_used(TrackConfig()) == []
-    assert "refine.iterations" in not_used(PRESETS["paper"])
+    assert unused_settings(TrackConfig()) == []
+    assert "refine.iterations" in unused_settings(PRESETS["paper"])
     mine = TrackConfig(
         start=StartConfig(iterations=3), grow=GrowConfig(slots=9, reach=7), seed=4, headroom=3.0, coarseness=7
     )
-    assert not_used(mine) == ["grow.reach", "coarseness"]
+    assert unused_settings(mine) == ["grow.reach", "coarseness"]
 
 
 @pytest.mark.filterwarnings("ignore:under a budget")
@@ -129,7 +129,7 @@ def test_costs_are_measured_with_the_second_frame(table, started, monkeypatch):
     def measured(start, second, config):
         raise Measured(second)
 
-    monkeypatch.setattr("gsjax.engine.track.tracking._measured", measured)
+    monkeypatch.setattr("gsjax.engine.track.tracking._measured_costs", measured)
     for following, expected in ((frames[1:], frames[1]), ([], frames[0])):
         with pytest.raises(Measured) as seen:
             next(track(started, frames[0], following, budget_ms=33.0))

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from gsjax.methods.track import PRESETS
 from gsjax.methods.track.align import ball_grid
-from gsjax.methods.track.recover import guesses_near, guesses_spun, middle_of_solid
+from gsjax.methods.track.recover import guesses_near, guesses_spun, solid_center
 from gsjax.methods.track.reference import ReferencePoints
 
 
@@ -41,7 +41,7 @@ def can_shell(seed=0, count=64):
 
 
 def test_the_middle_of_a_solid_is_behind_the_sides_that_are_known():
-    find = jax.jit(middle_of_solid)
+    find = jax.jit(solid_center)
     reference, middle = can_shell()
     np.testing.assert_allclose(find(reference)[:2], middle[:2], atol=6e-3)
     assert np.linalg.norm(reference.means.mean(1)[:2] - middle[:2]) > 0.015
@@ -64,7 +64,7 @@ def test_guesses_that_spin_keep_the_middle_and_turn_by_any_angle_either_way_up()
     center = reference.means.mean(1)
     draw = jax.jit(guesses_spun, static_argnums=(1, 6))
     drawn = np.asarray(draw(jax.random.key(0), 120, np.eye(3), reference, center, guess, config))
-    middle = np.asarray(jax.jit(middle_of_solid)(reference))
+    middle = np.asarray(jax.jit(solid_center)(reference))
 
     def place(twists):
         return Rotation.from_rotvec(twists[:, 3:]).apply(middle - center) + center + twists[:, :3]

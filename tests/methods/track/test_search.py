@@ -15,7 +15,7 @@ from gsjax.methods.track.points import Points, carry, pixels_of_groups, tones
 from gsjax.methods.track.recover import Relocation
 from gsjax.methods.track.search import best_of, follow
 from gsjax.methods.track.search import search as search_from
-from gsjax.methods.track.watch import TURN_KNOWN, SearchResult, first_watch
+from gsjax.methods.track.watch import MIN_LEAD, SearchResult, first_watch
 from tests.methods.track.carton import CONFIG, SIZE, error, gap, middle, see
 
 
@@ -227,7 +227,7 @@ def test_only_without_a_print_do_other_orientations_agree_as_well(table, printed
     points = picked(seen, mine.astype(np.int32), frame.depths, 1, CONFIG)
     points = jax.tree.map(lambda a: np.asarray(a)[0], points)
     result = search_one(points, middle(points).astype(np.float32), seen)
-    assert (float(result.leads[0]) > TURN_KNOWN) == printed
+    assert (float(result.leads[0]) > MIN_LEAD) == printed
     assert np.linalg.norm(np.asarray(result.estimate.twists)[0, :3]) < 1e-3
 
 

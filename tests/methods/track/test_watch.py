@@ -5,7 +5,7 @@ import numpy as np
 
 from gsjax.methods.track.lost import Confidence
 from gsjax.methods.track.recover import Relocation
-from gsjax.methods.track.watch import TURN_KNOWN, Estimate, SearchResult, first_watch
+from gsjax.methods.track.watch import MIN_LEAD, Estimate, SearchResult, first_watch
 
 
 def test_a_watch_records_usual_residuals_and_waiting_times():
@@ -97,7 +97,7 @@ def test_what_was_found_is_on_probation_until_searches_find_nothing_better_and_t
     told = after(watch, leads=0.2)
     assert told.turn_known[0]
     assert told.probation[0] == 0
-    unknown = after(watch, leads=TURN_KNOWN - 0.01)
+    unknown = after(watch, leads=MIN_LEAD - 0.01)
     assert not unknown.turn_known[0]
     assert not after(unknown, leads=0.2).turn_known[0]  # it may have turned in between
     assert after(found, agreement=0.55).lost[0]
@@ -158,7 +158,7 @@ def test_an_orientation_stays_unknown_until_its_group_is_lost_and_found():
     watch, none, one = first_watch(jnp.ones(1)), jnp.zeros(1), jnp.array([True])
     cases = [
         (0.8, 0.2, True),  # agreement, lead, whether the orientation is known then
-        (0.8, TURN_KNOWN - 0.01, False),
+        (0.8, MIN_LEAD - 0.01, False),
         (0.9, 0.2, False),  # it may have turned in between
         (0.2, 0.2, False),  # lost
         (0.9, 0.2, False),  # found, but by chance?

@@ -9,8 +9,8 @@ from scipy.sparse import csr_array, diags_array
 from scipy.sparse.linalg import LinearOperator, cg
 from scipy.spatial import cKDTree
 
-from gsjax.methods.parts.states.registration import Target, matched, moved, turned
-from gsjax.methods.parts.states.surfaces import Surface, evidence, unlike
+from gsjax.methods.parts.states.registration import Target, matched, moved, rotated_normals
+from gsjax.methods.parts.states.surfaces import Surface, color_distance, evidence
 from gsjax.scene.frame import Frame
 
 _NEIGHBORS = 10
@@ -20,7 +20,7 @@ _SAME_WAY, _SAME_COLOR = 0.7, 0.15
 _UNKNOWN = 0.4  # cost of a point about which nothing is known; 0 for one that agrees, up to 1 for others
 _MOVES = 0.1  # cost of following a motion, unless nothing is known about the point
 _THERE = 0.3  # cost of a point where cameras see something, but no surface that agrees
-_SHARPNESS = 0.1  # difference of costs that changes odds by a factor of e
+_TEMPERATURE = 0.1  # difference of costs that changes odds by a factor of e
 _PULL = 0.5  # weight of the cameras' evidence, relative to a connection
 _ITERATIONS = 300
 _APART = 0.5  # spacings by which the two sides of a thin plate are kept apart
@@ -36,7 +36,7 @@ def connections(surface: Surface, spacing: float) -> csr_array:
     """
     count = min(_NEIGHBORS + 1, len(surface.points))
     far, near = (a[:, 1:] for a in cKDTree(surface.points).query(surface.points, k=count))
-    apart = unlike(surface.colors[:, None], surface.colors[near])
+    apart = color_distance(surface.colors[:, None], surface.colors[near])
     bend = np.clip((surface.normals[:, None] * surface.normals[near]).sum(-1), 0, 1)
     strengths = np.exp(-apart / _COLOR - 0.5 * (far / (1.5 * spacing)) ** 2) * (_BEND + (1 - _BEND) * bend)
     rows = np.repeat(np.arange(len(far)), far.shape[1])
@@ -56,10 +56,12 @@ def costs_of(
         frame: all cameras of the other state.
         spacing: distance between the points, metres.
     """
-    found = evidence(moved(motion, surface.points), turned(motion, surface.normals), frame, 4 / 3 * spacing)
+    found = evidence(
+        moved(motion, surface.points), rotated_normals(motion, surface.normals), frame, 4 / 3 * spacing
+    )
     match = matched(motion, surface, target, spacing)
     fits = (match.far < spacing) & (match.cosines > _SAME_WAY)
-    off = np.maximum(match.unlike / _SAME_COLOR, (match.off / spacing) ** 2)
+    off = np.maximum(match.color_distance / _SAME_COLOR, (match.off / spacing) ** 2)
     unsure = np.where(found.there > 0, _THERE, _UNKNOWN)
     cost = np.where(fits, 0.5 * _UNKNOWN * np.minimum(off, 1), unsure)
     return np.where(found.seen, cost + (1 - _UNKNOWN) * np.minimum(3 * found.share, 1), _UNKNOWN)
@@ -88,13 +90,13 @@ def labels_of(
     claims = _claims(costs, surface, motions, spacing)
     costs = costs + np.clip(_UNKNOWN - costs, 0, [0, *[_MOVES] * (len(motions) - 1)])
     worth = np.maximum(_UNKNOWN - costs, 0)
-    shares = _spread(costs, links)
+    shares = _diffused(costs, links)
     for _ in range(_TURNS):
         taken = np.zeros(costs.shape)
         for k, j, rows, others in claims:
             taken[rows, k] = np.maximum(taken[rows, k], shares[others, j])
         likely = np.clip(2 * taken, 0, 1)  # certain, from a share of one half on
-        shares = _spread(costs + worth * likely, links)
+        shares = _diffused(costs + worth * likely, links)
     return shares.argmax(-1)
 
 
@@ -106,7 +108,7 @@ def _claims(
 ) -> list[tuple[int, int, Int[np.ndarray, "m"], Int[np.ndarray, "m"]]]:
     """The points that two motions bring to the same place, for each pair: the motions, the points of the
     first, and those of the second. Arguments as for `labels_of`."""
-    ways = [turned(motion, surface.normals) for motion in motions]
+    ways = [rotated_normals(motion, surface.normals) for motion in motions]
     places = [
         moved(motion, surface.points) + _APART * spacing * way
         for motion, way in zip(motions, ways, strict=True)
@@ -121,9 +123,9 @@ def _claims(
     return claims
 
 
-def _spread(costs: Float[np.ndarray, "n k"], links: csr_array) -> Float[np.ndarray, "n k"]:
+def _diffused(costs: Float[np.ndarray, "n k"], links: csr_array) -> Float[np.ndarray, "n k"]:
     """How likely each point follows each motion; where the costs do not tell, as likely as its neighbours."""
-    likely = np.exp(-(costs - costs.min(1, keepdims=True)) / _SHARPNESS)
+    likely = np.exp(-(costs - costs.min(1, keepdims=True)) / _TEMPERATURE)
     likely /= likely.sum(1, keepdims=True)
     pull = _PULL * (likely.max(1) - 1 / costs.shape[1]) + 1e-4
     diagonal = links.sum(1) + pull

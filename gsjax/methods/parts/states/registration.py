@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.ndimage import distance_transform_edt
 from scipy.spatial.transform import Rotation
 
-from gsjax.methods.parts.states.surfaces import Surface, unlike
+from gsjax.methods.parts.states.surfaces import Surface, color_distance
 
 _MOST_CELLS = 4e6  # of the grid that finds nearest points
 _BORDER = 4  # cells around it
@@ -20,13 +20,13 @@ _TURNS = np.radians(np.arange(8, 180, 8))
 SAME_WAY = 0.6
 """Least cosine between normals of points that may correspond."""
 _CLOSER = 0.75  # factor on the reach from round to round
-_PURE = 0.01  # weight of the penalty on sliding along the rotation axis, relative to the points ...
-_PULLED = 0.3  # ... and the slide beyond which it pulls no harder, in reaches
-_TURNS_AT_ALL = 0.05  # radians; a motion that rotates by less counts as a translation
+_SLIDE_WEIGHT = 0.01  # weight of the penalty on sliding along the rotation axis, relative to the points ...
+_SLIDE_LIMIT = 0.3  # ... and the slide beyond which it pulls no harder, in reaches
+_LEAST_TURN = 0.05  # radians; a motion that rotates by less counts as a translation
 _DARK, _LIT = 0.02, np.log(2.5)  # brightness that is not informative; largest log change of the lighting
 _CONTRAST = 0.1  # difference in brightness that counts as much as the reach
-_LESS = 0.4  # weight of edges and colours, relative to that of planes, which are measured better
-_TELLING = 8  # fewest points from which the lighting of a side is estimated
+_SOFT_WEIGHT = 0.4  # weight of edges and colours, relative to that of planes, which are measured better
+_LEAST_MATCHES = 8  # fewest points from which the lighting of a side is estimated
 
 
 class Target:
@@ -75,7 +75,7 @@ def moved(
     return points @ np.swapaxes(motion[..., :3, :3], -1, -2) + motion[..., None, :3, 3]
 
 
-def turned(
+def rotated_normals(
     motion: Float[np.ndarray, "*k 4 4"], normals: Float[np.ndarray, "n 3"]
 ) -> Float[np.ndarray, "*k n 3"]:
     """Normals rotated by rigid motions."""
@@ -163,20 +163,20 @@ def registered(
         pairs = _pairs(motion, part, target, near)
         if pairs.counts.sum() < 6:
             return motion
-        pulls = [_pulled_flat(pairs, target.surface), _pulled_by_color(pairs, part, target.surface, near)]
+        pulls = [_to_planes(pairs, target.surface), _to_brightness(pairs, part, target.surface, near)]
         if target.edges is not None:
-            pulls.append(_pulled_by_edges(motion, edges, target.edges, near))
+            pulls.append(_to_edges(motion, edges, target.edges, near))
         at, along, gaps = (np.concatenate(values) for values in zip(*pulls, strict=True))
         middle = at.mean(0)
         weights = 1 / (1 + (gaps / (0.3 * near)) ** 2) ** 2
         slopes = np.concatenate([np.cross(at - middle, along), along], -1)
         curvature, slope = (slopes * weights[:, None]).T @ slopes, (slopes * weights[:, None]).T @ gaps
         turn = Rotation.from_matrix(motion[:3, :3]).as_rotvec()
-        if (angle := np.linalg.norm(turn)) > _TURNS_AT_ALL:
+        if (angle := np.linalg.norm(turn)) > _LEAST_TURN:
             axis = np.concatenate([np.zeros(3), turn / angle])
-            slid = np.clip(motion[:3, 3] @ axis[3:], -_PULLED * near, _PULLED * near)
-            curvature += _PURE * len(at) * np.outer(axis, axis)
-            slope -= _PURE * len(at) * slid * axis
+            slid = np.clip(motion[:3, 3] @ axis[3:], -_SLIDE_LIMIT * near, _SLIDE_LIMIT * near)
+            curvature += _SLIDE_WEIGHT * len(at) * np.outer(axis, axis)
+            slope -= _SLIDE_WEIGHT * len(at) * slid * axis
         damped = curvature + np.diag(1e-5 * np.diag(curvature) + 1e-9 * np.trace(curvature))
         step = np.linalg.solve(damped, slope)
         change = np.eye(4)
@@ -186,7 +186,7 @@ def registered(
     return motion
 
 
-class _Pull(NamedTuple):
+class _Residuals(NamedTuple):
     """Residuals at points, each along a direction: gaps in metres, or weighted to be comparable."""
 
     at: Float[np.ndarray, "m 3"]
@@ -205,33 +205,33 @@ class _Pairs(NamedTuple):
 def _pairs(motion: Float[np.ndarray, "4 4"], part: Surface, target: Target, near: float) -> _Pairs:
     at = moved(motion, part.points)
     far, rows = target.nearest(at)
-    same = (turned(motion, part.normals) * target.surface.normals[rows]).sum(-1) > SAME_WAY
+    same = (rotated_normals(motion, part.normals) * target.surface.normals[rows]).sum(-1) > SAME_WAY
     return _Pairs(at, rows, (far < near) & same)
 
 
-def _pulled_flat(pairs: _Pairs, surface: Surface) -> _Pull:
+def _to_planes(pairs: _Pairs, surface: Surface) -> _Residuals:
     """Residuals from points to the tangent planes of the surface."""
     at, rows, counts = pairs
     normals = surface.normals[rows]
-    return _Pull(at[counts], normals[counts], ((surface.points[rows] - at) * normals).sum(-1)[counts])
+    return _Residuals(at[counts], normals[counts], ((surface.points[rows] - at) * normals).sum(-1)[counts])
 
 
-def _pulled_by_color(pairs: _Pairs, part: Surface, surface: Surface, near: float) -> _Pull:
+def _to_brightness(pairs: _Pairs, part: Surface, surface: Surface, near: float) -> _Residuals:
     """Residuals from points, along the surface, to where it is as bright as they are (Park et al. 2017)."""
     at, rows, counts = pairs
-    scale, slope = _LESS * near / _CONTRAST, surface.slope[rows]
+    scale, slope = _SOFT_WEIGHT * near / _CONTRAST, surface.slope[rows]
     bright = part.brightness * _relit(part, surface.brightness[rows], counts)
     gaps = bright - surface.brightness[rows] - (slope * (at - surface.points[rows])).sum(-1)
-    return _Pull(at[counts], scale * slope[counts], scale * gaps[counts])
+    return _Residuals(at[counts], scale * slope[counts], scale * gaps[counts])
 
 
-def _pulled_by_edges(motion: Float[np.ndarray, "4 4"], edges: Surface, target: Target, near: float) -> _Pull:
+def _to_edges(motion: Float[np.ndarray, "4 4"], edges: Surface, target: Target, near: float) -> _Residuals:
     """Residuals from the edges of a part, along the surface, to edges of the surface."""
     at, rows, counts = _pairs(motion, edges, target, near)
     outward = target.surface.outward[rows]
-    counts &= (turned(motion, edges.outward) * outward).sum(-1) > SAME_WAY
+    counts &= (rotated_normals(motion, edges.outward) * outward).sum(-1) > SAME_WAY
     gaps = ((target.surface.points[rows] - at) * outward).sum(-1)
-    return _Pull(at[counts], _LESS * outward[counts], _LESS * gaps[counts])
+    return _Residuals(at[counts], _SOFT_WEIGHT * outward[counts], _SOFT_WEIGHT * gaps[counts])
 
 
 class Match(NamedTuple):
@@ -247,7 +247,7 @@ class Match(NamedTuple):
     far: Float[np.ndarray, "*k n"]
     off: Float[np.ndarray, "*k n"]
     cosines: Float[np.ndarray, "*k n"]
-    unlike: Float[np.ndarray, "*k n"]
+    color_distance: Float[np.ndarray, "*k n"]
 
 
 def matched(motion: Float[np.ndarray, "*k 4 4"], part: Surface, target: Target, near: float) -> Match:
@@ -263,10 +263,10 @@ def matched(motion: Float[np.ndarray, "*k 4 4"], part: Surface, target: Target, 
     at, surface = moved(motion, part.points), target.surface
     far, rows = target.nearest(at)
     off = np.abs(((surface.points[rows] - at) * surface.normals[rows]).sum(-1))
-    cosines = (turned(motion, part.normals) * surface.normals[rows]).sum(-1)
+    cosines = (rotated_normals(motion, part.normals) * surface.normals[rows]).sum(-1)
     tells = (far < near) & (cosines > SAME_WAY)
     lit = _relit(part, surface.brightness[rows], tells)
-    return Match(far, off, cosines, unlike(part.colors * lit[..., None], surface.colors[rows]))
+    return Match(far, off, cosines, color_distance(part.colors * lit[..., None], surface.colors[rows]))
 
 
 def _relit(
@@ -284,7 +284,7 @@ def _relit(
     for k in np.unique(side):
         mine = side == k
         known = np.where(tells[..., mine], brighter[..., mine], np.nan)
-        enough = tells[..., mine].sum(-1, keepdims=True) >= _TELLING
+        enough = tells[..., mine].sum(-1, keepdims=True) >= _LEAST_MATCHES
         middle = np.nanmedian(np.where(enough, known, 0), axis=-1, keepdims=True)
         times[..., mine] = np.exp(np.clip(middle, -_LIT, _LIT))
     return times
@@ -311,4 +311,4 @@ def likeness(
     """
     match = matched(motion, part, target, near)
     fits = (match.far < near) & (match.cosines > SAME_WAY)
-    return fits * np.maximum(1 - match.unlike / color, 0) * np.maximum(1 - (match.off / near) ** 2, 0)
+    return fits * np.maximum(1 - match.color_distance / color, 0) * np.maximum(1 - (match.off / near) ** 2, 0)

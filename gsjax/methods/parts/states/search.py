@@ -20,9 +20,9 @@ from gsjax.methods.parts.states.registration import (
     matched,
     moved,
     registered,
-    turned,
+    rotated_normals,
 )
-from gsjax.methods.parts.states.surfaces import Evidence, Surface, evidence, pixel_width, steadied, surface_of
+from gsjax.methods.parts.states.surfaces import Evidence, Surface, denoised, evidence, pixel_width, surface_of
 from gsjax.scene.frame import Frame
 
 _SPACING = 1.5  # pixels between the points of a surface
@@ -40,7 +40,7 @@ _EXPLAINS = 0.02  # share of what is gone that a motion must explain, at least
 _FRESH = 0.25  # share of what a motion explains that must be new, or it repeats those before it
 _HIDDEN = 0.3  # value of explaining a point that an earlier motion may have moved out of sight
 _ALONGSIDE = 10.0  # pixels from the points that a motion explains within which it may hide others
-_FAR_COSTS = 0.6  # share of its gain that a motion loses if it is as long as the scene is large
+_LENGTH_COST = 0.6  # share of its gain that a motion loses if it is as long as the scene is large
 _MOST_MOTIONS = 30
 _RIVALS, _RIVAL = 3, 0.5  # motions among which the best is chosen, and their least gain, relative to it
 _BESIDE = -8, -4, 4, 8  # offsets, pixels, from which a motion better than the present one is sought ...
@@ -76,7 +76,7 @@ def states_of(before: Frame, after: Frame, seed: int = 0) -> States:
     """
     if not all((np.asarray(frame.depths) > 0).any() for frame in (before, after)):
         raise ValueError("frames: expected depth in both states, found none that is known")
-    before, after = steadied(before), steadied(after)
+    before, after = denoised(before), denoised(after)
     pixel, random = pixel_width(before), np.random.default_rng(seed)
     first, second = (surface_of(frame, _SPACING * pixel) for frame in (before, after))
     gone, come = _seen_through(first, after, pixel), _seen_through(second, before, pixel)
@@ -92,7 +92,7 @@ def states_of(before: Frame, after: Frame, seed: int = 0) -> States:
     lost = first.of(gone)
     some = lost.of(random.permutation(len(lost.points))[:_MANY])
     candidates = _candidates(lost, anywhere, new, size, pixel, random)
-    motions = _explaining(candidates, some, anywhere, new, after, size, pixel)
+    motions = _chosen_greedily(candidates, some, anywhere, new, after, size, pixel)
     if not motions:
         raise ValueError(
             "frames: expected parts that moved rigidly between two states, found no motion that explains "
@@ -148,12 +148,14 @@ def _candidates(
         alike = (match.cosines > SAME_WAY) & (match.unlike < _COLOR)
         costs = np.where(alike, np.minimum(match.far / (_REACH * pixel), 1), 1).mean(-1)
         places = moved(tried, few.points[:: len(few.points) // 8 + 1])
-        for guess in tried[_best_apart(costs, places, _REACH * pixel)]:
+        for guess in tried[_distinct_best(costs, places, _REACH * pixel)]:
             found.append(registered(guess, part, anywhere, _REACH * pixel, _TOLERANCE * pixel))
     return found
 
 
-def _best_apart(costs: Float[np.ndarray, "k"], places: Float[np.ndarray, "k n 3"], apart: float) -> list[int]:
+def _distinct_best(
+    costs: Float[np.ndarray, "k"], places: Float[np.ndarray, "k n 3"], apart: float
+) -> list[int]:
     """The guesses of least cost, without those that bring points close to where a better guess brings them.
 
     Args:
@@ -170,7 +172,7 @@ def _best_apart(costs: Float[np.ndarray, "k"], places: Float[np.ndarray, "k n 3"
     return chosen
 
 
-def _explaining(
+def _chosen_greedily(
     candidates: list[Float[np.ndarray, "4 4"]],
     some: Surface,
     anywhere: Target,
@@ -184,7 +186,9 @@ def _explaining(
     move out of sight count as explained in part."""
 
     def evidence_for(motion: Float[np.ndarray, "4 4"]) -> Evidence:
-        return evidence(moved(motion, some.points), turned(motion, some.normals), after, _TOLERANCE * pixel)
+        return evidence(
+            moved(motion, some.points), rotated_normals(motion, some.normals), after, _TOLERANCE * pixel
+        )
 
     def explained(motion: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "n"]:
         fits = likeness(motion, some, anywhere, _SPACING * pixel, _COLOR)
@@ -195,7 +199,7 @@ def _explaining(
 
     def worth(motion: Float[np.ndarray, "4 4"], mine: Bool[np.ndarray, "n"]) -> float:
         way = np.linalg.norm(moved(motion, some.points[mine]) - some.points[mine], axis=-1).mean()
-        return 1 - _FAR_COSTS * min(way / size, 1)
+        return 1 - _LENGTH_COST * min(way / size, 1)
 
     if not candidates:
         return []
@@ -218,9 +222,12 @@ def _explaining(
             mine = explained(motion)
             return float((mine * left).sum()) * worth(motion, mine > 0) if mine.any() else 0.0
 
-        best = [k for k in _best_apart(-gains, ends, 4 * pixel)[:_RIVALS] if gains[k] > _RIVAL * gains.max()]
+        best = [
+            k for k in _distinct_best(-gains, ends, 4 * pixel)[:_RIVALS] if gains[k] > _RIVAL * gains.max()
+        ]
         tried = [
-            _beside(candidates[k], some.of((explains[k] > 0) & ~known), anywhere, score, pixel) for k in best
+            _polished(candidates[k], some.of((explains[k] > 0) & ~known), anywhere, score, pixel)
+            for k in best
         ]
         winner, (highest, motion) = max(zip(best, tried, strict=True), key=lambda one: one[1][0])
         explains[winner] = 0
@@ -235,7 +242,7 @@ def _explaining(
     return motions
 
 
-def _beside(
+def _polished(
     motion: Float[np.ndarray, "4 4"],
     part: Surface,
     target: Target,
@@ -249,7 +256,7 @@ def _beside(
     best, highest = motion, score(motion)
     for _ in range(_TIMES_BESIDE):
         tried = np.tile(best, (len(steps), 1, 1))
-        tried[:, :3, 3] += turned(best, steps)
+        tried[:, :3, 3] += rotated_normals(best, steps)
         found = [registered(one, part, target, 3 * pixel, _SPACING * pixel, 8) for one in tried]
         scores = [score(one) for one in found]
         if max(scores) <= highest * 1.01:

@@ -16,7 +16,7 @@ from gsjax.geometry.neighbors import voxel_thin
 from gsjax.optim.compiler import host_jit
 from gsjax.scene.frame import Frame
 
-_BEND_OF_NOISE = 1.65  # median of absolute second differences of white noise, in standard deviations
+_NOISE_SCALE = 1.65  # median of absolute second differences of white noise, in standard deviations
 _LEAST_NOISE, _MOST_NOISE = 5e-4, 4.0  # of depth, relative; largest noise, in standard deviations
 _WIDTH = 3.0  # of the filter, pixels
 _FAR_AWAY = 20.0  # how far unknown depth is put behind all other, in differences that are noise
@@ -77,7 +77,9 @@ class Evidence(NamedTuple):
         return self.there + self.through > 0
 
 
-def unlike(one: Float[np.ndarray, "*n 3"], other: Float[np.ndarray, "*m 3"]) -> Float[np.ndarray, "*m"]:
+def color_distance(
+    one: Float[np.ndarray, "*n 3"], other: Float[np.ndarray, "*m 3"]
+) -> Float[np.ndarray, "*m"]:
     """Mean absolute difference of colours, 0 to 1."""
     return np.abs(one - other).mean(-1)
 
@@ -93,7 +95,7 @@ def pixel_width(frame: Frame) -> float:
     return float(np.median(widths))
 
 
-def steadied(frame: Frame) -> Frame:
+def denoised(frame: Frame) -> Frame:
     """The frame with less noise in its depth: if noise is measurable, depth is averaged with the depth around
     it that differs by no more than noise does (a bilateral filter).
 
@@ -103,7 +105,7 @@ def steadied(frame: Frame) -> Frame:
     depths = np.asarray(frame.depths, np.float32)
     logs = np.log(np.where(depths > 0, depths, np.nan))
     bends = np.abs(logs[:, :, 2:] - 2 * logs[:, :, 1:-1] + logs[:, :, :-2])
-    noise = float(np.nanmedian(bends)) / _BEND_OF_NOISE if np.isfinite(bends).any() else 0.0
+    noise = float(np.nanmedian(bends)) / _NOISE_SCALE if np.isfinite(bends).any() else 0.0
     if noise < _LEAST_NOISE:
         return frame
     width = _MOST_NOISE * noise

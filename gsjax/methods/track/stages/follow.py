@@ -36,7 +36,7 @@ from gsjax.scene.render import Rendered
 _ENOUGH_PIXELS, _MIN_SHARE = 200, 0.2
 
 
-def look_back(now: UpdateContext, config: TrackConfig) -> Past:
+def last_view(now: UpdateContext, config: TrackConfig) -> Past:
     """First stage: what the last scene shows of each group."""
     scene, state, frame, plan = now.scene, now.state, now.frame, now.plan
     num_objects = scene.num_objects
@@ -65,7 +65,7 @@ def look_back(now: UpdateContext, config: TrackConfig) -> Past:
     return Past(shown, cameras, template, rendered, backdrop, background, needed, counts, visible)
 
 
-def starting_points(now: UpdateContext, past: Past, config: TrackConfig, reduction: int) -> Starts:
+def motion_hypotheses(now: UpdateContext, past: Past, config: TrackConfig, reduction: int) -> Starts:
     """Second stage: hypotheses of the motion from the last frame until now: none, the same as before, and
     that of template matching, for which `reduction` is the factor by which images shrink."""
     before, num_objects = now.state.motion, now.scene.num_objects

@@ -10,11 +10,11 @@ from gsjax.methods.track.layers import Shown
 from gsjax.methods.track.lost import PROBATION, SURELY_FOUND, Confidence, group_confidence, is_found
 from gsjax.methods.track.motion import Motion, Pose, move, select_motion
 from gsjax.methods.track.plan import Needed
-from gsjax.methods.track.points import carry, carry_keyframe, pixels_of_groups, renewed, where_groups
+from gsjax.methods.track.points import carry, carry_keyframe, pixels_of_groups, renewed, select_groups
 from gsjax.methods.track.recover import evidence, relative_twists
 from gsjax.methods.track.reference import all_points_facing, radii
 from gsjax.methods.track.stages.context import Alignment, Past, Refined, Settled, UpdateContext
-from gsjax.methods.track.stages.shown import memory_of, show
+from gsjax.methods.track.stages.shown import show, stored_view
 from gsjax.methods.track.state import TrackState
 from gsjax.methods.track.watch import first_watch
 
@@ -43,7 +43,7 @@ def detect_lost(
         return group_confidence(points, now.images, gap, background, alignment.other_depths)
 
     of_facing = jax.lax.cond(alignment.suspects.any() | state.is_blank, by_all_facing, lambda: confidence)
-    confidence = jax.tree.map(partial(where_groups, lost | state.is_blank), of_facing, confidence)
+    confidence = jax.tree.map(partial(select_groups, lost | state.is_blank), of_facing, confidence)
     on_probation, astray = state.watch.probation > 0, lost | alignment.missed
     factor = jnp.where(on_probation, _STILL_BETTER, _BETTER)
     better = evidence(relocation.confidence) > factor * evidence(of_facing)
@@ -56,14 +56,14 @@ def detect_lost(
     elsewhere = tried & better & (astray | away | on_probation)
     # Among many guesses one may agree by chance, but not twice.
     relocated = elsewhere & jnp.where(astray, twice | surely, twice & (surely | on_probation))
-    guesses = where_groups(tried, relocation.twists, state.relocation_guesses)
+    guesses = select_groups(tried, relocation.twists, state.relocation_guesses)
     there = Motion(relocation.twists, jnp.zeros_like(kept.delta))
     kept = select_motion(relocated, there, kept, now.scene.groups)
-    confidence = jax.tree.map(partial(where_groups, relocated), relocation.confidence, confidence)
+    confidence = jax.tree.map(partial(select_groups, relocated), relocation.confidence, confidence)
     return Settled(kept, confidence, elsewhere, relocated, guesses)
 
 
-def remember(
+def store_state(
     now: UpdateContext,
     past: Past,
     alignment: Alignment,
@@ -102,12 +102,12 @@ def remember(
     at_first = first_watch(settled.confidence.coverage)
     watch = jax.tree.map(partial(jnp.where, state.is_blank), at_first, watch)
     still = jnp.zeros_like(motion.twists)
-    guesses = where_groups(
+    guesses = select_groups(
         watch.doubtful & ~relocated, relative_twists(settled.guesses, motion.twists), still
     )
     # A relocation does not give a velocity, unless the group was in its place one frame ago.
     no_velocity = relocated & ~alignment.missed
     velocity = select_motion(no_velocity, jax.tree.map(jnp.zeros_like, motion), motion, groups)
-    memory = memory_of(shown, past.backdrop, now.frame, config)
+    memory = stored_view(shown, past.backdrop, now.frame, config)
     new = TrackState(velocity, pixels, keyframe, guesses, watch, state.count + 1, *memory)
     return pose, new, shown, needed

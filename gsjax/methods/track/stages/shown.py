@@ -26,7 +26,7 @@ def show(
     return show_moving(scene, pose, backdrop, plan.near, config.coarseness)
 
 
-def memory_of(shown: Shown, backdrop: Backdrop | None, frame: Frame, config: TrackConfig) -> tuple:
+def stored_view(shown: Shown, backdrop: Backdrop | None, frame: Frame, config: TrackConfig) -> tuple:
     """The last three fields of `TrackState`: None if the whole scene is redrawn in each frame."""
     if config.redraw != "moving":
         return None, None, None
