@@ -246,7 +246,7 @@ def _rasterize(views: Views, plan: Plan, batch: tuple[int, ...]):
 
 
 def _draw(projected: Projected, values: Float[Array, "views n channels"], mask, reads, plan: Plan):
-    """Bin and composite all views at once, every view's tiles after the last one's."""
+    """Bin and composite all views at once, with the tiles of each view after those of the previous one."""
     num_views, n, channels = values.shape
     if num_views * max(n, plan.capacity + LANES) >= 2**31:
         raise ValueError(
@@ -270,7 +270,7 @@ def _draw(projected: Projected, values: Float[Array, "views n channels"], mask, 
 
 
 def _bin_views(projected: Projected, mask, plan: Plan):
-    """The lists of all views, one after the other, and the pairs, needed capacity and overflow of each."""
+    """The lists of all views, one after another, and the pairs, needed capacity and overflow of each."""
     views, n = projected.depths.shape
 
     def in_xla(projected, mask):
