@@ -35,7 +35,8 @@ def is_alive(gaussians: Gaussians) -> Bool[Array, "n"]:
 def relocate(
     gaussians: Gaussians, key: PRNGKeyArray, slots: Int[Array, ""]
 ) -> tuple[Gaussians, Bool[Array, "n"]]:
-    """Turn dead slots into copies of living Gaussians, sampled in proportion to opacity. The image is kept.
+    """Turn dead slots into copies of living Gaussians, sampled in proportion to opacity, such that the image
+    does not change.
 
     Each of n copies in one place has the opacity o' = 1 - (1 - o)^(1/n) and the covariance (eq. 9)
 

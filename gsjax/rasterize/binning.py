@@ -182,7 +182,7 @@ def _lay_out(ellipses, first_row, num_rows, plan: Plan) -> _Rows:
 
 
 def _rank_of(slot, starts, plan: Plan):
-    """The rank of the Gaussian to which each of consecutive slots belongs; a Gaussian's begin at `starts`."""
+    """The rank of the Gaussian to which each slot belongs; the slots of each Gaussian begin at `starts`."""
     ranks = jnp.arange(starts.shape[0], dtype=jnp.int32)
     return repeat(ranks, starts, slot.size, plan.sort).reshape(slot.shape)
 

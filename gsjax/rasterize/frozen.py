@@ -65,7 +65,7 @@ def freeze_views(
     that cannot be drawn are in no list.
 
     Raises:
-        ValueError: there is no Gaussian; or as `gsjax.plan`.
+        ValueError: there are no Gaussians; or as `gsjax.plan`.
     """
     if len(means) == 0:
         raise ValueError("means: expected at least one Gaussian to see, found none")
@@ -84,8 +84,8 @@ def freeze_views(
 
 
 def padded_view(view: FrozenView, seen: int, pairs: int) -> FrozenView:
-    """One view with `rows` and `ids` padded so that views can be stacked: with zeros, thus with the first of
-    the N Gaussians, but in no tile's list. On the host.
+    """One view with `rows` and `ids` padded with zeros, so that views can be stacked; no tile lists the
+    padding. On the host.
 
     Args:
         view: the view of one camera.

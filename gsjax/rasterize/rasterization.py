@@ -95,8 +95,8 @@ def rasterization(
         width, height: image size, static.
         plan: capacities and options, from `gsjax.plan`. Without one the call makes its own, which needs
             concrete values: under jit or vmap, plan outside and pass it in.
-        fisheye: coefficients k1 to k4 of fisheye cameras (Kannala and Brandt 2006, as OpenCV has them; zeros
-            for an equidistant one); then depths are distances from the camera, for it may see beyond 90
+        fisheye: coefficients k1 to k4 of fisheye cameras (Kannala and Brandt 2006, in OpenCV's form; zeros
+            for an equidistant one). Depths are then distances from the camera, because it may see beyond 90
             degrees off its axis. Default: pinhole cameras.
         near_plane, far_plane: depths between which Gaussians are drawn (default 0.01, 1e10).
         eps2d: variance added on the image, square pixels (default 0.3).
