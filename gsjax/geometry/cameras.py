@@ -1,4 +1,5 @@
-"""Cameras. World to camera, OpenCV axes (+x right, +y down, +z forward), pixel centres at +0.5."""
+"""Cameras and projection. View matrices are world to camera in OpenCV axes (+x right, +y down, +z forward);
+pixel centres lie at +0.5."""
 
 from dataclasses import replace
 from functools import partial
@@ -13,7 +14,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from gsjax.geometry.sight import pixels_at
 
-# nerfstudio, Blender and OpenGL look along -z with +y up; one sign flip of two axes leads to OpenCV.
+# nerfstudio, Blender and OpenGL look along -z with +y up; flipping the signs of two axes gives OpenCV.
 OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
@@ -22,7 +23,7 @@ NEAR = 0.01
 
 
 class Camera(eqx.Module):
-    """One or many cameras of the same image size, pinholes or fisheyes.
+    """One or more cameras with the same image size, pinhole or fisheye.
 
     Attributes:
         viewmat: world-to-camera transforms, OpenCV axes, metres.
@@ -32,7 +33,7 @@ class Camera(eqx.Module):
         near: distance of the near plane, metres, static. Anything nearer is not drawn, such as parts of the
             rig where cameras see each other.
         fisheye: coefficients k1 to k4 of the model of Kannala and Brandt, in OpenCV's form; None for
-            pinholes. Depths are distances from a fisheye, and z in the frame of a pinhole.
+            pinholes. Depth is the distance from the camera for a fisheye, and z in its frame for a pinhole.
     """
 
     viewmat: Float[Array | np.ndarray, "*batch 4 4"]
@@ -84,7 +85,7 @@ def intrinsics(
 
 
 def on_device(camera: Camera) -> Camera:
-    """The camera in JAX arrays of the default float type."""
+    """The camera with its arrays as JAX arrays of the default float type."""
     dtype = jnp.result_type(float)
     return jax.device_put(jax.tree.map(lambda a: np.asarray(a, dtype), camera))
 
@@ -154,7 +155,7 @@ def pixels_of(
         width, height: size of the image, pixels.
     """
     xy, depths = pixels_at(points @ viewmat[:3, :3].T + viewmat[:3, 3], K)
-    inside = (xy >= 0).all(axis=1) & (xy < (width, height)).all(axis=1)  # NaN is not
+    inside = (xy >= 0).all(axis=1) & (xy < (width, height)).all(axis=1)  # False for NaN
     columns, rows = np.where(inside[:, None], xy, 0).astype(int).T
     return PointPixels(columns, rows, depths, inside)
 
@@ -188,7 +189,7 @@ def camera_centers(viewmats: Float[Array, "*batch 4 4"]) -> Float[Array, "*batch
 def perturbed(
     viewmats: Float[Array, "c 4 4"], twist: Float[Array, "6"], radius: Float[Array, ""] | float
 ) -> Float[Array, "c 4 4"]:
-    """View matrices of cameras that are rotated about their own centres and shifted, all by one twist.
+    """View matrices of the cameras after each is rotated about its own centre and shifted, all by one twist.
 
     Args:
         viewmats: world to camera.

@@ -78,7 +78,7 @@ def distort(points: Float[Array, "*n 2"], coeffs: Coeffs, model: str = "opencv")
 def undistort(points: Float[Array, "*n 2"], coeffs: Coeffs, model: str = "opencv") -> Undistorted:
     """The inverse of `distort`, by Newton's method, differentiated exactly by the implicit function theorem.
 
-    A point is invalid if it lies beyond the fold (nothing is distorted to there) or so near to it that the
+    A point is invalid if it lies beyond the fold (no point is distorted to it) or so near to it that the
     condition number exceeds 1e4, if it is 90 degrees or more off axis, or if it is not finite; all points
     are invalid if a coefficient is not finite. For invalid points the result is finite and its gradients are
     zero.

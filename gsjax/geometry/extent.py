@@ -1,4 +1,4 @@
-"""The location and size of a scene, by the cameras that look at it. On the host, in float64."""
+"""The location and size of a scene, estimated from the cameras that look at it. On the host, in float64."""
 
 from typing import NamedTuple
 
@@ -11,9 +11,9 @@ class Extent(NamedTuple):
 
     Attributes:
         focus: the point nearest to all optical axes.
-        radius: 1.1 times the largest distance of a camera from their centroid, the unit of learning rates; 1
-            if all cameras are at one place, with the focus at that distance ahead of them.
-        is_point: whether all cameras are at one place.
+        radius: 1.1 times the largest distance of a camera from the centroid of all, the unit of learning
+            rates; 1 if all cameras are in one place, and the focus then lies that far ahead of them.
+        is_point: whether all cameras are in one place.
     """
 
     focus: Float[np.ndarray, "3"]

@@ -17,7 +17,7 @@ def warp(
     NaN where the flow is unknown or leaves the image, and where it ends on or next to a NaN pixel.
 
     Args:
-        image: the image to which the flow leads. A mask gives the fraction that is True.
+        image: the image to which the flow leads. For a mask, the result is the fraction that is True.
         flow: flow from each pixel of the result to `image`, pixels.
     """
     rows, columns = np.indices(flow.shape[:2])

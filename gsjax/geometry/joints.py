@@ -8,7 +8,7 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 KINDS = ("prismatic", "revolute")
-_FAR_BETTER = 2.0  # errors of a hinge, in those of a turning slide, from which a part is no hinge
+_FAR_BETTER = 2.0  # a hinge is rejected if its error exceeds that of a turning slide by this factor
 
 
 @dataclass(frozen=True, eq=False)
@@ -16,7 +16,7 @@ class Joint:
     """A joint with a fixed axis, and how far it was open over time.
 
     Attributes:
-        kind: "prismatic" (slides along the axis) or "revolute" (turns about it, right-handed).
+        kind: "prismatic" (slides along the axis) or "revolute" (rotates about it, right-handed).
         axis: unit direction of the axis in the world, [3].
         point: a point on the axis, world, metres, [3].
         values: displacement (metres) or angle (radians) at each frame, [T].
@@ -60,8 +60,8 @@ class FittedJoint(NamedTuple):
         kind: "fixed", "prismatic", "revolute", or "free" where no joint explains the motion.
         joint: the fitted joint if `kind` is prismatic or revolute, else None.
         errors_m: root mean square distance, metres, of the part's points from their positions under the best
-            fixed, prismatic and revolute joint, by name, and as a "turning slide": along a straight line, and
-            turning in proportion, which is no joint.
+            fixed, prismatic and revolute joint, by name, and under the best "turning slide": a translation
+            along a line with a rotation in proportion to it, which is not a joint.
         confidence: 0 to 1; relative distance of the errors from the decision boundary. At 0, the part is as
             likely free as on a joint, or as likely on the other joint as on this one.
     """
@@ -82,9 +82,9 @@ def fit_joint(
 ) -> FittedJoint:
     """The simplest joint that explains a rigid motion.
 
-    A prismatic joint is fitted as a line to the path of the points' centroid, a revolute joint to where the
-    points go: to the path of their centroid and to their turn about it, in the least-squares sense, each
-    weighed by how well it is known. Both are judged by where they move the part's own points.
+    A prismatic joint is fitted as a line to the path of the points' centroid. A revolute joint is fitted by
+    least squares to that path and to the rotation of the points about their centroid, each weighted by how
+    well it is known. Both are judged by the positions to which they move the part's own points.
 
     Args:
         motions: rigid motions that take the part from its canonical pose to its pose at each frame, in the
@@ -92,11 +92,11 @@ def fit_joint(
         points: points of the part in its canonical pose, metres.
         noise_m: a part that moves less than this is fixed, and a smaller error counts as none; metres.
         tolerance: largest error of a joint, as a fraction of the extent of the motion, at which it still
-            explains the motion. A box that slides and turns steadily at the same time is 4 to 8 % from a
-            hinge, so a turning slide is tried as well: where it explains the motion far better, the part is
+            explains the motion. A box that slides and rotates steadily at the same time is only 4 to 8 % off
+            a hinge, so a turning slide is tried as well: if it explains the motion far better, the part is
             free.
-        least_turn_rad: a joint that turns by less is never revolute, since about a distant axis a small
-            rotation looks like a translation; radians.
+        least_turn_rad: a part that rotates by less than this is never revolute, since a small rotation about
+            a distant axis looks like a translation; radians.
     """
     moved = np.einsum("tij,nj->tni", motions[:, :3, :3], points) + motions[:, None, :3, 3]
     found = {
@@ -125,7 +125,7 @@ def fit_joint(
 def _turning_slide(
     motions: Float[np.ndarray, "frames 4 4"], points: Float[np.ndarray, "points 3"]
 ) -> Float[np.ndarray, "frames points 3"]:
-    """Where the points are if their middle goes along a line, and they turn about it in proportion."""
+    """Positions of the points if their centroid moves along a line and they rotate about it in proportion."""
     middle = points.mean(0)
     way = motions[:, :3, :3] @ middle + motions[:, :3, 3] - middle
     turns = Rotation.from_matrix(motions[:, :3, :3]).as_rotvec()
@@ -143,11 +143,11 @@ def _slide(shifts: Float[np.ndarray, "frames points 3"], middle: Float[np.ndarra
 
 
 def _turn(motions: Float[np.ndarray, "frames 4 4"], points: Float[np.ndarray, "points 3"]) -> Joint:
-    """The hinge that takes the points nearest to where these motions take them.
+    """The hinge that moves the points closest to where these motions move them.
 
-    Rotations tell the axis of a wide part well; that of a short handle is told better by the path of its
-    middle. How much each is worth, the errors of a first answer tell. For an axis and a point on it the best
-    angles are known, so four numbers are sought: the axis and the point may go two ways each.
+    The rotations determine the axis of a wide part well; for a short handle, the path of its centroid does so
+    better. The errors of a first solution determine the weight of each. Given an axis and a point on it, the
+    best angles have a closed form, so four numbers are optimised: two each for the axis and the point.
     """
     rotations, middle = motions[:, :3, :3], points.mean(0)
     middles = rotations @ middle + motions[:, :3, 3]
@@ -157,7 +157,7 @@ def _turn(motions: Float[np.ndarray, "frames 4 4"], points: Float[np.ndarray, "p
     across = np.linalg.svd(first[None])[2][1:]
 
     def hinge(found, weight):
-        """Axis, a point on it less the middle, and angles; `weight`: of the middle's path."""
+        """Axis, offset of a point on it from the centroid, and angles; `weight` is of the centroid's path."""
         axis, offset = first + found[:2] @ across, found[2:] @ across
         axis /= np.linalg.norm(axis)
         arms = np.einsum("ti,j->tij", middles - middle - offset, -offset)
@@ -167,7 +167,7 @@ def _turn(motions: Float[np.ndarray, "frames 4 4"], points: Float[np.ndarray, "p
         return axis, offset, np.unwrap(np.arctan2(skew @ axis, np.trace(products, 0, 1, 2) - along))
 
     def errors(found, weight):
-        """By how much the middle is off in each frame, times `weight`, and the points about it."""
+        """Errors of the centroid in each frame, times `weight`, and of the points about it."""
         axis, offset, angles = hinge(found, weight)
         about = Rotation.from_rotvec(angles[:, None] * axis).as_matrix()
         return weight * (middles - middle - offset + about @ offset), (rotations - about) @ spread

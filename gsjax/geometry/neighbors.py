@@ -25,8 +25,8 @@ def nearest(
 
 
 def nearest_neighbors(points: Float[np.ndarray, "n 3"], k: int) -> Int[np.ndarray, "n k"]:
-    """Indices of the `k` nearest other points of each point; the point itself where there are fewer, and for
-    a point that is not finite.
+    """Indices of the `k` nearest other points of each point, padded with its own index if there are fewer; a
+    point that is not finite gets only its own.
 
     Args:
         points: positions, metres.
@@ -39,7 +39,7 @@ def nearest_neighbors(points: Float[np.ndarray, "n 3"], k: int) -> Int[np.ndarra
         return found
     _, nearby = cKDTree(points[finite]).query(points[finite], k=count + 1)
     own = nearby == np.arange(len(finite))[:, None]
-    own[~own.any(axis=1), -1] = True  # of many points at one place, a point itself may not be among them
+    own[~own.any(axis=1), -1] = True  # with many points in one place, a point may not find itself
     found[finite, :count] = finite[nearby[~own].reshape(-1, count)]
     return found
 
@@ -68,12 +68,12 @@ def voxel_thin(points: Float[np.ndarray, "n 3"], voxel: float) -> Int[np.ndarray
 
 
 def on_surfaces(depths: Float[np.ndarray, "*c h w"]) -> Float[np.ndarray, "*c h w"]:
-    """Depth where it is that of a surface, else 0.
+    """Depth of the pixels that lie on a surface, else 0.
 
-    A pixel is on none if its depth is not positive and finite, or stands alone: of five or more of its eight
-    neighbours that have depth, fewer than two have the same within 5 %, or of three or four none has. Depth
-    cameras measure such points at edges, in rain and on dark or shiny things. Sparse depth is kept, and lines
-    one pixel wide, but depth whose noise is above about 3 % is thinned.
+    A pixel lies on none if its depth is not positive and finite, or if it is a flying pixel: five or more of
+    its eight neighbours have depth and fewer than two of them agree with it within 5 %, or three or four have
+    depth and none agrees. Depth cameras measure flying pixels at edges, in rain and on dark or shiny objects.
+    Sparse depth and lines one pixel wide are kept, but depth with more than about 3 % noise is thinned.
 
     Args:
         depths: depth images of any number of cameras, metres.

@@ -1,4 +1,4 @@
-"""Paths of cameras through a scene, for videos. On the host, in float64."""
+"""Camera paths through a scene, for videos. On the host, in float64."""
 
 import numpy as np
 from jaxtyping import Float
@@ -6,7 +6,7 @@ from jaxtyping import Float
 from gsjax.geometry.cameras import look_at
 
 _WIDEST_GAP = np.deg2rad(120)  # between neighbours in a ring of cameras that still counts as closed
-_SWING = np.deg2rad(8)  # swing of the path if all cameras stand in one direction
+_SWING = np.deg2rad(8)  # amplitude of the path if all cameras are in one direction
 _NEAREST = 0.02  # smallest radius of a path, as a fraction of the distance to the focus
 
 
@@ -14,7 +14,7 @@ def orbit(
     viewmats: Float[np.ndarray, "n 4 4"], focus: Float[np.ndarray, "3"], frames: int
 ) -> Float[np.ndarray, "frames 4 4"]:
     """A closed path around a focus, at the height and distance of the given cameras: a full circle if the
-    cameras surround the focus, else a swing to and fro within their arc.
+    cameras surround the focus, else a swing back and forth within their arc.
 
     Args:
         viewmats: view matrices of the cameras, world to camera.

@@ -41,8 +41,8 @@ _SKEW = np.cross(np.eye(3)[:, None], -np.eye(3))  # [k, i, j]: -epsilon_kij
 
 @partial(jax.jit, inline=True)
 def matrix_of(vector: Float[Array, "3"]) -> Float[Array, "3 3"]:
-    """Rotation matrix of a rotation vector, radians. As `jaxlie.SO3.exp(vector).as_matrix()`, which stacks
-    nine numbers; a stack takes XLA:CPU long to compile, and this has none."""
+    """Rotation matrix of a rotation vector, radians. Equal to `jaxlie.SO3.exp(vector).as_matrix()`, but
+    without its stack of nine numbers, which takes XLA:CPU long to compile."""
     squared = jnp.sum(vector * vector)
     small = squared < 1e-12
     angle = jnp.sqrt(jnp.where(small, 1.0, squared))

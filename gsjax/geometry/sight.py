@@ -1,7 +1,7 @@
-"""Where points appear and what pixels look at, by pinholes and by fisheyes; on the host.
+"""Projection of points, and rays of pixels, for pinhole and fisheye cameras; on the host.
 
-Of fisheyes (Kannala and Brandt, PAMI 28(8), 2006, in OpenCV's form) a point at an angle theta off axis
-appears at the distance
+In the image of a fisheye (Kannala and Brandt, PAMI 28(8), 2006, in OpenCV's form) a point at an angle theta
+off axis appears at the distance
 
     d(theta) = theta + k1 theta^3 + k2 theta^5 + k3 theta^7 + k4 theta^9
 
@@ -11,14 +11,14 @@ from the principal point, in units of the focal length, up to the angle where d 
 import numpy as np
 from jaxtyping import Float
 
-_STEPS = 4096  # of a table of d, which is interpolated
+_STEPS = 4096  # entries of the table of d, which is interpolated
 _WIDEST = 3.0  # radians off axis
 
 
 def bent(
     coeffs: Float[np.ndarray, "4"], widest: float = _WIDEST
 ) -> tuple[Float[np.ndarray, "steps"], Float[np.ndarray, "steps"]]:
-    """Angles off axis, and the distances from the centre of the image at which they appear, both growing.
+    """Angles off axis, and the distances from the principal point at which they appear, both increasing.
 
     Args:
         coeffs: k1 to k4.
@@ -36,8 +36,8 @@ def rays(
     K: Float[np.ndarray, "3 3"],
     fisheye: Float[np.ndarray, "4"] | None = None,
 ) -> Float[np.ndarray, "*n 3"]:
-    """Vectors along which pixels look, in the camera's frame, at depth 1: with z = 1 by a pinhole, and of
-    length 1 by a fisheye, where they are NaN for pixels that its lens does not reach.
+    """Rays of pixels in the camera's frame, as vectors of depth 1: with z = 1 for a pinhole, and of length 1
+    for a fisheye, where they are NaN for pixels outside the lens's image circle.
 
     Args:
         pixels: (x, y), centres at +0.5.
@@ -60,8 +60,8 @@ def pixels_at(
     K: Float[np.ndarray, "3 3"],
     fisheye: Float[np.ndarray, "4"] | None = None,
 ) -> tuple[Float[np.ndarray, "*n 2"], Float[np.ndarray, "*n"]]:
-    """Pixel positions and depths of points in the camera's frame; positions are NaN for those behind a
-    pinhole, and for those that the lens of a fisheye does not show.
+    """Pixel positions and depths of points in the camera's frame; positions are NaN for points behind a
+    pinhole, and for points outside the field of view of a fisheye.
 
     Args:
         local: points.

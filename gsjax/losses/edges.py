@@ -81,8 +81,8 @@ def spatial_edges(positions: Float[Array, "t n c"], k: int, valid: NodeMask | No
 def temporal_edges(
     features: Features, k: int, window: int, valid: NodeMask | None = None, matching: Matching = Matching()
 ) -> Edges:
-    """Edges from each node to the `k` of highest affinity in each of the other frames at most `window` away
-    (SurstSplat, Algorithm 1).
+    """Edges from each node to the `k` nodes of highest affinity in each of the other frames at most `window`
+    away (SurstSplat, Algorithm 1).
 
     One matrix serves both directions: rows rank nodes of the later frame, columns those of the earlier.
 
@@ -103,8 +103,8 @@ def temporal_edges(
 
 
 def similar_edges(features: Features, k: int, window: int = 0, valid: NodeMask | None = None) -> Edges:
-    """Edges from each node to the `k` of highest cosine similarity in its own frame (GaussianClin, eq. 7), or
-    with a `window` in each of the other frames at most that far away. Features of length zero have no edges.
+    """Edges from each node to the `k` nodes of highest cosine similarity in its frame (GaussianClin, eq. 7),
+    or with a `window` in each of the other frames at most that far away. Zero features have no edges.
 
     Args:
         features: features of n nodes in t frames.
@@ -195,7 +195,7 @@ def affinities(
 def edge_affinities(
     features: Features, edges: Edges, valid: NodeMask | None = None, matching: Matching = Matching()
 ) -> Float[Array, "t n e"]:
-    """A of each edge times the number of nodes that it could have led to, so that chance gives 1.
+    """A of each edge times the number of nodes to which it could have led, so that chance gives 1.
 
     The factor is needed because rows of A sum to 1: with twice the nodes, its entries, and losses on them,
     would be half as large.
@@ -305,14 +305,14 @@ def _at_ends(values: Shaped[Array, "t n ..."], edges: Edges) -> Shaped[Array, "t
 
 
 def live_edges(edges: Edges, there: NodeMask) -> Bool[Array, "t n e"]:
-    """Which edges join nodes that are present."""
+    """Which edges connect nodes that are present."""
     return edges.valid & there[:, :, None] & _at_ends(there, edges)
 
 
 def edge_cosines(
     features: Features, edges: Edges, there: NodeMask
 ) -> tuple[Float[Array, "t n e"], Bool[Array, "t n e"]]:
-    """Cosine of the two features that each edge joins, and where both are `there` and non-zero."""
+    """Cosine of the two features that each edge connects, and where both are `there` and non-zero."""
     squared = jnp.sum(features**2, axis=-1)
     products = jnp.sum(features[:, :, None] * _at_ends(features, edges), axis=-1)
     one = jnp.broadcast_to(squared[:, :, None], products.shape)

@@ -7,7 +7,7 @@ A method that takes `extra_losses` adds them to its own and trains on the gradie
 
     gsjax.track(scene, first, frames, config, extra_losses=(above_the_table,))
 
-The weight of a loss is a factor inside it. A loss is given by keyword where in a run it is, if it asks:
+The weight of a loss is a factor inside it. A loss that asks for its position in the run gets it by keyword:
 
     def prior(scene, rendered, frame, *, index, progress):
         return (1 - progress) * jnp.abs(rendered.depths - DEPTHS[index]).mean()
@@ -38,24 +38,24 @@ ExtraLoss = Callable[..., Float[Array, ""]]
 - its rendering (`gsjax.scene.render.Rendered`): colours, depths and alphas of C cameras,
 - the frame that these cameras saw (`gsjax.scene.frame.Frame`): images [C,H,W,3], 0 to 1, and depths,
 
-and, where it names them as keyword-only arguments without defaults, of
+and, if it has keyword-only arguments without defaults of these names, of
 
 - `index`: the position of the photograph or frame among those that the method was given,
 - `camera`: the position of its camera (`parts`),
-- `progress`: the share of the steps that are done, 0 to 1; of one frame's steps, or of the refinement's, in
-  `parts`.
+- `progress`: the fraction of the steps taken, 0 to 1; in `parts`, of one frame's steps or of the
+  refinement's.
 
-The tracker, whose frames come one by one, gives none of the three.
+The tracker, whose frames come one by one, provides none of the three.
 """
 
-_DIGESTED = 2**20  # bytes up to which an array is known by its content, not by its identity
+_DIGESTED = 2**20  # bytes up to which an array is identified by its content, not by its identity
 
 ExtraLosses = tuple[ExtraLoss, ...]
 """A tuple, because it is static under jit. A new function object, such as a fresh lambda, recompiles."""
 
 
 def named_losses(losses: Any) -> dict[str, ExtraLoss]:
-    """Losses by the names of their functions, under which `info["extra"]` reports their values.
+    """Losses by function name, under which `info["extra"]` reports their values.
 
     Raises:
         ValueError: `losses` is not a tuple of functions, one cannot be hashed, or two have the same name.
@@ -92,31 +92,31 @@ def _name(loss: Any) -> str:
 
 
 def captured(losses: ExtraLosses) -> tuple[Hashable, ...]:
-    """What losses take from outside, which is compiled in: where it differs, a method compiles anew.
+    """The values that losses capture, compiled in as constants: if they change, a method recompiles.
 
-    Numbers, texts and arrays are found in globals, closures, defaults, partials, containers, attributes of
-    callable objects, and in functions of one's own that are called. What is reached in other ways (an
-    attribute of a module or of another object) is not, and under `jax.jit` JAX keeps what it traced.
+    Numbers, strings and arrays are found in globals, closures, defaults, partials, containers, attributes of
+    callable objects, and in the user's own functions that a loss calls. Values reached in other ways (an
+    attribute of a module or of another object) are not, and under `jax.jit` JAX keeps what it traced.
 
     Args:
         losses: functions of scene, rendered and frame.
     """
     found: list[Hashable] = []
-    known: dict[int, Any] = {}  # held, so that no other gets the id of one
+    known: dict[int, Any] = {}  # holds the objects, so that their ids are not reused
     for loss in losses:
         _collect(loss, found, known)
     return tuple(found)
 
 
 class UpToDate:
-    """The program of a loop, compiled anew where what its losses take from outside has changed between two
-    steps. What the trace itself changes, such as a counter of traces, is no change."""
+    """The program of a loop, recompiled if values that its losses capture have changed between two steps.
+    Changes made by tracing itself, such as to a counter of traces, do not count."""
 
     def __init__(self, losses: ExtraLosses, compiled: Callable[[tuple[Hashable, ...]], Callable]):
         """
         Args:
             losses: functions of scene, rendered and frame.
-            compiled: makes the program for what `captured` found.
+            compiled: makes the program for the values that `captured` found.
         """
         self._losses, self._compiled = losses, compiled
         self._left = captured(losses)
@@ -131,7 +131,7 @@ class UpToDate:
 
 
 class _Same:
-    """An array that equals itself alone. As a key of a cache holds it, nothing else gets its id."""
+    """An array that is equal only to itself. A cache key that holds it keeps its id from being reused."""
 
     def __init__(self, array: Any):
         self.array = array
@@ -175,7 +175,7 @@ def _collect(value: Any, found: list[Hashable], known: dict[int, Any]) -> None:
 
 
 def _outside(function: FunctionType) -> dict[str, Any]:
-    """Values of a function's globals, of its closure and of its defaults, by name."""
+    """The values that a function takes from globals, its closure and its defaults, by name."""
     names, codes = set(), [function.__code__]
     while codes:  # a lambda or a comprehension within it has code of its own
         code = codes.pop()
@@ -210,10 +210,10 @@ def extra_terms(
     Args:
         losses: functions of scene, rendered and frame.
         scene, rendered, frame: their arguments.
-        context: what each is given by keyword, if it asks; see `ExtraLoss`.
+        context: what a loss gets by keyword if it asks for it; see `ExtraLoss`.
 
     Raises:
-        ValueError: as for `named_losses`; or a loss asks for what is not given, or returns no scalar.
+        ValueError: as for `named_losses`; or a loss asks for what `context` lacks, or returns no scalar.
     """
     named = named_losses(losses)
     terms = {name: _value(name, loss, scene, rendered, frame, context) for name, loss in named.items()}
@@ -231,13 +231,13 @@ def _asked_for(loss: Callable) -> tuple[str, ...]:
     """Names of keyword-only arguments without defaults."""
     try:
         given = inspect.signature(loss).parameters.values()
-    except (TypeError, ValueError):  # of a function written in C
+    except (TypeError, ValueError):  # a function written in C
         return ()
     return tuple(one.name for one in given if one.kind is one.KEYWORD_ONLY and one.default is one.empty)
 
 
 def _value(name: str, loss: Callable, scene: Any, rendered: Any, frame: Any, context: dict[str, Any]) -> Any:
-    """The value of a loss; what goes wrong in it says in which, and what is usual."""
+    """The value of a loss. Its errors get a note that names the loss and the usual causes."""
     asked = _asked_for(loss)
     if missing := sorted({*asked} - context.keys()):
         given = f"only {' and '.join(sorted(context))}" if context else "nothing"

@@ -80,7 +80,7 @@ def similarity_loss(features: Features, edges: Edges, valid: NodeMask | None = N
     """The mean over edges of (1 - cos)^2 (GaussianClin, eq. 8), except edges of zero features.
 
     L_s and L_t are this loss over `similar_edges` of the teacher, within frames and with a window, each with
-    its own weight. Features that are all equal have no such loss: another loss must separate them.
+    its own weight. It is 0 for features that are all equal: another loss must separate them.
 
     Args:
         features: the trained features.

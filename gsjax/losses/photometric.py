@@ -130,7 +130,7 @@ def _similarity(m: _Moments) -> Float[Array, "n h w"]:
 
 
 def _slope(x: Float[Array, "n h w"], y: Float[Array, "n h w"], m: _Moments) -> Float[Array, "n h w"]:
-    """Derivative of the mean similarity by each pixel of x."""
+    """Derivative of the mean similarity with respect to each pixel of x."""
     a, b, c, d = _factors(m)
     score, weights = a * c / (b * d), _weights(x)
     by_mx = 2 * m.my * (c - a) / (b * d) - 2 * m.mx * score * (1 / b - 1 / d)

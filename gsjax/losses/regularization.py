@@ -61,7 +61,7 @@ def local_strain(
 
 
 def pseudo_huber(squared: Float[Array, "*n"], tolerance: float) -> Float[Array, "*n"]:
-    """A penalty of a length that grows with its square below a tolerance and linearly above; smooth.
+    """A smooth penalty on a length: quadratic below a tolerance and linear above.
 
     Args:
         squared: the length, squared.

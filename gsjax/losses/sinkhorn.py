@@ -1,4 +1,4 @@
-"""Sinkhorn: scores of pairs become a soft matching whose rows and columns sum to one (SurstSplat, eq. 10).
+"""Sinkhorn: turns scores of pairs into a soft matching whose rows and columns sum to 1 (SurstSplat, eq. 10).
 
     A = exp(S / tau + f 1^T + 1 g^T),    f and g such that A 1 = 1 and A^T 1 = 1,
 

@@ -31,8 +31,8 @@ def host_options() -> dict[str, Any]:
 
 
 def host_jit(function: Callable, **options: Any) -> Callable:
-    """`jax.jit` with `host_options`, which are read at the first call: read as a module is imported, they
-    would start JAX's backend, after which nothing configures it (`jax.distributed.initialize`).
+    """`jax.jit` with `host_options`, which are read at the first call: reading them on import would start
+    JAX's backend, which can then no longer be configured (`jax.distributed.initialize`).
 
     Args:
         function: the function to compile, at the top level of a module.
@@ -68,8 +68,8 @@ _compiling = threading.local()
 
 
 def compile_seconds() -> float:
-    """Seconds that this thread has spent tracing and compiling since the first call of this function. Like
-    `time.perf_counter`, only the difference between two readings has a meaning."""
+    """Seconds that this thread has spent tracing and compiling since the first call of this function. As with
+    `time.perf_counter`, only the difference between two readings is meaningful."""
     _listen()
     return getattr(_compiling, "seconds", 0.0)
 
@@ -96,7 +96,7 @@ def has_avx512() -> bool:
 
 
 def forget_programs(most_maps: int = 30_000) -> bool:
-    """Drop all compiled programs if this process has more than `most_maps` memory maps; returns whether so.
+    """Drop all compiled programs if this process has over `most_maps` memory maps; returns whether it did.
 
     Each program takes some. Linux allows 65,530 per process, beyond which compiling fails ("Cannot allocate
     memory") even with free memory. Call this when one process runs many jobs for hours.
@@ -138,12 +138,12 @@ def keep_freed_memory() -> bool:
 
 TRACES = "traces"
 """Folder beside the compiled programs for what `gsjax.optim.traces` keeps."""
-_MOST_BYTES, _WORTH_S = 2**30, 0.0  # size of the cache on disk; the seconds from which a program is kept
+_MOST_BYTES, _WORTH_S = 2**30, 0.0  # size of the cache on disk; least compile time of a program that is kept
 
 
 def keep_programs(folder: str | Path | None = None) -> Path | None:
     """Make JAX cache compiled programs on disk, up to 1 GiB, so that the next process can reuse them. The
-    command line does: what would compile for a minute starts in seconds. Call it before JAX computes
+    command line does this: what would compile for a minute starts in seconds. Call it before JAX computes
     anything.
 
     Programs contain instructions that another processor may lack, and are partitioned for the number of cores

@@ -1,5 +1,6 @@
-"""Preconditioned conjugate gradients on many right-hand sides with one matrix, an iteration at a time
-(Hestenes and Stiefel 1952): for products A d that are renders and their transposes, and take all the time.
+"""Preconditioned conjugate gradients for many right-hand sides with one matrix, one iteration at a time
+(Hestenes and Stiefel 1952). The caller computes the products A d: renderings and their transposes, which
+dominate the cost.
 
     state = turned(Conjugate(zeros, zeros, zeros), b - A x, scale)
     x, state = advanced(x, state, A @ state.direction, scale)
@@ -41,11 +42,11 @@ def advanced(
 
 
 def turned(state: Conjugate, residual: Float[Array, "n c"], scale: Float[Array, "n"]) -> Conjugate:
-    """The state with the direction for a residual, conjugate to the one before.
+    """The state for a new residual, with a direction that is conjugate to the previous one.
 
     Args:
         state: the state before.
-        residual: the residual now.
+        residual: the new residual.
         scale: the preconditioner.
     """
     scaled = residual / scale[:, None]

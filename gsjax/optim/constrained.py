@@ -26,7 +26,7 @@ def project_simplex(values: Float[Array, "*batch P"]) -> Float[Array, "*batch P"
     The derivative passes the tangents of the entries above 0, less their mean, and 0 for the others, also at
     kinks. An entry of -inf becomes 0; a row with a NaN or +inf becomes NaN and affects no other row.
     """
-    from jaxopt.projection import projection_simplex  # it warns on import, and few need it
+    from jaxopt.projection import projection_simplex  # imported late, as it warns and few need it
 
     # A constant added to a row changes nothing; without the largest entry, sums of large values stay exact.
     offsets = jax.lax.stop_gradient(values.max(axis=-1, keepdims=True))

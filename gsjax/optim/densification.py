@@ -35,9 +35,10 @@ def is_alive(gaussians: Gaussians) -> Bool[Array, "n"]:
 def relocate(
     gaussians: Gaussians, key: PRNGKeyArray, slots: Int[Array, ""]
 ) -> tuple[Gaussians, Bool[Array, "n"]]:
-    """Turn dead slots into copies of living Gaussians, sampled in proportion to opacity; the picture stays.
+    """Turn dead slots into copies of living Gaussians, sampled in proportion to opacity, such that the image
+    does not change.
 
-    Each of n copies at one place has the opacity o' = 1 - (1 - o)^(1/n) and the covariance (eq. 9)
+    Each of n copies in one place has the opacity o' = 1 - (1 - o)^(1/n) and the covariance (eq. 9)
 
         S' = o^2 ( sum_{i=1..n} sum_{k=0..i-1} C(i-1, k) (-1)^k o'^(k+1) / sqrt(k+1) )^-2 S
 

@@ -1,16 +1,16 @@
-"""A guard over the steps of any method: when the loss is lost, it goes back to the best parameters and takes
-smaller steps from there; and a run ends with the best that it had.
+"""A guard over the steps of any method: if the loss diverges, the run goes back to its best parameters and
+continues from there in smaller steps; and a run ends with the best parameters that it had.
 
-Losses are compared by their mean over a window of steps, and beyond the standard error that they have in the
-best window. It has whole passes over the views, so that each view counts in each; where those would be a
-large part of the run, it has some of the views, in their random order. Before the first window, the best are
-the parameters that the stretch began with. A stretch is the time during which losses can be compared: it
-begins anew when parameters or constants are replaced, such as by densification, or when a method says that
-its loss has become another. One shorter than a window, such as a frame of parts, can go back to its beginning
-alone.
+Losses are compared by their means over windows of steps, and differences must exceed the standard error of
+the best window. A window consists of whole passes over the views, so that each view counts equally; if those
+would be a large part of the run, it has some of the views, in their random order. Before the first window,
+the best parameters are those with which the stretch began. A stretch is a period in which losses can be
+compared: a new one begins when parameters or constants are replaced, such as by densification, or when a
+method says that the meaning of its loss has changed. A stretch shorter than a window, such as a frame of
+parts, can only go back to its beginning.
 
-That a step is finite is the step's own promise (`gsjax.optim.step`), as is that none is far longer than usual
-(`steady_adam`).
+Steps themselves ensure that their results are finite (`gsjax.optim.step`) and that none is far longer than
+usual (`steady_adam`).
 """
 
 from dataclasses import replace
@@ -24,20 +24,21 @@ from jaxtyping import Array, Float, PyTree
 from gsjax.optim.step import all_finite
 
 LEAST_WINDOW = 100
-"""Fewest steps whose losses are compared."""
-_WINDOWS, _MOST_STEPS = 50, 200  # windows of a run, at most, unless they have so many steps
-_LEAST_WINDOWS = 8  # of a run, if whole passes are compared
-_TAIL = 20  # steps by which a candidate is confirmed, and of which most must not be worse at the end
-_LOST, _LOST_SIGMA = 0.25, 4.0  # by how much a loss is lost: relative, and in standard errors
-_WORSE, _WORSE_SIGMA = 0.02, 3.0  # by how much it must be worse at the end to go back
-_SMALLER = 0.5
-_FIRST = 5  # losses of which the largest stands for the parameters at the beginning
-_MOST_SKIPPED, _FAR_SMALLER, _LEAST_SHARE = 18, 0.1, 1e-3  # of a tail, to go back at once; and then
+"""Fewest steps in a window."""
+_WINDOWS, _MOST_STEPS = 50, 200  # most windows in a run; with this many steps in each, there may be more
+_LEAST_WINDOWS = 8  # fewest windows in a run for each to consist of whole passes
+_TAIL = 20  # steps that confirm a candidate, and most of which must not be worse at the end
+_LOST, _LOST_SIGMA = 0.25, 4.0  # increase at which a loss has diverged: relative, and in standard errors
+_WORSE, _WORSE_SIGMA = 0.02, 3.0  # the same at the end of a run, to go back to the best
+_SMALLER = 0.5  # factor on steps after a return
+_FIRST = 5  # first losses, the largest of which stands for the initial parameters
+# Skipped steps in a tail that make a run go back at once, the factor on steps then, and the smallest share.
+_MOST_SKIPPED, _FAR_SMALLER, _LEAST_SHARE = 18, 0.1, 1e-3
 
 
 class Level(eqx.Module):
     """The losses of a window, and the parameters at its end; or the first losses of a stretch, and the
-    parameters that it began with.
+    parameters with which it began.
 
     Attributes:
         mean: mean of the losses; at the beginning, the largest.
@@ -52,15 +53,15 @@ class Level(eqx.Module):
     def is_exceeded(
         self, losses: Float[np.ndarray, "n"], relative: float, sigma: float, statistic=np.mean
     ) -> bool:
-        """Whether losses are larger by a relative and a significant amount.
+        """Whether losses exceed this level, by an amount that is both relatively large and significant.
+
+        The beginning has no known deviation; only losses that have diverged exceed it.
 
         Args:
-            losses: of as many steps; NaN for the ones that were skipped.
+            losses: losses of as many steps; NaN for skipped ones.
             relative: least difference, relative to the level.
             sigma: least difference in standard errors.
-            statistic: what is compared.
-
-        The beginning, whose deviation is not known, is exceeded by a loss that is lost.
+            statistic: the statistic of the losses that is compared.
         """
         loss = _of_those_taken(statistic, losses)
         if self.deviation is None:
@@ -73,15 +74,15 @@ class Level(eqx.Module):
 
 
 class Guard(eqx.Module):
-    """What is known of the present stretch of a run.
+    """The state of the guard in the current stretch of a run.
 
     Attributes:
-        share: share of each step that is taken; 1 until a return.
-        beginning: of the stretch; its parameters are dropped once there is a best window.
-        losses: those of the latest steps, at most a window; NaN for the ones that were skipped.
+        share: fraction of each step that is taken; 1 until a return.
+        beginning: the beginning of the stretch; its parameters are dropped once there is a best window.
+        losses: losses of the latest steps, at most a window; NaN for skipped ones.
         steps: number of steps in the stretch, or since the last return.
         best: the best window; None before the first.
-        candidate: a better one, until the steps after it confirm its parameters, which no loss has seen.
+        candidate: a better window, until the next steps confirm its parameters, which no loss has tested yet.
         returns: number of returns to the best parameters, in all stretches.
         is_settled: whether the parameters at the end of the run are the best rather than the latest.
         is_resting: whether nothing is watched; see `resting`.
@@ -99,17 +100,17 @@ class Guard(eqx.Module):
 
     @property
     def level(self) -> Level:
-        """What the run goes back to: the best window or, before the first, the beginning."""
+        """The level that the run goes back to: the best window or, before the first, the beginning."""
         return self.beginning if self.best is None else self.best
 
     def watched(self, loss: float, params: PyTree, window: int) -> tuple["Guard", PyTree]:
-        """The guard after a step, and the parameters to continue from: those given or, where the loss is
-        lost, the best.
+        """The guard after a step, and the parameters to continue from: those given or, if the loss has
+        diverged, the best.
 
         Args:
             loss: loss of the step; NaN if it was skipped.
             params: parameters after the step.
-            window: number of steps that are compared.
+            window: number of steps in a window.
         """
         if self.is_resting:
             return self, params
@@ -172,18 +173,18 @@ def begun(params: PyTree, before: Guard | None = None) -> Guard:
 
     Args:
         params: the parameters.
-        before: the guard of the stretch before, whose count of returns goes on.
+        before: the guard of the previous stretch, whose count of returns continues.
     """
     beginning = Level(-np.inf, None, jax.tree.map(np.array, params))
     return Guard(jnp.ones((), jnp.float32), beginning, returns=0 if before is None else before.returns)
 
 
 def resting(before: Guard | None) -> Guard:
-    """A guard that watches nothing and keeps no parameters, for steps that are parts of an iteration which
-    cannot diverge, and whose losses do not tell how good the parameters are.
+    """A guard that watches nothing and keeps no parameters, for steps that are parts of an iteration that
+    cannot diverge, and whose losses do not show how good the parameters are.
 
     Args:
-        before: the guard before, whose count of returns goes on.
+        before: the previous guard, whose count of returns continues.
     """
     if before is not None and before.is_resting:
         return before
@@ -192,11 +193,11 @@ def resting(before: Guard | None) -> Guard:
 
 
 def window_of(total: int, period: int) -> int:
-    """Number of steps that are compared: whole passes over the views, unless windows would be too few.
+    """Number of steps in a window: whole passes over the views, unless there would be too few windows.
 
     Args:
         total: number of steps of the run.
-        period: number of steps of a pass over the views.
+        period: number of steps in a pass over the views.
     """
     steps = max(LEAST_WINDOW, min(total // _WINDOWS, _MOST_STEPS))
     passes = period * -(-steps // period)
@@ -204,11 +205,11 @@ def window_of(total: int, period: int) -> int:
 
 
 def part_of_step(new: PyTree, old: PyTree, share: Float[Array, ""]) -> PyTree:
-    """The parameters after a share of a step; after a whole one, the new ones to the bit.
+    """The parameters after a fraction of a step; after a whole one, bitwise equal to the new ones.
 
     Args:
         new, old: parameters after and before the step.
-        share: 0 to 1.
+        share: the fraction, 0 to 1.
     """
 
     def of(end, start):
@@ -224,7 +225,6 @@ def _restored(level: Level) -> PyTree:
 
 
 def _of_those_taken(statistic, losses: Float[np.ndarray, "n"]) -> float:
-    """A statistic of losses without those of skipped steps; infinite if these are half of all, or another is
-    not finite."""
+    """A statistic of the losses of steps that were not skipped; infinite if at least half were skipped."""
     taken = losses[~np.isnan(losses)]
     return float(statistic(taken)) if 2 * len(taken) > len(losses) else float("inf")

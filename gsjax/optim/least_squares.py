@@ -214,7 +214,7 @@ def least_squares_step(
 
         sound = all_finite((params, here.as_min()))
         accepted &= sound & all_finite((moved, there.as_min()))
-        # Factors of 3.5 and 1/4 over many frames must not reach 0 or infinity: no factor leads back.
+        # Factors of 3.5 and 1/4 over many frames must not reach 0 or infinity, from which no factor returns.
         search = jax.tree.map(lambda new, old: jnp.clip(new, 1e-6, 1e6).astype(old.dtype), search, state)
         capacity = _joined(aux, moved_aux)
         info = {

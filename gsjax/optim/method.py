@@ -75,13 +75,13 @@ class Method(Protocol[Problem]):
         ...
 
     def period(self, problem: Problem) -> int:
-        """Number of steps of a pass over the views, after whose multiples a new one begins; 1 where steps are
-        not in passes."""
+        """Number of steps in a pass over the views; a new pass begins after every multiple of it. 1 if steps
+        do not form passes."""
         ...
 
     def between(self, problem: Problem, run: Run, progress: float) -> Run:
         """The run for the next step, after changes of shape: densification, new parts, a graph, new plans.
-        Arrays of `run` may be donated. A run is returned without its guard where the loss becomes another.
+        Arrays of `run` may be donated. The run is returned without its guard if the loss changes its meaning.
 
         Args:
             problem: the data, which does not change.

@@ -14,8 +14,8 @@ def block_residual(
     softness: float,
 ) -> Float[Array, "c rows columns d"]:
     """Residuals whose half squares sum to the weighted sum of min(|difference|, limit), for blocks of one
-    pixel and differences above `softness` times the limit. Smaller differences are rounded off (Huber),
-    because an absolute value has no curvature that Gauss-Newton could use.
+    pixel and differences above `softness` times the limit. Smaller differences are smoothed (Huber), because
+    an absolute value has no curvature that Gauss-Newton could use.
 
     Args:
         difference: rendered minus observed.
@@ -24,7 +24,7 @@ def block_residual(
         block: width in pixels of the blocks over which differences are averaged. How a single rendered pixel
             changes depends on the Gaussian whose edge it lies on; this is unrelated to the motion, but counts
             in J^T J like image gradients, which makes steps short. Pixels outside full blocks are left out.
-        softness: share of the limit below which differences are rounded off.
+        softness: fraction of the limit below which differences are smoothed.
     """
     total = _summed(weights, block)
     mean = _summed(difference * weights, block) / jnp.maximum(total, 1e-6)

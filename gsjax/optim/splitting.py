@@ -26,7 +26,7 @@ class Pull(NamedTuple):
     """Accumulated gradients of the projected means.
 
     Attributes:
-        total: sum over steps of the gradient norms, in units of half the picture's width and height.
+        total: sum over steps of the gradient norms, in units of half the image's width and height.
         seen: number of steps with a non-zero gradient.
     """
 
@@ -41,7 +41,7 @@ class Pull(NamedTuple):
 
 def watch_pull() -> optax.GradientTransformation:
     """An optimizer for the zeros [1,n,2] that are added to the projected means: it leaves them unchanged and
-    accumulates their gradients in a `Pull`. Gradients must be per half picture, not per pixel."""
+    accumulates their gradients in a `Pull`. Gradients must be per half image, not per pixel."""
 
     def init(params) -> Pull:
         zeros = jnp.zeros((2, _only(params).shape[1]), _only(params).dtype)

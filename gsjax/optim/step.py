@@ -10,7 +10,7 @@
     loss       the value that is minimised
     skipped    True if params and state are unchanged: a number was not finite, or a plan overflowed
     overflow   True if a plan was too small
-    needed     the capacity that would have sufficed: a number, or the form that the method's plans take
+    needed     the capacity that would have sufficed: a number, or in the form of the method's plans
 
 Steps close over static configuration only, so they run under jit, vmap and scan, and compose by calling
 one another. tests/engine/test_laws.py checks every step of the package.
@@ -26,17 +26,17 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Bool, PyTree
 
-_MOST = 10.0  # roots of the second moment: a gradient's most effect on the first
+_MOST = 10.0  # bound on a gradient in the first moment, in units of the root of the second
 
 
 class Init(Protocol):
-    """Makes the state of a step from its parameters."""
+    """Makes the initial state of a step from its parameters."""
 
     def __call__(self, params: PyTree) -> PyTree: ...
 
 
 class Update(Protocol):
-    """Advances parameters and state by one batch, and reports how it went."""
+    """Advances parameters and state by one batch, and reports on it in `info`."""
 
     def __call__(
         self, params: PyTree, state: PyTree, batch: PyTree, *, step: Any, key: Any
@@ -55,9 +55,9 @@ def gradient_step(
 ) -> Step:
     """One step down the gradient of `loss(params, batch, *, step, key) -> (scalar, aux)`.
 
-    A step whose loss or gradient is not finite, whose gradient is too large to be squared, or whose aux has a
-    true `overflow`, returns params and state unchanged; `info["skipped"]` reports it. `info` is aux with
-    `loss` and `skipped`. Without a plan, aux need not have `overflow` and `needed`: False and 0 by default.
+    A step whose loss or gradient is not finite, whose gradient is too large to be squared, or whose aux
+    reports an `overflow`, returns params and state unchanged, with `info["skipped"]` True. `info` is aux with
+    `loss` and `skipped`. Without a plan, aux may omit `overflow` and `needed`, by default False and 0.
     """
 
     def update(params, state, batch, *, step, key):
@@ -76,8 +76,8 @@ def gradient_step(
 
 @jax.jit
 def copied(tree: PyTree) -> PyTree:
-    """The same arrays in buffers of their own, for what must survive a step that donates those of its
-    inputs. Half precision, in which the moments of Adam underflow, becomes single."""
+    """The same arrays in buffers of their own, which outlive a step that donates the buffers of its inputs.
+    Half precision, in which the moments of Adam underflow, becomes single."""
 
     def own(leaf):
         if jnp.issubdtype(leaf.dtype, jnp.floating):
@@ -100,10 +100,11 @@ def keep_if(condition: Bool[Array, ""], new: PyTree, old: PyTree) -> PyTree:
 def steady_adam(rate: Any, eps: float = 1e-15, decay: float = 0.0) -> optax.GradientTransformation:
     """Adam in which a single gradient moves a parameter by no more than about ten learning rates.
 
-    In plain Adam it is 31, however large or small the gradient, if those before were much smaller: the first
-    moment then is (1 - b1) g, the second (1 - b2) g^2, and the first fades slowly. So one frame that is drawn
-    wrongly throws what all frames share. Here the first moment takes at most ten roots of the second, which
-    limits no gradient that comes in one step of a hundred or more often. The state is that of `optax.adam`.
+    In plain Adam it is 31, whatever the size of the gradient, if those before were much smaller: the first
+    moment is then (1 - b1) g, the second (1 - b2) g^2, and the first decays slowly. So one badly rendered
+    frame could ruin what all frames share. Here gradients enter the first moment clipped to ten roots of the
+    second, which affects none that occur in one step of a hundred or more often. The state is that of
+    `optax.adam`.
 
     Args:
         rate: learning rate, or a schedule.

@@ -1,4 +1,4 @@
-"""Traces kept on disk beside the compiled programs, so that the next process need not trace again."""
+"""A cache of traces on disk, beside the compiled programs, so that the next process need not trace again."""
 
 import hashlib
 import json
@@ -23,7 +23,7 @@ from gsjax.rasterize.sorting import CUSTOM_CALLS
 
 _MOST_FILES = 200  # half a megabyte each
 _TRACED_THROUGH = ("jax", "jaxlib", "equinox", "jaxlie", "lineax", "optax", "optimistix", "jaxopt")
-_OURS = "gsjax"  # whose sources are known: what others define is never kept
+_OURS = "gsjax"  # the package whose sources are known; functions of others are never kept
 _VAGUE = re.compile(r" at 0x|\.\.\.")  # in the text of a tree: an address, or an omission
 _BEGUN = time()
 
@@ -32,11 +32,11 @@ def jit_once(fun: Callable, closed_over: Any, **options: Any) -> Callable:
     """`jax.jit(fun, **options)`, traced once for all processes if `keep_programs` keeps compiled programs.
 
     JAX caches what XLA compiles, but every process traces again to find it: an update of the tracker takes
-    5 s to trace, and 0.2 s to read. A trace belongs to the trees, shapes and types of the arguments, to
-    `closed_over`, and to the sources of gsjax, its libraries and JAX's configuration.
+    5 s to trace, and 0.2 s to read. The key of a trace consists of the trees, shapes and types of the
+    arguments, `closed_over`, the sources of gsjax, the versions of its libraries, and JAX's configuration.
 
-    Use it only for an outermost `jax.jit`: what is read can be neither differentiated nor mapped. Anywhere
-    but on a single CPU device, and wherever a trace cannot be kept, `fun` is simply traced.
+    Use it only for an outermost `jax.jit`: a stored trace can be neither differentiated nor vmapped. On
+    anything but a single CPU device, and where a trace cannot be kept, `fun` is traced as usual.
 
     Args:
         fun: a pure function of pytrees of arrays, without keyword arguments.
@@ -63,14 +63,14 @@ def jit_once(fun: Callable, closed_over: Any, **options: Any) -> Callable:
         return jax.tree.unflatten(out_tree, program.call(*leaves))
 
     traced.__name__ = fun.__name__
-    # What such a program returns is committed to its device, and the next call takes it: without shardings
-    # the program would be compiled once more for that.
+    # The results of such a program are committed to its device, and the next call takes them as inputs:
+    # without shardings the program would be compiled a second time for those.
     here = jax.sharding.SingleDeviceSharding(jax.devices()[0])
     return jax.jit(traced, in_shardings=here, out_shardings=here, **options)
 
 
 def _name(fun: Callable, closed_over: Any, inputs: str) -> str | None:
-    """The file name of a trace, or None if something in it may be another in the next process."""
+    """The file name of a trace, or None if something that it depends on may differ in the next process."""
     static, sources = _described(closed_over), _sources()
     if static is None or sources is None or not _is_ours(fun) or _VAGUE.search(inputs):
         return None
@@ -80,7 +80,7 @@ def _name(fun: Callable, closed_over: Any, inputs: str) -> str | None:
 
 
 def _described(value: Any) -> str | None:
-    """A static value as text that is equal only for equal values; None for what has no such text."""
+    """A static value as text that is equal only for equal values; None if it has no such text."""
     if isinstance(value, FunctionType):
         name = f"{value.__module__}.{value.__qualname__}"
         return name if _is_ours(value) and "<" not in name else None
@@ -97,8 +97,8 @@ def _is_ours(value: Any) -> bool:
 
 @cache
 def _sources() -> str | None:
-    """What identifies the code that is traced: the sources of gsjax, and the versions of its libraries; None
-    if a source was changed since this process began, which may run it as it was."""
+    """A text that identifies the code that is traced: a hash of gsjax's sources, and versions of libraries;
+    None if a source file changed since this process began, because it may run the old version."""
     digest, package = hashlib.sha256(), Path(__file__).resolve().parents[1]
     for file in sorted(package.rglob("*.py")):
         if file.stat().st_mtime > _BEGUN:
@@ -121,7 +121,7 @@ def _read(path: Path) -> tuple[jax.export.Exported, Any] | None:
     try:
         kept, _ = load_checkpoint(path)
         program = jax.export.deserialize(bytearray(kept["program"].tobytes()))
-        os.utime(path)  # those that are read least recently go first
+        os.utime(path)  # the least recently read are deleted first
     except (OSError, ValueError, KeyError, TypeError, ImportError):
         return None
     return program, jax.tree.structure(kept["results"])
@@ -130,7 +130,8 @@ def _read(path: Path) -> tuple[jax.export.Exported, Any] | None:
 def _traced_and_kept(
     path: Path, fun: Callable, tree: Any, specs: Sequence[jax.ShapeDtypeStruct]
 ) -> tuple[jax.export.Exported, Any] | None:
-    """The trace that is written to `path`, as another process will read it; None if that is not possible."""
+    """Trace `fun`, write the trace to `path`, and return it as another process will read it; None if that is
+    not possible."""
     results: list[Any] = []
 
     def flat(*leaves):
@@ -151,7 +152,7 @@ def _traced_and_kept(
         for old in newest[_MOST_FILES:]:
             old.unlink(missing_ok=True)
     found = _read(path)
-    if found is None or found[1] != out_tree:  # a static value that a file does not keep as it was
+    if found is None or found[1] != out_tree:  # a static value does not survive the round trip
         path.unlink(missing_ok=True)
         return None
     return found

@@ -1,9 +1,10 @@
 """The tiles that each Gaussian touches, and each tile's list from front to back.
 
 Gaussians are ranked by depth. Each is expanded to the rows of tiles that its ellipse crosses, and in every
-row to the range of columns that it covers; so the number of pairs is known before they are laid out: every
-tile where it reaches alpha_min at a pixel's centre, and a few between centres or within rounding. Pairs are
-then sorted by tile, stably. Lists can have any length: only their total is bounded.
+row to the range of columns that it covers, so the number of pairs is known before they are laid out. They
+include every tile where the Gaussian reaches alpha_min at a pixel's centre, and a few where it does so only
+between centres or within rounding. Pairs are then sorted by tile, stably. Lists can have any length: only
+their total is bounded.
 """
 
 from typing import NamedTuple
@@ -166,7 +167,7 @@ def _bounding_pairs(projected: Projected, plan: Plan) -> Int[Array, ""]:
 
 
 class _Rows(NamedTuple):
-    """Rows of tiles of all Gaussians, one Gaussian after the other."""
+    """Rows of tiles of all Gaussians, one Gaussian after another."""
 
     ellipses: list[Float[Array, "n"]]  # from `_ellipses`, in the order in which rows are laid out
     shift: Int[Array, "n"]  # a slot's row of tiles is the slot plus this
@@ -181,7 +182,7 @@ def _lay_out(ellipses, first_row, num_rows, plan: Plan) -> _Rows:
 
 
 def _rank_of(slot, starts, plan: Plan):
-    """Which of the Gaussians, whose slots begin at `starts`, each of the consecutive slots belongs to."""
+    """The rank of the Gaussian to which each slot belongs; the slots of each Gaussian begin at `starts`."""
     ranks = jnp.arange(starts.shape[0], dtype=jnp.int32)
     return repeat(ranks, starts, slot.size, plan.sort).reshape(slot.shape)
 
@@ -211,8 +212,9 @@ def _columns_in_row(ellipses, row, plan: Plan):
     """First column of tiles and one past the last where alpha reaches alpha_min at pixel centres of a row.
 
     The ellipse A dx^2 + 2 B dx dy + C dy^2 = t, t = 2 ln(o / alpha_min), reaches furthest to the right at
-    dy = -(B/C) h_x, as a concave function of dy; so within a band of rows it does so at the nearest dy of the
-    band, and likewise to the left. At dy it spans -(B/A) dy +- sqrt(t/A (1 - (dy/h_y)^2)).
+    dy = -(B/C) h_x, and its reach is a concave function of dy; so within a band of rows it reaches furthest
+    at the nearest dy of the band, and likewise to the left. At dy it spans
+    -(B/A) dy +- sqrt(t/A (1 - (dy/h_y)^2)).
     """
     u, v, half_x, half_y, a, b, c, opacity = ellipses
     tiny = jnp.finfo(a.dtype).tiny  # a conic with an underflowed entry is flat in that direction

@@ -62,19 +62,19 @@ def in_columns(splats: Splats, limits: Limits) -> Columns:
 
 
 class TileState(NamedTuple):
-    """The state of compositing of P pixels. Within loops, more than FEW_CHANNELS are the last axis."""
+    """The compositing state of P pixels. Within loops, more than FEW_CHANNELS channels are the last axis."""
 
     values: Float[Array, "*tiles channels pixels"] | Float[Array, "*tiles pixels channels"]
     light: Float[Array, "*tiles pixels"]  # the transmittance; its negative once the pixel has ended
 
     @property
     def transmittance(self) -> Float[Array, "*tiles pixels"]:
-        """The share of light that still passes."""
+        """The fraction of light that still passes."""
         return jnp.abs(self.light)
 
 
 def start_tile(num_pixels: int, channels: int, dtype=jnp.float32) -> TileState:
-    """The state of pixels that nothing covers yet.
+    """The initial state of pixels, which nothing covers yet.
 
     Args:
         num_pixels: number of pixels, P.
@@ -102,7 +102,7 @@ def splat_alphas(
 def dimmed(
     light: Float[Array, "*pixels"], alphas: Float[Array, "list *pixels"], limits: Limits
 ) -> Float[Array, "*pixels"]:
-    """The light of a TileState behind a list.
+    """The light, as in a TileState, behind a list.
 
     Args:
         light: light in front of the list, as in a TileState.
@@ -140,7 +140,7 @@ def splat_weights(
 def weights_of_many(alphas, light, limits: Limits):
     """`splat_weights` [list, pixels] of a longer list, chunk by chunk, and the light [pixels] behind it.
 
-    Arguments as for `splat_weights`. The derivative is written by hand: one Gaussian after the other.
+    Arguments as for `splat_weights`. The derivative is written by hand: one Gaussian after another.
     """
     weights = []
     for i in range(0, alphas.shape[0], CHUNK):
@@ -152,7 +152,7 @@ def weights_of_many(alphas, light, limits: Limits):
 
 @weights_of_many.defjvp
 def _weights_of_many_jvp(limits: Limits, primals, tangents):
-    """Tangents one Gaussian after the other: the tangents of the products above would be nested products."""
+    """Tangents one Gaussian after another: the tangents of the products above would be nested products."""
 
     def step(carry, entry):
         (light, d_light), (alpha, d_alpha) = carry, entry
@@ -216,7 +216,7 @@ def composite_tile(
 
 
 def _for_loops(state: TileState, channels: int) -> TileState:
-    """A state as the loops have it, and back: many channels last, as rows of a matrix product."""
+    """A state in the layout of the loops, or back: many channels last, as rows of a matrix product."""
     return state._replace(values=state.values.T) if channels > FEW_CHANNELS else state
 
 
@@ -226,7 +226,7 @@ def composite_columns(columns: Columns, pixels, state: TileState, limits: Limits
     Args:
         columns: the chunk.
         pixels: [P, 2], in the same coordinates as the means in `columns`.
-        state: the state before the chunk, as the loops have it.
+        state: the state before the chunk, in the layout of the loops.
         limits: thresholds of alphas and transmittance.
     """
     alphas, dtype = splat_alphas(columns, pixels, limits), state.light.dtype
@@ -314,7 +314,7 @@ def still_read(
 
 def composite_forward(splats: Splats, lists: Lists, reads: Int[Array, "tiles"] | None, plan: Plan):
     """The image of all tiles [tile rows x edge, tile columns x edge, channels], the transmittance of each
-    tile [tiles, pixels], and the entries read of each list [tiles].
+    tile [tiles, pixels], and the number of entries read from each list [tiles].
 
     `reads` from an earlier call groups tiles that end equally early; it does not change the result.
     """
@@ -347,7 +347,7 @@ def composite_forward(splats: Splats, lists: Lists, reads: Int[Array, "tiles"] |
 
     num_tiles = lists.counts.shape[0]
     edges = num_tiles // plan.tiles_x * plan.tile_size, plan.tiles_x * plan.tile_size
-    # On a CPU, many channels go where they belong at once: ordering tiles later takes half as long again.
+    # On a CPU, many channels are written in place at once: reordering tiles later takes half as long again.
     at_once = is_wide and jax.default_backend() == "cpu"
     image = jnp.zeros((*edges, channels), dtype) if at_once else None
     numbers = jnp.arange(batches.tiles.shape[0], dtype=jnp.int32)

@@ -1,7 +1,7 @@
 """Views of fixed Gaussians: projected and listed once, painted as often as their values change.
 
-When only values are trained, such as features on an already fitted scene, a render would project, sort and
-list the same Gaussians in every step. The result is stored here instead, with 28 bytes per Gaussian that the
+When only values are trained, such as features on an already fitted scene, rendering would project, sort and
+list the same Gaussians in every step. Here the result is stored instead, with 28 bytes per Gaussian that the
 view shows and 4 per pair. Gaussians that it does not show, because they are outside or occluded, need no
 values. Nor does an image of many channels have to exist as a whole: it can be painted and consumed strip by
 strip, in rows of tiles.
@@ -31,9 +31,9 @@ class FrozenView(NamedTuple):
     """A camera's view of N Gaussians, independent of the values they are painted with; or a strip of it.
 
     Attributes:
-        rows: which of the N are shown, in the order in which tiles list them.
+        rows: which of the N are shown, in the order in which the tiles list them.
         means2d, conics, opacities: their projections, in pixels of the image or of the strip.
-        ids: indices into `rows`: the lists of all tiles, front to back, only as far as they are read.
+        ids: indices into `rows`: the lists of all tiles, front to back, cut off where reading stops.
         starts, counts: start and length of each tile's list in `ids`.
     """
 
@@ -65,7 +65,7 @@ def freeze_views(
     that cannot be drawn are in no list.
 
     Raises:
-        ValueError: there is no Gaussian; or as `gsjax.plan`.
+        ValueError: there are no Gaussians; or as `gsjax.plan`.
     """
     if len(means) == 0:
         raise ValueError("means: expected at least one Gaussian to see, found none")
@@ -84,12 +84,12 @@ def freeze_views(
 
 
 def padded_view(view: FrozenView, seen: int, pairs: int) -> FrozenView:
-    """One view with `rows` and `ids` padded, so that views can be stacked: with the first of the N Gaussians,
-    which no tile lists for it. On the host.
+    """One view with `rows` and `ids` padded with zeros, so that views can be stacked; no tile lists the
+    padding. On the host.
 
     Args:
         view: the view of one camera.
-        seen: wanted length of `rows` and the fields that go with it.
+        seen: wanted length of `rows` and of the fields that go with it.
         pairs: wanted length of `ids`.
     """
 
@@ -114,11 +114,11 @@ def rows_within(megabytes: float, numbers: int, plan: Plan) -> int:
 
 
 def strip_of(view: FrozenView, plan: Plan, first: Int[Array, ""] | int, rows: int) -> tuple[FrozenView, Plan]:
-    """A strip of `rows` tile rows of a view, from `first` on, and its plan; empty below the image."""
+    """A strip of `rows` tile rows of a view, starting at row `first`, and its plan; empty below the image."""
     wide = plan.tiles_x
 
     def cut(a):
-        padded = jnp.pad(a, (0, rows * wide))  # or a slice that reaches beyond the end would start earlier
+        padded = jnp.pad(a, (0, rows * wide))  # otherwise a slice that reaches beyond the end starts earlier
         return jax.lax.dynamic_slice_in_dim(padded, first * wide, rows * wide)
 
     down = jnp.stack([jnp.zeros(()), first * plan.tile_size]).astype(view.means2d.dtype)

@@ -1,8 +1,8 @@
-"""Binning, compositing and its gradients by the kernels of `kernels/`: the same results as by XLA alone.
+"""Binning, compositing and its gradients by the kernels in `kernels/`, with the same results as in XLA alone.
 
-They are chosen where the platform is CUDA, Warp is installed (`pip install "gsjax[cuda]"`) and numbers are
-float32. Like XLA's loops, the kernels read lists front to back, skip and saturate at the same alphas and stop
-at the same transmittance; images agree to rounding. Many channels are composited in several passes.
+The kernels are used where the platform is CUDA, Warp is installed (`pip install "gsjax[cuda]"`) and numbers
+are float32. Like the loops in XLA, they read lists front to back, skip and saturate at the same alphas and
+stop at the same transmittance; images agree up to rounding. Many channels are composited in several passes.
 """
 
 from collections.abc import Callable
@@ -105,8 +105,8 @@ def _summed(splats: Splats, lists: Lists, reads, d_values, behind, plan: Plan, l
     """Sums over the pixels of each Gaussian: dL/dpower times dx, dy, dx^2, dx dy, dy^2 and 1 [n, 6], where
     (dx, dy) leads from its centre to the pixel, and the gradients of its values [n, channels].
 
-    `behind` is what each pass composites, and in the first one the transmittance, times its gradient
-    [passes, tiles, pixels]. Without it the first result is empty.
+    `behind` [passes, tiles, pixels] is the sum over what each pass composites, and in the first one also the
+    transmittance, times the respective gradients. Without it the first result is empty.
     """
     from gsjax.rasterize.kernels import compositing as kernels
     from gsjax.rasterize.kernels.sums import row_sums
@@ -139,7 +139,7 @@ def _form(passes: Array, channels: int, plan: Plan, lanes: int):
 
 
 def _values_per_pass(channels: int) -> int:
-    """As few passes as possible, of equal size."""
+    """Values per pass, so that passes are as few as possible and of equal size."""
     return -(-channels // -(-channels // MOST_VALUES))
 
 
@@ -163,13 +163,13 @@ def _shapes(splats: Splats, plan: Plan) -> Float[Array, "n 6"]:
 
 
 def _records(shapes: Float[Array, "n 6"], values: Float[Array, "n values"]) -> Float[Array, "numbers"]:
-    """What a kernel reads of each Gaussian, one after the other, as multiples of four numbers."""
+    """The numbers that a kernel reads for each Gaussian, one after another, padded to multiples of four."""
     both = jnp.concatenate([shapes, values], axis=1)
     return jnp.pad(both, ((0, 0), (0, -both.shape[1] % 4))).ravel()
 
 
 def _by_gaussian(lists: Lists, reads: Int[Array, "tiles"], n: int, lanes: int):
-    """The entries that were read in order of their Gaussian, and where each Gaussian's begin [n + 1]."""
+    """The entries that were read, ordered by Gaussian, and where each Gaussian's entries begin [n + 1]."""
     from gsjax.rasterize.kernels.sums import read_ids
 
     keys = read_ids(lists.ids, lists.starts, reads, n, lanes)
@@ -178,11 +178,11 @@ def _by_gaussian(lists: Lists, reads: Int[Array, "tiles"], n: int, lanes: int):
 
 
 def edges(keys: UInt[Array, "entries"], n: int) -> Int[Array, "n_plus_1"]:
-    """Where 0, 1, ... n begin in sorted keys. One program: a GPU would launch a loop step by step.
+    """Where 0, 1, ... n begin in sorted keys. Unrolled, because a GPU would launch a loop step by step.
 
     Args:
         keys: sorted keys.
-        n: the largest key whose begin is wanted.
+        n: the largest key to look for.
     """
     return jnp.searchsorted(keys, jnp.arange(n + 1, dtype=keys.dtype), method="scan_unrolled").astype(
         jnp.int32

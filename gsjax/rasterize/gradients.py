@@ -46,8 +46,8 @@ SMALL = 1e-6  # lower bound of 1 - alpha as a divisor
 def composite(
     splats: Splats, lists: Lists, reads: Int[Array, "tiles"] | None, plan: Plan
 ) -> tuple[Float[Array, "high wide channels"], Float[Array, "tiles pixels"], Int[Array, "tiles"]]:
-    """The image of all tiles, the transmittance that each of them lets pass, and the entries that are read of
-    each list.
+    """The image of all tiles, the transmittance of their pixels, and the number of entries read from each
+    list.
 
     Differentiable in the plan's mode. `reads` from an earlier, similar call makes this one faster; it does
     not change the result.
@@ -92,7 +92,7 @@ def _composite_bwd(plan: Plan, residuals, cotangents):
 
 
 def _reader(image: Float[Array, "high wide channels"], plan: Plan):
-    """A function that gives some tiles of an image, in the layout in which they are composited."""
+    """A function that returns some tiles of an image, in the layout in which they are composited."""
     if image.shape[-1] > FEW_CHANNELS:
         return partial(read_tiles, image, plan=plan)
     tiles = in_tiles(image, plan)
@@ -107,7 +107,7 @@ def _gradients(splats: Splats, lists: Lists, reads, kept, cotangents, plan: Plan
     cotangent_of = _reader(d_image, plan)
     if channels > FEW_CHANNELS:
         behind = in_tiles((image * d_image).sum(axis=-1, keepdims=True), plan)[:, 0]
-    else:  # channel after channel: along the last axis XLA:CPU adds four in another order
+    else:  # channel by channel: along the last axis XLA:CPU adds four of them in another order
         behind = (in_tiles(image, plan) * in_tiles(d_image, plan)).sum(axis=1)
     behind += d_transmittance * transmittance
     constants = {"pixels": pixels, "monomials": _monomials(pixels), "limits": plan.limits}

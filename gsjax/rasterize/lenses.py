@@ -1,4 +1,4 @@
-"""How a camera maps points to its image, linearised at each Gaussian's centre: pinholes and fisheyes."""
+"""Mappings from points to the image, linearised at each Gaussian's centre, for pinholes and fisheyes."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -12,8 +12,8 @@ from gsjax.rasterize.plan import Plan
 
 Columns = Float[Array, "rows lanes"]
 
-_NEAR_AXIS = 0.01  # squared sine of the angle off axis below which series are summed
-_ANGLES = np.arange(1, 193) / 64  # off axis, radians: up to 172 degrees, for behind it all directions meet
+_NEAR_AXIS = 0.01  # squared sine of the angle off axis below which series are used
+_ANGLES = np.arange(1, 193) / 64  # off axis, radians: up to 172 degrees, since at 180 all directions meet
 
 
 class Linearised(NamedTuple):
@@ -23,7 +23,7 @@ class Linearised(NamedTuple):
     y: Columns  # times depth
     depth: Columns  # z; of a fisheye the distance from the camera
     slopes: Callable  # a direction in the camera's frame -> its image under the Jacobian, times depth
-    seen: Bool[Array, "rows lanes"] | None  # where a fisheye's mapping is one to one; None: wherever z > 0
+    seen: Bool[Array, "rows lanes"] | None  # where a fisheye's mapping is one-to-one; None: wherever z > 0
 
 
 def pinhole(local: list[Columns], K: Float[Array, "3 3"], plan: Plan) -> Linearised:
@@ -32,11 +32,11 @@ def pinhole(local: list[Columns], K: Float[Array, "3 3"], plan: Plan) -> Lineari
     Args:
         local: x, y and z in the camera's frame.
         K: intrinsics, pixels.
-        plan: has the size of the image.
+        plan: gives the size of the image.
     """
     x, y, z = local
     fx, cx, fy, cy = K[0, 0], K[0, 2], K[1, 1], K[1, 2]
-    # Far outside the image the linearisation would blow up: its x/z is clamped to near the frame.
+    # Far outside the image the linearisation would blow up, so its x/z is clamped to near the frame.
     margin_x, margin_y = 0.15 * plan.width / fx, 0.15 * plan.height / fy
     tx = jnp.clip(x / z, -cx / fx - margin_x, (plan.width - cx) / fx + margin_x)
     ty = jnp.clip(y / z, -cy / fy - margin_y, (plan.height - cy) / fy + margin_y)
@@ -52,8 +52,8 @@ def pinhole(local: list[Columns], K: Float[Array, "3 3"], plan: Plan) -> Lineari
 def fisheye(local: list[Columns], coeffs: Float[Array, "4"]) -> Linearised:
     """A fisheye, by the model of Kannala and Brandt.
 
-    In OpenCV's form of it (PAMI 28(8), 2006), with the unit vector n to a point and its angle theta off
-    axis, the image is F A (n_x, n_y), where
+    In OpenCV's form of the model (PAMI 28(8), 2006), with the unit vector n to a point and its angle theta
+    off axis, the image is F A (n_x, n_y), where
 
         A = theta / sin(theta)          F = 1 + k1 theta^2 + k2 theta^4 + k3 theta^6 + k4 theta^8
 
@@ -62,8 +62,8 @@ def fisheye(local: list[Columns], coeffs: Float[Array, "4"]) -> Linearised:
 
         s = (D A^2 cos(theta) - F B) (n_x v_x + n_y v_y) - P v_z
 
-    A and B are smooth on the axis, where series replace their quotients. What lies beyond the first angle at
-    which P is not positive, where the lens folds back, is not seen.
+    A and B are smooth on the axis, where series replace their quotients. Points beyond the first angle at
+    which P is not positive, where the lens folds back, are not seen.
 
     Args:
         local: x, y and z in the camera's frame.

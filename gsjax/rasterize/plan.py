@@ -1,8 +1,9 @@
-"""A Plan: the static half of a rasterization. Image size, options, capacities; never values of a scene.
+"""Plans: the static part of a rasterization. Image size, options and capacities; never values of a scene.
 
-The idea is jax-md's neighbour list: shapes are fixed in advance with some headroom, the device reports what
-it needed, and the host re-plans if the capacity was too small. Capacities climb one geometric ladder, so that
-a growing scene compiles only a few variants, and re-planning on a known rung compiles nothing.
+The idea is that of jax-md's neighbour lists: shapes are fixed in advance with some headroom, the device
+reports what it needed, and the host re-plans if the capacity was too small. Capacities are rungs of a single
+geometric ladder, so that a growing scene compiles only a few variants, and re-planning on a known rung
+compiles nothing.
 """
 
 import dataclasses
@@ -46,8 +47,8 @@ class Plan:
 
     Attributes:
         width, height: image size in pixels.
-        capacity: most Gaussian-tile pairs of one camera, and twice the most tile rows that its Gaussians may
-            cross.
+        capacity: largest number of Gaussian-tile pairs of one camera, and twice the largest number of tile
+            rows that its Gaussians may cross.
         near_plane, far_plane: depths between which Gaussians are drawn, metres.
         eps2d: variance added to projected Gaussians, square pixels.
         sh_degree: None if colours are values, else the degree up to which their coefficients are used.
@@ -153,7 +154,7 @@ class Plan:
         return self.tiles_per_batch or max(1, pixels // self.tile_pixels)
 
     def grown(self, needed: int | Int[Array, ""], headroom: float = 1.0) -> "Plan":
-        """The same plan on the lowest rung that holds `needed` pairs, and never below this one.
+        """The same plan on the lowest rung that holds `needed` pairs times `headroom`, never below this one.
 
         Raises:
             ValueError: `needed` is negative, or 2^31 - 1, which stands for more than can be counted; or
@@ -182,13 +183,13 @@ Drawn = TypeVar("Drawn")
 def with_room(
     draw: Callable[[Plan], tuple[Drawn, Any]], plan: Plan, headroom: float = HEADROOM
 ) -> tuple[Drawn, Plan]:
-    """What `draw(plan)` returns, and a plan that held it: that one, grown as often as it overflows. For loops
-    on the host.
+    """The result of `draw(plan)`, with the plan grown until nothing overflows, and that plan. For loops on
+    the host.
 
     Args:
         draw: plan -> (result, meta), whose `overflow` and `needed` are those of a rasterization.
         plan: the plan to begin with.
-        headroom: how many times as much as was needed a grown plan holds, 1 or more.
+        headroom: capacity of a grown plan as a multiple of what was needed, 1 or more.
     """
     while True:
         drawn, meta = draw(plan)

@@ -146,7 +146,7 @@ def project_gaussians(
     def linearised(local, K, coeffs):
         return pinhole(local, K, plan) if coeffs is None else fisheye(local, coeffs)
 
-    mean, quat, scale = (columns_in_lanes(a) for a in (means, quats, scales))  # lists of their numbers
+    mean, quat, scale = (columns_in_lanes(a) for a in (means, quats, scales))  # lists of columns
     opacities, usable = in_lanes(opacities), in_lanes(usable)
     offset = [] if means2d_offset is None else columns_in_lanes(means2d_offset)
     sound = _all_finite([*mean, *quat, *scale, opacities, *offset]) & usable & camera_finite
@@ -179,7 +179,7 @@ def project_gaussians(
     visible = _stored(sound & in_range & has_area & (reach > 0) & in_frame)
 
     # Then again, on inputs whose invisible rows are harmless: their gradients are zero, and never 0 * inf.
-    # What is harmless depends on the camera: its first visible row is. One that sees nothing is replaced.
+    # What is harmless depends on the camera: its first visible row is. A camera without any is replaced.
     sees = visible.any()
     viewmat = jnp.where(sees, viewmat, jnp.eye(4, dtype=viewmat.dtype))
     K = jnp.where(sees, K, jnp.eye(3, dtype=K.dtype))
@@ -201,7 +201,7 @@ def project_gaussians(
     if offset:
         means2d = [c + d for c, d in zip(means2d, kept(offset, (0.0, 0.0)), strict=True)]
 
-    # Without the barrier XLA:GPU computes the whole projection once more for every column that is stacked.
+    # Without the barrier XLA:GPU would recompute the whole projection for every column that is stacked.
     columns = (means2d, conics, at.depth, opacities, kept((half_x, half_y), (0.0, 0.0)))
     means2d, conics, depths, opacities, extents = jax.lax.optimization_barrier(columns)
 

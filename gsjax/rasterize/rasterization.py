@@ -95,8 +95,8 @@ def rasterization(
         width, height: image size, static.
         plan: capacities and options, from `gsjax.plan`. Without one the call makes its own, which needs
             concrete values: under jit or vmap, plan outside and pass it in.
-        fisheye: coefficients k1 to k4 of fisheye cameras (Kannala and Brandt 2006, as OpenCV has them; zeros
-            for an equidistant one); then depths are distances from the camera, for it may see beyond 90
+        fisheye: coefficients k1 to k4 of fisheye cameras (Kannala and Brandt 2006, in OpenCV's form; zeros
+            for an equidistant one). Depths are then distances from the camera, because it may see beyond 90
             degrees off its axis. Default: pinhole cameras.
         near_plane, far_plane: depths between which Gaussians are drawn (default 0.01, 1e10).
         eps2d: variance added on the image, square pixels (default 0.3).
@@ -246,7 +246,7 @@ def _rasterize(views: Views, plan: Plan, batch: tuple[int, ...]):
 
 
 def _draw(projected: Projected, values: Float[Array, "views n channels"], mask, reads, plan: Plan):
-    """Bin and composite all views at once, every view's tiles after the last one's."""
+    """Bin and composite all views at once, with the tiles of each view after those of the previous one."""
     num_views, n, channels = values.shape
     if num_views * max(n, plan.capacity + LANES) >= 2**31:
         raise ValueError(
@@ -270,7 +270,7 @@ def _draw(projected: Projected, values: Float[Array, "views n channels"], mask, 
 
 
 def _bin_views(projected: Projected, mask, plan: Plan):
-    """The lists of all views, one after the other, and the pairs, needed capacity and overflow of each."""
+    """The lists of all views, one after another, and the pairs, needed capacity and overflow of each."""
     views, n = projected.depths.shape
 
     def in_xla(projected, mask):

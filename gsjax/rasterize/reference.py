@@ -1,8 +1,9 @@
-"""The rasterizer written as slowly and plainly as possible: every Gaussian at every pixel, in float64.
+"""A reference rasterizer, as plain and as slow as possible: every Gaussian at every pixel, in float64.
 
-It shares no code with the fast path. Its gradients are plain autodiff. It also marks the pixels whose value
-depends on a comparison that rounding could reverse (the thresholds of alpha, the early stop, the order of
-nearly equal depths); there, two correct renderings may differ by up to 1/255.
+Apart from spherical harmonics it shares no code with the fast path, and its gradients are plain autodiff. It
+also marks the pixels whose value depends on a comparison that rounding could reverse (the thresholds of
+alpha, the early stop, the order of nearly equal depths); there, two correct renderings may differ by up to
+1/255.
 """
 
 from typing import NamedTuple
@@ -13,20 +14,20 @@ from jaxtyping import Array, Bool, Float
 
 from gsjax.geometry.spherical_harmonics import evaluate_sh
 
-_DOUBT = 1e-5  # relative distance to a threshold at which float32 may decide otherwise
+_DOUBT = 1e-5  # relative distance to a threshold within which float32 may decide otherwise
 _TIE = 5e-7  # the same for two depths: a few units in the last place of float32
 _BLOCK = 256  # pixels at once; affects only speed and memory
 _VISIBLE = 1e-3  # below this transmittance a flip changes a pixel by less than 4e-6
 
 
 class Reference(NamedTuple):
-    """The images of one camera, and which of their pixels may be off.
+    """The images of one camera, and which of their pixels are uncertain.
 
     Attributes:
         colors: channels selected by `render_mode`; depth comes last.
         alphas: 0 to 1.
         features: None if none were given.
-        doubtful: pixels that depend on a comparison which rounding could reverse.
+        doubtful: pixels that depend on a comparison that rounding could reverse.
     """
 
     colors: Float[Array, "height width d"]
@@ -104,8 +105,8 @@ def rasterization_reference(
     alpha_max: float = 0.99,
     min_transmittance: float = 1e-4,
 ) -> Reference:
-    """One scene in one camera, exactly; arguments as for `gsjax.rasterization`. All rows must be drawable,
-    and none lie exactly on the axis of a fisheye."""
+    """Render one scene in one camera, exactly; arguments as for `gsjax.rasterization`. All Gaussians must be
+    drawable, and none may lie exactly on the axis of a fisheye."""
     antialiased = rasterize_mode == "antialiased"
     means2d, conics, depths, opacities = jax.vmap(
         lambda *g: _splat(*g, viewmat, K, width, height, eps2d, antialiased, fisheye)

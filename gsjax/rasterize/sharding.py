@@ -1,4 +1,4 @@
-"""Cameras and scenes over a mesh of devices: each device draws its own, Gaussians are shared.
+"""Rasterization over a mesh of devices: each device draws its own cameras or scenes; Gaussians are shared.
 
 The image of a camera depends only on that camera and its scene, so drawing needs no communication. Only the
 backward pass does: a Gaussian drawn by several devices receives the sum of their gradients.
@@ -77,7 +77,7 @@ def sharded_rasterization(
 
 
 def _shape_of(array):
-    """Shape and type for the checks, without sharding: their reshapes would not allow an explicit one."""
+    """Shape and type for the checks, without sharding: their reshapes do not support an explicit one."""
     return jax.ShapeDtypeStruct(array.shape, array.dtype) if hasattr(array, "dtype") else array
 
 

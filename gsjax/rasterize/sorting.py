@@ -43,8 +43,8 @@ def _repeat_into(values: np.ndarray, starts: np.ndarray, out: np.ndarray) -> Non
 
 
 def _lists_into(items: np.ndarray, firsts: np.ndarray, counts: np.ndarray, out, edges) -> None:
-    # A sparse matrix of entries and lists: in compressed rows it is what is given, in compressed columns what
-    # is wanted, and scipy turns one into the other by counting.
+    # In a sparse matrix of entries by lists, the input is its compressed rows and the output its compressed
+    # columns, and scipy converts one to the other by counting.
     for item, first, count, filled, edge in _rows(items, firsts, counts, out, edges):
         ends = np.cumsum(count, dtype=np.int32)
         pointers = np.append(np.int32(0), ends)
@@ -56,7 +56,7 @@ def _lists_into(items: np.ndarray, firsts: np.ndarray, counts: np.ndarray, out, 
 
 
 def _rows(*arrays: np.ndarray) -> Iterator[tuple[np.ndarray, ...]]:
-    """The arrays' last axes, together."""
+    """Rows along the last axis of each array, in parallel."""
     return zip(*(a.reshape(math.prod(a.shape[:-1]), a.shape[-1]) for a in arrays), strict=True)
 
 
@@ -68,7 +68,7 @@ _WORK = {
 }
 _AVAILABLE = all([register(name, work) for name, work in _WORK.items()])
 CUSTOM_CALLS = tuple(_WORK)
-"""Names of the custom calls, for those who export programs."""
+"""Names of the custom calls, which the export of programs needs."""
 
 
 def _either(name: str, where: str, on_device: Callable, result, *arguments: Array) -> Any:
@@ -98,11 +98,11 @@ def running_sum(counts: Int[Array, "n"], where: str = "host") -> Int[Array, "n"]
 def repeat(
     values: Int[Array, "n"] | UInt32[Array, "n"], starts: Int[Array, "n"], length: int, where: str = "host"
 ) -> Array:
-    """[length]: `values[i]` from `starts[i]` to the next start. `where` as in `argsort_keys`.
+    """An array [length] of `values[i]` from `starts[i]` to the next start. `where` as in `argsort_keys`.
 
     Args:
         values: any values; their differences may wrap.
-        starts: non-decreasing. If several values start at the same place, the last one counts.
+        starts: non-decreasing. If several values start at the same index, the last one counts.
         length: length of the result; values that start beyond it are left out.
     """
 
@@ -125,10 +125,10 @@ def lists(
     length: int,
     where: str = "host",
 ) -> tuple[Int[Array, "length"], Int[Array, "edges"]]:
-    """Entries that each go into consecutive lists, list by list.
+    """Lists of items, from entries that each put an item into a range of consecutive lists.
 
     Args:
-        items: what is listed, non-decreasing, 0 to `num_items` - 1.
+        items: the item of each entry, non-decreasing, 0 to `num_items` - 1.
         firsts: the first list of each entry.
         counts: number of lists of each, 0 or more.
         num_items: number of different items.
@@ -137,8 +137,8 @@ def lists(
         where: as in `argsort_keys`.
 
     Returns:
-        The lists one after the other, each in ascending order, then any items; and where each list starts,
-        and after these where the last one ends.
+        The lists one after another, each in ascending order, padded with arbitrary items; and where each list
+        starts, followed by where the last one ends.
     """
 
     def on_device(items, firsts, counts):

@@ -1,7 +1,7 @@
-"""Tiles and the image that they make.
+"""Conversion between tiles and the image that they form.
 
-A tile is its pixels in one axis, row by row. Few channels are composited as [channels, pixels], and many as
-[pixels, channels], in which they also lie in the image: a row of a tile is one piece of memory there.
+The pixels of a tile lie along one axis, row by row. Few channels are composited as [channels, pixels], many
+as [pixels, channels], which is also their layout in the image: there, a row of a tile is contiguous.
 """
 
 import jax
@@ -26,13 +26,14 @@ def write_tiles(
     count: Int[Array, ""] | int,
     plan: Plan,
 ) -> Float[Array, "high wide channels"]:
-    """The image with some of its tiles replaced, one after the other: for CPUs.
+    """The image with some of its tiles replaced, one after another: for CPUs.
 
     Args:
         image: the image of all tiles.
-        tiles: which are replaced.
-        values: their values.
-        count: how many are, from the first on. Under vmap it should be one number, or each tile costs a copy.
+        tiles: indices of the tiles to replace.
+        values: their new values.
+        count: how many of them to replace, from the first on. Under vmap it should not be batched, or each
+            tile costs a copy.
         plan: determines the size of a tile.
     """
     edge = plan.tile_size
@@ -51,7 +52,7 @@ def read_tiles(
 
     Args:
         image: the image of all tiles.
-        tiles: which are wanted.
+        tiles: indices of the wanted tiles.
         plan: determines the size of a tile.
     """
     size = plan.tile_size, plan.tile_size, image.shape[-1]
@@ -70,7 +71,7 @@ def _corner(tile: Int[Array, ""], plan: Plan):
 
 
 def untile(tiles: Float[Array, "tiles channels pixels"], plan: Plan) -> Float[Array, "high wide channels"]:
-    """The image of all tiles, those of several views below each other."""
+    """The image of all tiles, with those of several views one below another."""
     edge, wide = plan.tile_size, plan.tiles_x
     num_tiles, channels, _ = tiles.shape
     apart = tiles.reshape(num_tiles // wide, wide, channels, edge, edge)
@@ -88,6 +89,6 @@ def in_tiles(image: Float[Array, "high wide channels"], plan: Plan) -> Float[Arr
 def of_views(
     image: Float[Array, "high wide channels"], shape: tuple[int, ...], plan: Plan
 ) -> Float[Array, "*shape height width channels"]:
-    """The images of the views, [*shape] of them, in the plan's size."""
+    """The images of the views, [*shape] of them, cropped to the plan's size."""
     apart = image.reshape(*shape, plan.tiles_y * plan.tile_size, *image.shape[1:])
     return apart[..., : plan.height, : plan.width, :]

@@ -26,7 +26,7 @@ class Views(NamedTuple):
 
 
 def usable(views: Views) -> Bool[Array | np.ndarray, "b n"]:
-    """Gaussians whose values can be drawn: overflowing squares would corrupt others' gradients."""
+    """Gaussians whose values can be drawn: squares that overflow would corrupt the gradients of others."""
 
     def paintable(a):
         a = a.astype(views.means.dtype)

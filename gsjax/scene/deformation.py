@@ -1,4 +1,4 @@
-"""Scenes that deform: a field that gives offsets for each Gaussian at a time, and the deformed Gaussians.
+"""Deforming scenes: a field of offsets for each Gaussian at a given time, and the deformed Gaussians.
 
     mean' = mean + dmean,    scale' = exp(log s + ds)
     q' = Exp(dw) q                    SurstSplat, eq. 4: dw an axis times an angle
@@ -215,7 +215,7 @@ def deform(gaussians: Gaussians, offsets: Offsets) -> Gaussians:
 
 class Nodes(NamedTuple):
     """Control nodes: the field is evaluated there instead of at every Gaussian, and the offsets are blended,
-    as deformations are smoother than Gaussians are dense (Sumner et al. 2007; SC-GS, Huang et al. 2024).
+    because deformations vary slowly between Gaussians (Sumner et al. 2007; SC-GS, Huang et al. 2024).
 
     Attributes:
         rows: the Gaussians that are nodes.

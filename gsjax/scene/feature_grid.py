@@ -9,9 +9,9 @@ Level l has a resolution N_l, with b such that resolutions range from the least 
 A position x, 0 to 1 within the box, lies at (N_l - 1) x + 1/2 among the vertices 0, 1, ... N_l of each axis,
 and its features are interpolated between the eight vertices around it. Scale and offset are those of
 tiny-cuda-nn, the paper's own code, so that a field means the same here as there; the offset prevents the
-cells of all levels from starting together on the faces of the box. There are two differences. tiny-cuda-nn
-scales by b^l N_min - 1, without the floor. And it has entries for N_l vertices per axis, so that the last
-vertex, which half a cell needs, shares an entry with another; here it has its own.
+cells of all levels from starting together on the faces of the box. There are two differences: tiny-cuda-nn
+scales by b^l N_min - 1, without the floor; and it has entries for N_l vertices per axis, so that the last
+vertex, which half a cell needs, shares an entry with another, while here it has its own.
 
 A level whose vertices, (N_l + 1)^3, all fit the table is dense: each has its own entry. In finer levels they
 share entries by the paper's hash (eq. 4).

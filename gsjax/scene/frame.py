@@ -1,4 +1,4 @@
-"""What a set of cameras saw at one moment: the one observation that every loss and method takes."""
+"""Observations of a set of cameras at one moment: the form of input that all losses and methods share."""
 
 from functools import partial
 from typing import Any, TypeVar
@@ -23,7 +23,7 @@ class Frame(eqx.Module):
         depths: metres along the optical axis, 0 where unknown; None without depth cameras.
         cameras: C cameras (viewmat [C,4,4], K [C,3,3]), which may move from frame to frame.
         masks: the pixels that count; None if all do.
-        time: when it was seen, 0 to 1 over the recording; None for a scene that stands still.
+        time: when it was recorded, 0 to 1 over the recording; None for a static scene.
     """
 
     images: Float[Array | np.ndarray, "c height width 3"] | UInt8[Array | np.ndarray, "c height width 3"]
@@ -41,7 +41,7 @@ class Frame(eqx.Module):
 
     @property
     def known_depths(self) -> Float[np.ndarray, "c height width"]:
-        """On the host: depths of surfaces (`on_surfaces`) where they count, else 0; zeros without depth."""
+        """Depths of surfaces (`on_surfaces`) within the masks, else 0; zeros without depth. On the host."""
         if self.depths is None:
             return np.zeros(self.images.shape[:-1], np.float32)
         depths = on_surfaces(np.asarray(self.depths))
@@ -49,7 +49,7 @@ class Frame(eqx.Module):
 
 
 def of_cameras(frame: Frame, which: slice | Int[Array | np.ndarray, "k"]) -> Frame:
-    """The frame as some of its cameras saw it."""
+    """The frame with only some of its cameras."""
     images, depths, cameras, masks = jax.tree.map(
         lambda a: a[which], (frame.images, frame.depths, frame.cameras, frame.masks)
     )
@@ -72,14 +72,14 @@ def _chosen(seen: Any, which: slice | Int[Array | np.ndarray, "k"]) -> Any:
 
 
 def part_of(frame: Frame, cameras: tuple[int, ...] = (), shrink: int = 1) -> Frame:
-    """The frame of some cameras (all unless given), in smaller pictures.
+    """The frame of some cameras (default: all), in smaller images.
 
-    Colours are means over blocks of `shrink` by `shrink` pixels; depths and masks are those of one pixel in
-    the block's middle, for a mean of depths would lie between surfaces. Rows and columns that fill no block
-    are left out.
+    Colours are means over blocks of `shrink` by `shrink` pixels; depths and masks are those of a pixel in the
+    middle of the block, since a mean of depths could lie between surfaces. Incomplete blocks at the right and
+    bottom are left out.
 
     Raises:
-        ValueError: there is no such camera, or nothing is left of the pictures.
+        ValueError: there is no such camera, or nothing is left of the images.
     """
     if cameras:
         count = len(frame.images)
@@ -106,7 +106,7 @@ def part_of(frame: Frame, cameras: tuple[int, ...] = (), shrink: int = 1) -> Fra
 
 
 def without_broken(frame: Frame) -> tuple[Frame, Int[Array, ""]]:
-    """The frame with pixels that are not finite made black and without depth, as `Sequence` reads them, and
+    """The frame with pixels that are not finite set to black and to depth 0, as `Sequence` reads them, and
     their number. Such a pixel would otherwise turn every sum that it enters into NaN."""
     frame = Frame(frame.colors, frame.depths, frame.cameras, frame.masks, frame.time)
     broken = ~jnp.isfinite(frame.images).all(-1)
@@ -119,5 +119,5 @@ def without_broken(frame: Frame) -> tuple[Frame, Int[Array, ""]]:
         depths = None if frame.depths is None else jnp.where(broken, 0.0, frame.depths)
         return Frame(images, depths, frame.cameras, frame.masks, frame.time)
 
-    # Where there is nothing to mend, what reads the images is not slowed by the question, pixel for pixel.
+    # A branch: where there is nothing to mend, readers of the images are not slowed by a test of each pixel.
     return jax.lax.cond(count > 0, mended, lambda: frame), count

@@ -19,7 +19,7 @@ from gsjax.geometry.spherical_harmonics import num_sh_bases, rgb_to_sh0
 _MIN_SCALE = 1e-12
 _MIN_OPACITY = 1e-6
 FLAT, OPAQUE = math.log(_MIN_SCALE), math.log1p(-_MIN_OPACITY) - math.log(_MIN_OPACITY)
-"""The log scale of a Gaussian without thickness, and the logit of one that hides all behind it."""
+"""The log scale of a Gaussian without thickness, and the logit of one that hides everything behind it."""
 SH_SIZES = tuple(num_sh_bases(degree) for degree in range(4))
 
 
@@ -161,7 +161,7 @@ def gaussians_from_activated(
 
 
 def _on_device(value: Any, dtype: Any) -> Array:
-    """An array of this type; what is on the host is converted there, without a program for each shape."""
+    """An array of this type; host arrays are converted on the host, without a program for each shape."""
     return (
         jnp.asarray(value, dtype)
         if isinstance(value, jax.Array)
@@ -171,7 +171,7 @@ def _on_device(value: Any, dtype: Any) -> Array:
 
 @jax.jit
 def _raw(activated: dict[str, Array]) -> tuple[Array, Array, Array]:
-    """Log scales, opacity logits, and sh0. A single program, because few counts of Gaussians occur twice."""
+    """Log scales, opacity logits, and sh0. A single program, as most numbers of Gaussians occur only once."""
     opacities = jnp.clip(activated["opacities"], _MIN_OPACITY, 1 - _MIN_OPACITY)
     logits = jnp.log(opacities) - jnp.log1p(-opacities)
     log_scales = jnp.log(jnp.maximum(activated["scales"], _MIN_SCALE))
@@ -246,7 +246,7 @@ def valid_rows(gaussians: Gaussians) -> Bool[np.ndarray, "N"]:
 
 
 def cull_invalid(gaussians: Gaussians) -> tuple[Gaussians, int]:
-    """Remove rows with NaN, infinity or a quaternion of |q|^2 < 1e-12; returns the rest and how many went."""
+    """Remove rows with NaN, infinity or |q|^2 < 1e-12; returns the rest and the number of rows removed."""
     valid = valid_rows(gaussians)
     removed = int(np.sum(~valid))
     return (gaussians if removed == 0 else take(gaussians, np.flatnonzero(valid))), removed

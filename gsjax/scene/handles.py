@@ -5,7 +5,7 @@ with weights w moves as in MotionSplicer, section 3.3:
 
     mean' = sum_p w_p (R_p (mean - c_p) + c_p + T_p)
 
-The paper's formula for the orientation, quat(sum_p w_p R_p^T R(q)), turns the wrong way, and a sum of
+The paper's formula for the orientation, quat(sum_p w_p R_p^T R(q)), rotates the wrong way, and a sum of
 rotations is not a rotation; `Blend` selects how they are blended instead.
 """
 
@@ -145,7 +145,7 @@ def _polar(weights: Float[Array, "N P"], quats: Float[Array, "P 4"]) -> Float[Ar
 
 
 def _inverse(matrices: Float[Array, "N 3 3"]) -> Float[Array, "N 3 3"]:
-    """Inverses by cofactors: a solver would cost more than all the rest."""
+    """Inverses by cofactors: a linear solver would cost more than all the rest."""
     a, b, c = jnp.moveaxis(matrices, -2, 0)
     rows = jnp.stack([jnp.cross(b, c), jnp.cross(c, a), jnp.cross(a, b)], axis=-1)
     return rows / jnp.sum(a * jnp.cross(b, c), axis=-1)[:, None, None]

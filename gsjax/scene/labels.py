@@ -29,7 +29,7 @@ def lift_labels(
 ) -> Int[np.ndarray, "N"]:
     """Labels of the points that one view sees, from its mask; -1 for the others.
 
-    A point is seen if its projection falls in the picture and its z is within `max_depth_gap` metres of the
+    A point is seen if its projection lies in the image and its z is within `max_depth_gap` metres of the
     depth there, so an object in front does not label what is behind it.
 
     Args:
@@ -38,7 +38,7 @@ def lift_labels(
         depth: z-depth in metres; invalid values are 0, negative or not finite.
         viewmat: world to camera.
         K: intrinsics, pixels.
-        max_depth_gap: metres.
+        max_depth_gap: largest difference between a point's z and the depth of its pixel, metres.
 
     Raises:
         ValueError: mask and depth differ in size, or no pixel has depth, so that nothing can be lifted.
@@ -76,7 +76,7 @@ def inherit_labels(
     objects are mostly convex, and separate objects mostly meet in a crease (the criterion of Stein et al.,
     "Object Partitioning using Local Convexity", CVPR 2014). So the far side of a box takes the box's label
     over its edge, not that of the table it stands on. Points that no path reaches become background, 0:
-    without a limit, labels bleed into what the view could not see.
+    without a limit on paths, labels would bleed into what the view could not see.
 
     Args:
         points: metres.
@@ -134,7 +134,7 @@ def _neighbor_pairs(points: np.ndarray, max_step: float) -> tuple[np.ndarray, np
 
 
 def _path_lengths(points, normals, begins, ends) -> np.ndarray:
-    """Length of each step, plus a cost for its turn if concave: normals then lean towards each other."""
+    """Length of each step, plus a cost for its bend if concave: normals then lean towards each other."""
     along = points[begins] - points[ends]
     before, after = normals[begins], normals[ends]
     turn = np.arccos(np.clip(np.sum(before * after, axis=1), -1, 1))
@@ -144,7 +144,7 @@ def _path_lengths(points, normals, begins, ends) -> np.ndarray:
 
 
 def _warn_of_lost_labels(mask: np.ndarray, labels: np.ndarray) -> None:
-    """Warn of labels that have pixels but reached no point."""
+    """Warn about labels that have pixels but reached no point."""
     lost = sorted({*np.unique(mask).tolist()} - {BACKGROUND_LABEL, *np.unique(labels).tolist()})
     if lost:
         warnings.warn(f"mask: label {lost} reached no point (no depth there, or no points)", stacklevel=3)

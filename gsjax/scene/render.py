@@ -61,7 +61,7 @@ def render(
 
     Args:
         gaussians: the scene.
-        cameras: C cameras, viewmat [C,4,4] and K [C,3,3]; of fisheyes fisheye [C,4].
+        cameras: C cameras, viewmat [C,4,4] and K [C,3,3], and fisheye [C,4] for fisheyes.
         plan: from `plan_render`; required under jit.
         features: values composited with the colours (default: the scene's own features).
         backgrounds, roi, means2d_offset: as for `gsjax.rasterization`.
@@ -101,7 +101,7 @@ def render(
 
 @partial(jax.jit, static_argnums=3, inline=True)
 def _rendered(images: Array, alphas: Array, meta: Meta, each_alone: bool) -> Rendered:
-    """What was rasterized; with `each_alone`, each camera as a scene of its own, whose axis goes."""
+    """The rasterizer's results as `Rendered`; with `each_alone`, each camera was a scene of its own."""
     if each_alone:
         images, alphas, meta = jax.tree.map(lambda a: a[:, 0], (images, alphas, meta))
     return Rendered(images[..., :3], images[..., 3], alphas[..., 0], meta.features, meta)
@@ -116,8 +116,8 @@ def render_with_room(
     rasterize_mode: str = "classic",
     headroom: float = HEADROOM,
 ) -> tuple[Rendered, Plan]:
-    """The result of `render` and a plan that is large enough for it: the given one, made or grown if needed.
-    For host loops over views of one size.
+    """The result of `render`, and a plan that is large enough for it: the given one, grown if needed, or a
+    new one. For host loops over views of one size.
 
     Args:
         gaussians, cameras, backgrounds: as for `render`.

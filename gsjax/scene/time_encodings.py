@@ -1,6 +1,6 @@
 """Encodings of position and time for deformation fields: planes, sinusoids, or voxels.
 
-Positions are 0 to 1 along each axis of the scene's box, the time 0 to 1 over the whole recording.
+Positions range from 0 to 1 along each axis of the scene's box, the time from 0 to 1 over the whole recording.
 """
 
 from itertools import product
@@ -76,13 +76,13 @@ class HexPlane(eqx.Module):
 def init_hexplane(
     key: PRNGKeyArray, resolution: int, time_resolution: int, levels: int, channels: int
 ) -> HexPlane:
-    """Spatial planes initialised from 0.1 to 0.5 and time planes to 1 (K-Planes, Fridovich-Keil et al. 2023):
-    at first nothing depends on the time.
+    """Spatial planes initialised uniformly from 0.1 to 0.5 and time planes to 1 (K-Planes, Fridovich-Keil et
+    al. 2023): at first nothing depends on time.
 
     Args:
         key: random key for the spatial planes.
         resolution: vertices per side of the coarsest planes; each level doubles it.
-        time_resolution: vertices along the time, on all levels.
+        time_resolution: vertices along the time axis, on all levels.
         levels: number of levels.
         channels: channels per vertex.
     """
@@ -114,7 +114,7 @@ def _line(planes: Float[Array, "3 T R F"], time: Float[Array, ""]) -> Float[Arra
 
 
 class Sinusoids(eqx.Module):
-    """Positions and the time, with their sines and cosines of 1, 2, 4, ... half periods over the whole range.
+    """Positions and time, and their sines and cosines of 1, 2, 4, ... half periods over the whole range.
 
     Attributes:
         frequencies: number of frequencies.
@@ -141,8 +141,8 @@ def sinusoids(values: Float[Array, "N D"], frequencies: int) -> Float[Array, "N 
 
 
 class Voxels(eqx.Module):
-    """Dense neural voxels (SurstSplat, section 2.1) with sinusoids of the time. The voxels represent what is
-    where, "organ or background", so semantic features are read from them too.
+    """Dense neural voxels (SurstSplat, section 2.1) with sinusoids of time. The voxels encode what is where,
+    "organ or background", so semantic features are read from them too.
 
     Attributes:
         grid: a single dense level, whose network is the projection to semantic features.
@@ -163,7 +163,7 @@ class Voxels(eqx.Module):
         return jnp.concatenate([here, jnp.broadcast_to(waves, (len(places), waves.shape[1]))], axis=-1)
 
     def meaning(self, places: Float[Array, "N 3"]) -> Float[Array, "N outputs"]:
-        """Semantic features of positions, the same at all times."""
+        """Semantic features at positions, the same at all times."""
         return self.grid(places)
 
 
