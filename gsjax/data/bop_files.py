@@ -21,9 +21,8 @@ from gsjax.data.validation import check_poses
 
 MM = 0.001
 MODELS, INFO = "models_eval", "models_info.json"
-_NUM_ROTATIONS = (
-    315  # rotations of a continuous symmetry: BOP's ceil(pi / 0.01), about 1 % of the diameter apart
-)
+# Of a continuous symmetry: BOP's ceil(pi / 0.01), about 1 % of the diameter apart.
+_NUM_ROTATIONS = 315
 
 
 def by_number(path: Path, parse: Callable[[Any], Any], what: str = "frame") -> dict[int, Any]:

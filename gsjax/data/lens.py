@@ -10,7 +10,7 @@ from jaxtyping import Float
 
 from gsjax.data.errors import DataError
 from gsjax.geometry.cameras import intrinsics
-from gsjax.geometry.sight import bent
+from gsjax.geometry.sight import radial_table
 
 _SAME_SHAPE = 0.02  # largest relative difference of aspect ratios that rounding a size explains
 _WIDEST = np.deg2rad(70)  # off axis: a wider pinhole view consists mostly of stretched edges
@@ -119,7 +119,7 @@ def _pinhole_of_fisheye(
 ) -> Float[np.ndarray, "3 3"]:
     """Like `_pinhole_K`, but keeps the principal point: OpenCV's own estimate follows the mean of the edge
     midpoints, which diverges for a lens that sees almost 90 degrees off its axis."""
-    angles, distances = bent(coeffs, _WIDEST)
+    angles, distances = radial_table(coeffs, _WIDEST)
     cx, cy = lens_K[0, 2], lens_K[1, 2]
     sides = np.array([cx, width - 1 - cx, cy, height - 1 - cy])  # from the principal point to the edges
     focals = np.array([lens_K[0, 0], lens_K[0, 0], lens_K[1, 1], lens_K[1, 1]])

@@ -13,7 +13,7 @@ from gsjax.data.errors import DataError, DataWarning
 from gsjax.data.objects import PointModel, Truth
 from gsjax.data.photographs import Photographs
 from gsjax.data.sequence import Sequence
-from gsjax.scene.origin import about, far_origin, in_words
+from gsjax.scene.origin import about, far_origin, origin_message
 
 Data = TypeVar("Data", Photographs, Sequence)
 Given = ParamSpec("Given")
@@ -48,7 +48,7 @@ def near_origin(read: Callable[Given, Data]) -> Callable[Given, Data]:
         origin = far_origin(centers.reshape(-1, 3), [] if cloud is None else [cloud.points], least)
         if origin is None:
             return data
-        words = in_words(centers.reshape(-1, 3), origin)
+        words = origin_message(centers.reshape(-1, 3), origin)
         warnings.warn(f"{data.name}: {words}, and put back in what is written", DataWarning, stacklevel=2)
         return relative_to_origin(data, origin)
 

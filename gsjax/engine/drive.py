@@ -22,9 +22,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from gsjax.engine.interrupts import raise_if_interrupted, shielded
-from gsjax.losses.extra import ExtraLosses, UpToDate, named_losses
+from gsjax.losses.extra import ExtraLosses, Recompiling, named_losses
 from gsjax.optim.compiler import compile_seconds, host_options
-from gsjax.optim.guard import Guard, begun, part_of_step, window_of
+from gsjax.optim.guard import Guard, new_guard, partial_step, window_of
 from gsjax.optim.method import Method, Run
 from gsjax.optim.traces import jit_once
 from gsjax.rasterize.plan import HEADROOM
@@ -122,7 +122,7 @@ class Drive(Iterator[Tick]):
         self._progress = (lambda step: step / total if total else 1.0) if progress is None else progress
         self._headroom = headroom
         self._losses: ExtraLosses = getattr(method, "extra_losses", ())
-        self._advance = UpToDate(self._losses, partial(_compiled, method))
+        self._advance = Recompiling(self._losses, partial(_compiled, method))
         self._skipped = 0  # consecutive steps
         self._key = jax.random.key(method.config.seed)
 
@@ -207,7 +207,7 @@ def _guard_of(before: Run, run: Run) -> Guard:
         return run.guard
     old, new = (jax.tree.leaves((one.params, one.kept)) for one in (before, run))
     is_same = len(old) == len(new) and all(map(operator.is_, old, new))
-    return run.guard if run.guard is not None and is_same else begun(run.params, before.guard)
+    return run.guard if run.guard is not None and is_same else new_guard(run.params, before.guard)
 
 
 def warn_of_lost_losses(after: Tick, extra_losses: ExtraLosses) -> None:
@@ -243,6 +243,6 @@ def _compiled(method: Method, outside: tuple) -> Callable:
     def advance(params, state, share, batch, step, key):
         jax.monitoring.record_event(COMPILING)  # Python runs only while JAX traces
         new, state, info = update(params, state, batch, step=step, key=jax.random.fold_in(key, step))
-        return part_of_step(new, params, share), state, info
+        return partial_step(new, params, share), state, info
 
     return jit_once(advance, method, compiler_options=host_options(), donate_argnums=(0, 1))

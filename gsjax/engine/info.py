@@ -26,7 +26,7 @@ from gsjax.engine.messages import Notes
 from gsjax.engine.options import Common, Reading
 from gsjax.engine.summary import Column, Table
 from gsjax.engine.terminal import print_facts, print_table
-from gsjax.geometry.sight import bent
+from gsjax.geometry.sight import radial_table
 from gsjax.io.scenes import is_scene
 from gsjax.io.sequences import frame_files
 from gsjax.methods.fit import extent_of
@@ -216,7 +216,7 @@ def _view(photographs: Photographs) -> str:
     if photographs.fisheye is None:
         return _fields_of_view(photographs.sizes[:, 0], photographs.Ks)
     views = zip(photographs.sizes[:, 0] / (2 * photographs.Ks[:, 0, 0]), photographs.fisheye, strict=True)
-    half = np.array([np.interp(far, *bent(coeffs)[::-1]) for far, coeffs in views])
+    half = np.array([np.interp(far, *radial_table(coeffs)[::-1]) for far, coeffs in views])
     return f"{_degrees_wide(np.degrees(2 * half))}, by fisheyes"
 
 

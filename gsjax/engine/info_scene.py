@@ -14,7 +14,7 @@ from gsjax.io.brief import shortened
 from gsjax.io.scene_file import SceneReport
 from gsjax.io.scenes import read_gaussians
 from gsjax.scene.gaussians import Gaussians
-from gsjax.scene.origin import in_numbers, in_world
+from gsjax.scene.origin import in_world, origin_text
 
 _MOST_LABELS = 8  # to list
 
@@ -81,7 +81,7 @@ def origin_fact(origin: Float[np.ndarray, "3"] | None) -> dict[str, str]:
     Args:
         origin: what was subtracted from positions; None for data near 0.
     """
-    return {} if origin is None else {"origin": in_numbers(origin)}
+    return {} if origin is None else {"origin": origin_text(origin)}
 
 
 def _in_short(labels: Int[np.ndarray, "k"]) -> str:

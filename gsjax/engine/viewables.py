@@ -36,7 +36,7 @@ from gsjax.methods.deform.query import most_likely
 from gsjax.methods.parts.film import Layer
 from gsjax.methods.parts.timeline import Names
 from gsjax.scene.handles import Blend
-from gsjax.scene.origin import moved_to
+from gsjax.scene.origin import rebased
 from gsjax.viz.colors import to_uint8
 from gsjax.viz.viewer import Motion, Shots, Viewable, moved
 
@@ -112,7 +112,7 @@ def _of_files(path: Path, files: list[Path], notes: Notes) -> Viewable:
     """The scene whose frames are files, in order, in the coordinates of the first."""
     read = read_frames(files)
     first, report = next(read)
-    frames = [first, *(moved_to(there, known.origin, report.origin) for there, known in read)]
+    frames = [first, *(rebased(there, known.origin, report.origin) for there, known in read)]
     still = all(eqx.tree_equal(each, first) for each in frames[1:])
     colors = np.asarray(first.sh0)
     if max(np.abs(np.asarray(each.sh0) - colors).max() for each in frames) > _SAME_COLOR:

@@ -100,8 +100,8 @@ def fit_joint(
     """
     moved = np.einsum("tij,nj->tni", motions[:, :3, :3], points) + motions[:, None, :3, 3]
     found = {
-        "prismatic": _slide(moved - points, points.mean(0)),
-        "revolute": _turn(motions, points),
+        "prismatic": _fit_prismatic(moved - points, points.mean(0)),
+        "revolute": _fit_revolute(motions, points),
     }
     errors = {"fixed": _rms(moved - points)}
     for kind, joint in found.items():
@@ -136,13 +136,13 @@ def _turning_slide(
     return np.einsum("tij,nj->tni", about, points - middle) + middle + (gone[:, None] * line)[:, None]
 
 
-def _slide(shifts: Float[np.ndarray, "frames points 3"], middle: Float[np.ndarray, "3"]) -> Joint:
+def _fit_prismatic(shifts: Float[np.ndarray, "frames points 3"], middle: Float[np.ndarray, "3"]) -> Joint:
     way = shifts.mean(1)
     axis = _principal(way)
     return Joint("prismatic", axis, middle, way @ axis)
 
 
-def _turn(motions: Float[np.ndarray, "frames 4 4"], points: Float[np.ndarray, "points 3"]) -> Joint:
+def _fit_revolute(motions: Float[np.ndarray, "frames 4 4"], points: Float[np.ndarray, "points 3"]) -> Joint:
     """The hinge that moves the points closest to where these motions move them.
 
     The rotations determine the axis of a wide part well; for a short handle, the path of its centroid does so

@@ -67,7 +67,7 @@ def voxel_thin(points: Float[np.ndarray, "n 3"], voxel: float) -> Int[np.ndarray
     return np.sort(order[first])
 
 
-def on_surfaces(depths: Float[np.ndarray, "*c h w"]) -> Float[np.ndarray, "*c h w"]:
+def drop_flying_pixels(depths: Float[np.ndarray, "*c h w"]) -> Float[np.ndarray, "*c h w"]:
     """Depth of the pixels that lie on a surface, else 0.
 
     A pixel lies on none if its depth is not positive and finite, or if it is a flying pixel: five or more of

@@ -15,7 +15,7 @@ _STEPS = 4096  # entries of the table of d, which is interpolated
 _WIDEST = 3.0  # radians off axis
 
 
-def bent(
+def radial_table(
     coeffs: Float[np.ndarray, "4"], widest: float = _WIDEST
 ) -> tuple[Float[np.ndarray, "steps"], Float[np.ndarray, "steps"]]:
     """Angles off axis, and the distances from the principal point at which they appear, both increasing.
@@ -49,7 +49,7 @@ def rays(
     y = (pixels[..., 1] - K[1, 2]) / K[1, 1]
     x = (pixels[..., 0] - K[0, 2] - K[0, 1] * y) / K[0, 0]
     far = np.hypot(x, y)
-    angles, distances = bent(fisheye)
+    angles, distances = radial_table(fisheye)
     angle = np.interp(far, distances, angles, right=np.nan)
     across = np.sin(angle) / np.maximum(far, 1e-12)
     return np.stack([across * x, across * y, np.cos(angle)], axis=-1)
@@ -71,7 +71,7 @@ def pixels_at(
         depths = local[..., 2]
         return (local @ K.T)[..., :2] / np.where(depths > 0, depths, np.nan)[..., None], depths
     across = np.linalg.norm(local[..., :2], axis=-1)
-    angles, distances = bent(fisheye)
+    angles, distances = radial_table(fisheye)
     far = np.interp(np.arctan2(across, local[..., 2]), angles, distances, right=np.nan)
     x, y = np.moveaxis(local[..., :2] * (far / np.maximum(across, 1e-12))[..., None], -1, 0)
     pixels = np.stack([K[0, 0] * x + K[0, 1] * y + K[0, 2], K[1, 1] * y + K[1, 2]], axis=-1)

@@ -27,7 +27,7 @@ from gsjax.io.labels import labels_beside, read_labels, write_labels
 from gsjax.io.parsed_ply import parse_ply
 from gsjax.io.scene_file import AGAIN, SceneError, SceneReport, drawable
 from gsjax.scene.gaussians import FLAT, OPAQUE, SH_SIZES, Gaussians
-from gsjax.scene.origin import far_origin, in_words, in_world
+from gsjax.scene.origin import far_origin, in_world, origin_message
 
 _REQUIRED = (
     *("x", "y", "z"),
@@ -173,7 +173,7 @@ def read_ply(path: str | os.PathLike) -> tuple[Gaussians, SceneReport]:
     names, size = vertices.dtype.names or (), _size(gaussians)
     if (origin := far_origin(places, least=size)) is not None:
         gaussians = eqx.tree_at(lambda g: g.means, gaussians, jnp.asarray(_relative(places, origin)))
-        words = in_words(places, origin)
+        words = origin_message(places, origin)
         if "x" in names and vertices.dtype["x"].itemsize < 8 and _loses_precision(np.abs(origin).max(), size):
             words += "; the file itself is of float32, which has lost what is smaller than these steps"
         warnings.warn(f"{path}: {words}", UserWarning, stacklevel=1)

@@ -17,7 +17,7 @@ from gsjax.io import glb, ksplat, page, ply, sog, splat, spz
 from gsjax.io.compressed_ply import write_compressed_ply
 from gsjax.io.scene_file import SceneError, SceneReport
 from gsjax.scene.gaussians import Gaussians, take, valid_rows
-from gsjax.scene.origin import in_numbers
+from gsjax.scene.origin import origin_text
 
 Reader = Callable[[Path], tuple[Gaussians, SceneReport]]
 
@@ -185,7 +185,7 @@ def write_gaussians(
     options = {name: value for name, value in asked.items() if value is not None}
     no_room = {"labels": "labels", "antialiased": "that the scene is antialiased"}
     if origin is not None:
-        no_room["origin"] = f"the origin {in_numbers(origin)}, to which its places are relative"
+        no_room["origin"] = f"the origin {origin_text(origin)}, to which its places are relative"
     for name in [name for name in options if name not in written.options]:
         if name not in no_room:
             having = ", ".join(ending for ending, each in FORMATS.items() if name in each.options)

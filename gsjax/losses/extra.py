@@ -108,7 +108,7 @@ def captured(losses: ExtraLosses) -> tuple[Hashable, ...]:
     return tuple(found)
 
 
-class UpToDate:
+class Recompiling:
     """The program of a loop, recompiled if values that its losses capture have changed between two steps.
     Changes made by tracing itself, such as to a counter of traces, do not count."""
 
@@ -169,12 +169,12 @@ def _collect(value: Any, found: list[Hashable], known: dict[int, Any]) -> None:
         _collect([value.__func__, value.__self__], found, known)
     elif isinstance(value, FunctionType):
         if not _is_library(value.__code__):
-            _collect(_outside(value), found, known)
+            _collect(_captured_by(value), found, known)
     elif callable(value) and not isinstance(value, type):
         _collect(getattr(value, "__dict__", {}), found, known)
 
 
-def _outside(function: FunctionType) -> dict[str, Any]:
+def _captured_by(function: FunctionType) -> dict[str, Any]:
     """The values that a function takes from globals, its closure and its defaults, by name."""
     names, codes = set(), [function.__code__]
     while codes:  # a lambda or a comprehension within it has code of its own
@@ -227,7 +227,7 @@ def extra_terms(
     return terms
 
 
-def _asked_for(loss: Callable) -> tuple[str, ...]:
+def _required(loss: Callable) -> tuple[str, ...]:
     """Names of keyword-only arguments without defaults."""
     try:
         given = inspect.signature(loss).parameters.values()
@@ -238,7 +238,7 @@ def _asked_for(loss: Callable) -> tuple[str, ...]:
 
 def _value(name: str, loss: Callable, scene: Any, rendered: Any, frame: Any, context: dict[str, Any]) -> Any:
     """The value of a loss. Its errors get a note that names the loss and the usual causes."""
-    asked = _asked_for(loss)
+    asked = _required(loss)
     if missing := sorted({*asked} - context.keys()):
         given = f"only {' and '.join(sorted(context))}" if context else "nothing"
         raise ValueError(

@@ -28,7 +28,10 @@ LEAST_WINDOW = 100
 _WINDOWS, _MOST_STEPS = 50, 200  # most windows in a run; with this many steps in each, there may be more
 _LEAST_WINDOWS = 8  # fewest windows in a run for each to consist of whole passes
 _TAIL = 20  # steps that confirm a candidate, and most of which must not be worse at the end
-_LOST, _LOST_SIGMA = 0.25, 4.0  # increase at which a loss has diverged: relative, and in standard errors
+_DIVERGED, _DIVERGED_SIGMA = (
+    0.25,
+    4.0,
+)  # increase at which a loss has diverged: relative, and in standard errors
 _WORSE, _WORSE_SIGMA = 0.02, 3.0  # the same at the end of a run, to go back to the best
 _SMALLER = 0.5  # factor on steps after a return
 _FIRST = 5  # first losses, the largest of which stands for the initial parameters
@@ -63,10 +66,12 @@ class Level(eqx.Module):
             sigma: least difference in standard errors.
             statistic: the statistic of the losses that is compared.
         """
-        loss = _of_those_taken(statistic, losses)
+        loss = _of_unskipped(statistic, losses)
         if self.deviation is None:
             margin = (
-                max(_LOST * abs(self.mean), _LOST_SIGMA * float(np.nanstd(losses))) if loss < np.inf else 0
+                max(_DIVERGED * abs(self.mean), _DIVERGED_SIGMA * float(np.nanstd(losses)))
+                if loss < np.inf
+                else 0
             )
         else:
             margin = max(relative * abs(self.mean), sigma * self.deviation * (2 / len(losses)) ** 0.5)
@@ -85,7 +90,7 @@ class Guard(eqx.Module):
         candidate: a better window, until the next steps confirm its parameters, which no loss has tested yet.
         returns: number of returns to the best parameters, in all stretches.
         is_settled: whether the parameters at the end of the run are the best rather than the latest.
-        is_resting: whether nothing is watched; see `resting`.
+        is_resting: whether nothing is watched; see `inactive`.
     """
 
     share: Float[Array, ""]
@@ -103,7 +108,7 @@ class Guard(eqx.Module):
         """The level that the run goes back to: the best window or, before the first, the beginning."""
         return self.beginning if self.best is None else self.best
 
-    def watched(self, loss: float, params: PyTree, window: int) -> tuple["Guard", PyTree]:
+    def after_step(self, loss: float, params: PyTree, window: int) -> tuple["Guard", PyTree]:
         """The guard after a step, and the parameters to continue from: those given or, if the loss has
         diverged, the best.
 
@@ -124,21 +129,21 @@ class Guard(eqx.Module):
             is_small = float(guard.share) <= _LEAST_SHARE  # smaller steps will not help
             return (guard, params) if is_small else guard._returned(params, _FAR_SMALLER)
         if candidate is not None and guard.steps % window == _TAIL:
-            is_confirmed = not candidate.is_exceeded(losses[-_TAIL:], _LOST, _LOST_SIGMA, np.median)
+            is_confirmed = not candidate.is_exceeded(losses[-_TAIL:], _DIVERGED, _DIVERGED_SIGMA, np.median)
             guard = replace(guard, candidate=None)
             if is_confirmed:
                 guard = replace(guard, best=candidate, beginning=replace(beginning, params=None))
         if guard.steps % window:
             return guard, params
-        if guard.level.is_exceeded(losses, _LOST, _LOST_SIGMA):
+        if guard.level.is_exceeded(losses, _DIVERGED, _DIVERGED_SIGMA):
             return guard._returned(params, _SMALLER)
-        mean = _of_those_taken(np.mean, losses)
+        mean = _of_unskipped(np.mean, losses)
         if mean < (np.inf if guard.best is None else guard.best.mean):
             level = Level(mean, float(np.nanstd(losses)), jax.tree.map(np.array, params))
             guard = replace(guard, candidate=level)
         return guard, params
 
-    def settled(self, params: PyTree) -> tuple["Guard", PyTree]:
+    def at_end(self, params: PyTree) -> tuple["Guard", PyTree]:
         """The guard at the end of a run, and the parameters to end with: the best, if the latest losses are
         worse.
 
@@ -155,8 +160,8 @@ class Guard(eqx.Module):
             tail = tail[~np.isnan(tail)]
         latest = ((tail if self.best is None else self.losses, np.mean), (tail, np.median))
         if any(level.is_exceeded(losses, _WORSE, _WORSE_SIGMA, statistic) for losses, statistic in latest):
-            settled = replace(self, losses=np.zeros(0), steps=0, candidate=None, is_settled=True)
-            return settled, _restored(level)
+            at_end = replace(self, losses=np.zeros(0), steps=0, candidate=None, is_settled=True)
+            return at_end, _restored(level)
         return self, params
 
     def _returned(self, params: PyTree, smaller: float) -> tuple["Guard", PyTree]:
@@ -168,7 +173,7 @@ class Guard(eqx.Module):
         return replace(self, losses=np.zeros(0), steps=0, **state), _restored(self.level)
 
 
-def begun(params: PyTree, before: Guard | None = None) -> Guard:
+def new_guard(params: PyTree, before: Guard | None = None) -> Guard:
     """The guard at the beginning of a stretch.
 
     Args:
@@ -179,7 +184,7 @@ def begun(params: PyTree, before: Guard | None = None) -> Guard:
     return Guard(jnp.ones((), jnp.float32), beginning, returns=0 if before is None else before.returns)
 
 
-def resting(before: Guard | None) -> Guard:
+def inactive(before: Guard | None) -> Guard:
     """A guard that watches nothing and keeps no parameters, for steps that are parts of an iteration that
     cannot diverge, and whose losses do not show how good the parameters are.
 
@@ -204,7 +209,7 @@ def window_of(total: int, period: int) -> int:
     return passes if _LEAST_WINDOWS * passes <= total else steps
 
 
-def part_of_step(new: PyTree, old: PyTree, share: Float[Array, ""]) -> PyTree:
+def partial_step(new: PyTree, old: PyTree, share: Float[Array, ""]) -> PyTree:
     """The parameters after a fraction of a step; after a whole one, bitwise equal to the new ones.
 
     Args:
@@ -224,7 +229,7 @@ def _restored(level: Level) -> PyTree:
     return jax.tree.map(jnp.array, level.params)
 
 
-def _of_those_taken(statistic, losses: Float[np.ndarray, "n"]) -> float:
+def _of_unskipped(statistic, losses: Float[np.ndarray, "n"]) -> float:
     """A statistic of the losses of steps that were not skipped; infinite if at least half were skipped."""
     taken = losses[~np.isnan(losses)]
     return float(statistic(taken)) if 2 * len(taken) > len(losses) else float("inf")

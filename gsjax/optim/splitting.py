@@ -39,7 +39,7 @@ class Pull(NamedTuple):
         return self.total / jnp.maximum(self.seen, 1.0)
 
 
-def watch_pull() -> optax.GradientTransformation:
+def accumulate_pull() -> optax.GradientTransformation:
     """An optimizer for the zeros [1,n,2] that are added to the projected means: it leaves them unchanged and
     accumulates their gradients in a `Pull`. Gradients must be per half image, not per pixel."""
 
@@ -65,7 +65,7 @@ def strongly_pulled(gaussians: Gaussians, pull: Pull, threshold: float) -> Bool[
     return is_alive(gaussians) & (pull.mean > threshold)
 
 
-def divide(
+def densify(
     gaussians: Gaussians,
     pull: Pull,
     key: PRNGKeyArray,

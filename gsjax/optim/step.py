@@ -26,7 +26,7 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Bool, PyTree
 
-_MOST = 10.0  # bound on a gradient in the first moment, in units of the root of the second
+_MAX_ROOTS = 10.0  # bound on a gradient in the first moment, in units of the root of the second
 
 
 class Init(Protocol):
@@ -121,7 +121,9 @@ def steady_adam(rate: Any, eps: float = 1e-15, decay: float = 0.0) -> optax.Grad
 
         nu = jax.tree.map(lambda v, g: b2 * v + (1 - b2) * jnp.square(g), state.nu, gradients)
         roots = jax.tree.map(lambda v: jnp.sqrt(corrected(v, b2)), nu)
-        limited = jax.tree.map(lambda g, root: jnp.clip(g, -_MOST * root, _MOST * root), gradients, roots)
+        limited = jax.tree.map(
+            lambda g, root: jnp.clip(g, -_MAX_ROOTS * root, _MAX_ROOTS * root), gradients, roots
+        )
         mu = jax.tree.map(lambda m, g: b1 * m + (1 - b1) * g, state.mu, limited)
         moves = jax.tree.map(lambda m, root: corrected(m, b1) / (root + eps), mu, roots)
         return moves, optax.ScaleByAdamState(count, mu, nu)

@@ -23,7 +23,7 @@ from gsjax.rasterize.sorting import CUSTOM_CALLS
 
 _MOST_FILES = 200  # half a megabyte each
 _TRACED_THROUGH = ("jax", "jaxlib", "equinox", "jaxlie", "lineax", "optax", "optimistix", "jaxopt")
-_OURS = "gsjax"  # the package whose sources are known; functions of others are never kept
+_PACKAGE = "gsjax"  # the package whose sources are known; functions of others are never kept
 _VAGUE = re.compile(r" at 0x|\.\.\.")  # in the text of a tree: an address, or an omission
 _BEGUN = time()
 
@@ -56,7 +56,7 @@ def jit_once(fun: Callable, closed_over: Any, **options: Any) -> Callable:
         name = _name(fun, closed_over, f"{tree} {specs}")
         if name is None:
             return fun(*args)
-        found = _read(traces / name) or _traced_and_kept(traces / name, fun, tree, specs)
+        found = _read(traces / name) or _trace_and_save(traces / name, fun, tree, specs)
         if found is None:
             return fun(*args)
         program, out_tree = found
@@ -92,7 +92,7 @@ def _described(value: Any) -> str | None:
 
 
 def _is_ours(value: Any) -> bool:
-    return value.__module__.split(".")[0] == _OURS
+    return value.__module__.split(".")[0] == _PACKAGE
 
 
 @cache
@@ -127,7 +127,7 @@ def _read(path: Path) -> tuple[jax.export.Exported, Any] | None:
     return program, jax.tree.structure(kept["results"])
 
 
-def _traced_and_kept(
+def _trace_and_save(
     path: Path, fun: Callable, tree: Any, specs: Sequence[jax.ShapeDtypeStruct]
 ) -> tuple[jax.export.Exported, Any] | None:
     """Trace `fun`, write the trace to `path`, and return it as another process will read it; None if that is

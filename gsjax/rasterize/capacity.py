@@ -12,7 +12,7 @@ from gsjax.rasterize.projection import project_gaussians
 from gsjax.rasterize.views import Views, usable
 
 
-def planned_for(views: Views, bare: Plan, headroom: float) -> Plan:
+def plan_for(views: Views, bare: Plan, headroom: float) -> Plan:
     """`bare` with a capacity for these checked inputs, times `headroom`.
 
     Args:

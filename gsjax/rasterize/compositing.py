@@ -99,7 +99,7 @@ def splat_alphas(
     return jnp.exp(jnp.where(log_alpha >= math.log(limits.alpha_min), clamped, -jnp.inf))
 
 
-def dimmed(
+def light_behind(
     light: Float[Array, "*pixels"], alphas: Float[Array, "list *pixels"], limits: Limits
 ) -> Float[Array, "*pixels"]:
     """The light, as in a TileState, behind a list.
@@ -120,8 +120,8 @@ def splat_weights(
 ) -> Float[Array, "list pixels"]:
     """w_i = alpha_i T_i, and 0 from where the pixel has ended.
 
-    Every row computes its own product T_i, in list order and therefore bit for bit as `dimmed`: for a short
-    list this is cheaper than storing them all.
+    Every row computes its own product T_i, in list order and therefore bit for bit as `light_behind`. For a
+    short list this is cheaper than storing them all.
 
     Args:
         alphas: from `splat_alphas`.
@@ -146,7 +146,7 @@ def weights_of_many(alphas, light, limits: Limits):
     for i in range(0, alphas.shape[0], CHUNK):
         piece = alphas[i : i + CHUNK]
         weights.append(splat_weights(piece, light, limits))
-        light = dimmed(light, piece, limits)
+        light = light_behind(light, piece, limits)
     return jnp.concatenate(weights), light
 
 
@@ -199,7 +199,7 @@ def composite_tile(
         state = start_tile(pixels.shape[0], channels, dtype)
     if length == 0:
         return state
-    chunk, state = chunk_length(channels), _for_loops(state, channels)
+    chunk, state = chunk_length(channels), _loop_layout(state, channels)
     if length <= chunk:
         state = composite_columns(in_columns(splats, limits), pixels, state, limits)
     else:
@@ -212,10 +212,10 @@ def composite_tile(
         state = jax.lax.scan(
             lambda state, piece: (composite_columns(piece, pixels, state, limits), None), state, pieces
         )[0]
-    return _for_loops(state, channels)
+    return _loop_layout(state, channels)
 
 
-def _for_loops(state: TileState, channels: int) -> TileState:
+def _loop_layout(state: TileState, channels: int) -> TileState:
     """A state in the layout of the loops, or back: many channels last, as rows of a matrix product."""
     return state._replace(values=state.values.T) if channels > FEW_CHANNELS else state
 
@@ -241,7 +241,7 @@ def composite_columns(columns: Columns, pixels, state: TileState, limits: Limits
         live = after > limits.min_transmittance
         values = values + jnp.where(live, alpha * light, 0.0) * value[:, None]
         light = jnp.where(live, after, -jnp.abs(light))
-    return TileState(values, dimmed(state.light, alphas, limits))
+    return TileState(values, light_behind(state.light, alphas, limits))
 
 
 def chunk_length(channels: int) -> int:
@@ -326,7 +326,7 @@ def composite_forward(splats: Splats, lists: Lists, reads: Int[Array, "tiles"] |
     compose = jax.vmap(partial(composite_columns, limits=plan.limits), in_axes=(0, None, 0))
 
     def start(_):
-        return _for_loops(start_tile(plan.tile_pixels, channels, dtype), channels)
+        return _loop_layout(start_tile(plan.tile_pixels, channels, dtype), channels)
 
     def one_batch(image, at):
         number, batch = at

@@ -22,7 +22,7 @@ from gsjax.rasterize.gradients import composite
 from gsjax.rasterize.plan import Plan
 from gsjax.rasterize.projection import project_gaussians
 from gsjax.rasterize.rasterization import plan as _plan
-from gsjax.rasterize.tiles import of_views, untile
+from gsjax.rasterize.tiles import split_views, untile
 
 _OF_ROWS = ("rows", "means2d", "conics", "opacities")  # fields with one entry per Gaussian that is shown
 
@@ -77,7 +77,7 @@ def freeze_views(
     frozen = [_freeze(*scene, *camera, plan=plan) for camera in cameras]
     if any(bool(overflow) for _, overflow in frozen):
         raise RuntimeError("the plan made for these views is too small for them; please report this as a bug")
-    shown = [_shown(jax.device_get(view)) for view, _ in frozen]
+    shown = [_compacted(jax.device_get(view)) for view, _ in frozen]
     seen, pairs = (max(1, *(len(getattr(view, name)) for view in shown)) for name in ("rows", "ids"))
     views = [padded_view(view, seen, pairs) for view in shown]
     return jax.device_put(jax.tree.map(lambda *leaves: np.stack(leaves), *views)), plan
@@ -148,10 +148,10 @@ def paint_shown(
     lists = Lists(view.ids, view.starts, view.counts)
     image, transmittance, _ = composite(splats, lists, None, plan)
     alphas = 1 - untile(transmittance[:, None], plan)
-    return of_views(image, (), plan), of_views(alphas, (), plan)[..., 0]
+    return split_views(image, (), plan), split_views(alphas, (), plan)[..., 0]
 
 
-def _shown(view: FrozenView) -> FrozenView:
+def _compacted(view: FrozenView) -> FrozenView:
     """The view without unlisted Gaussians, with its lists packed one after another. On the host."""
     counts, total = view.counts, int(view.counts.sum())
     starts = np.cumsum(counts) - counts

@@ -36,7 +36,7 @@ def _all_finite(columns: list[Array]) -> Bool[Array, "rows lanes"]:
     return jnp.stack([jnp.isfinite(c) for c in columns]).all(axis=0)
 
 
-def _stored(flags: Bool[Array, "rows lanes"]) -> Bool[Array, "rows lanes"]:
+def _materialised(flags: Bool[Array, "rows lanes"]) -> Bool[Array, "rows lanes"]:
     """The same flags, stored in memory: XLA:CPU would recompute them at each use.
 
     It recomputes everything except what it considers expensive, such as a square root, and drops barriers.
@@ -176,7 +176,7 @@ def project_gaussians(
     # Rounding must not cut off a pixel.
     half_x, half_y = (jnp.sqrt(jnp.maximum(reach, 0.0) * c) * 1.0001 + 1e-3 for c in variances)
     in_frame = (u + half_x > 0) & (u - half_x < plan.width) & (v + half_y > 0) & (v - half_y < plan.height)
-    visible = _stored(sound & in_range & has_area & (reach > 0) & in_frame)
+    visible = _materialised(sound & in_range & has_area & (reach > 0) & in_frame)
 
     # Then again, on inputs whose invisible rows are harmless: their gradients are zero, and never 0 * inf.
     # What is harmless depends on the camera: its first visible row is. A camera without any is replaced.

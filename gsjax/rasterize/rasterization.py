@@ -16,14 +16,14 @@ from gsjax.geometry.cameras import camera_centers
 from gsjax.geometry.spherical_harmonics import evaluate_sh, num_sh_bases
 from gsjax.rasterize import fused
 from gsjax.rasterize.binning import bin_gaussians
-from gsjax.rasterize.capacity import planned_for
+from gsjax.rasterize.capacity import plan_for
 from gsjax.rasterize.checks import check_inputs
 from gsjax.rasterize.compositing import Lists, Splats
 from gsjax.rasterize.gradients import composite
 from gsjax.rasterize.lanes import LANES, slots
 from gsjax.rasterize.plan import HEADROOM, OPTION_NAMES, UNSET, Plan, resolve
 from gsjax.rasterize.projection import Projected, project_gaussians
-from gsjax.rasterize.tiles import of_views, untile
+from gsjax.rasterize.tiles import split_views, untile
 from gsjax.rasterize.views import Views, usable
 
 
@@ -136,7 +136,7 @@ def rasterization(
     others = (backgrounds, features, roi, means2d_offset, reads)
     views, batch = check_inputs(plan, *gaussians, viewmats, Ks, fisheye, *others)
     if plan.capacity == 0:
-        plan = planned_for(views, plan, headroom=1.0)
+        plan = plan_for(views, plan, headroom=1.0)
     return _rasterize(views, plan, batch)
 
 
@@ -181,7 +181,7 @@ def plan(
     colors = np.zeros((*np.shape(means)[:-1], *bases, 1), jnp.result_type(float))
     gaussians = (means, quats, scales, opacities, colors)
     views, _ = check_inputs(bare, *gaussians, viewmats, Ks, fisheye, None, None, roi, None, None)
-    return planned_for(views, bare, headroom)
+    return plan_for(views, bare, headroom)
 
 
 def _options(arguments: dict[str, Any]) -> dict[str, Any]:
@@ -241,7 +241,7 @@ def _rasterize(views: Views, plan: Plan, batch: tuple[int, ...]):
     mask, reads = jax.tree.map(merge, (views.tile_mask, views.reads))
     image, transmittance, counts = _draw(jax.tree.map(merge, projected), merge(values), mask, reads, plan)
     alphas = 1 - untile(transmittance[:, None], plan)
-    image, alphas = of_views(image, shape, plan), of_views(alphas, shape, plan)
+    image, alphas = split_views(image, shape, plan), split_views(alphas, shape, plan)
     return _finish(image, alphas, views, projected, counts, plan, batch)
 
 

@@ -14,7 +14,7 @@ import jax
 from jax.sharding import AxisType, Mesh, NamedSharding
 from jax.sharding import PartitionSpec as P
 
-from gsjax.rasterize.capacity import planned_for
+from gsjax.rasterize.capacity import plan_for
 from gsjax.rasterize.checks import check_inputs
 from gsjax.rasterize.plan import OPTION_NAMES, UNSET, Plan, resolve
 from gsjax.rasterize.rasterization import rasterization
@@ -70,7 +70,7 @@ def sharded_rasterization(
         _check_divides(arrays, mesh, cameras, scenes)
         if plan.capacity == 0:
             views, _ = check_inputs(plan, *(_placed(arrays.get(name), mesh, P()) for name in _ARRAYS))
-            plan = planned_for(views, plan, headroom=1.0)
+            plan = plan_for(views, plan, headroom=1.0)
         return _draw(arrays, mesh, cameras, scenes, plan)
 
     return draw

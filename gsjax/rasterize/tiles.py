@@ -86,7 +86,7 @@ def in_tiles(image: Float[Array, "high wide channels"], plan: Plan) -> Float[Arr
     return apart.transpose(0, 2, 4, 1, 3).reshape(high // edge * wide, channels, edge * edge)
 
 
-def of_views(
+def split_views(
     image: Float[Array, "high wide channels"], shape: tuple[int, ...], plan: Plan
 ) -> Float[Array, "*shape height width channels"]:
     """The images of the views, [*shape] of them, cropped to the plan's size."""

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, UInt8
 
 from gsjax.geometry.cameras import Camera, resized
-from gsjax.geometry.neighbors import on_surfaces
+from gsjax.geometry.neighbors import drop_flying_pixels
 
 Seen = TypeVar("Seen")
 
@@ -41,10 +41,10 @@ class Frame(eqx.Module):
 
     @property
     def known_depths(self) -> Float[np.ndarray, "c height width"]:
-        """Depths of surfaces (`on_surfaces`) within the masks, else 0; zeros without depth. On the host."""
+        """Depths of surfaces (`drop_flying_pixels`) within masks, else 0; zeros without depth. On the host."""
         if self.depths is None:
             return np.zeros(self.images.shape[:-1], np.float32)
-        depths = on_surfaces(np.asarray(self.depths))
+        depths = drop_flying_pixels(np.asarray(self.depths))
         return depths if self.masks is None else np.where(np.asarray(self.masks), depths, 0)
 
 

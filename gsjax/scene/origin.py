@@ -77,7 +77,7 @@ def relative_to(
     return places if origin is None else np.asarray(places, np.float64) - origin
 
 
-def moved_to(
+def rebased(
     gaussians: Gaussians, was: Float[np.ndarray, "3"] | None, now: Float[np.ndarray, "3"] | None
 ) -> Gaussians:
     """Gaussians given relative to the origin `was`, now relative to `now`; None is the origin of the data."""
@@ -87,16 +87,16 @@ def moved_to(
     return eqx.tree_at(lambda g: g.means, gaussians, jnp.asarray(means, gaussians.means.dtype))
 
 
-def in_numbers(origin: Float[np.ndarray, "3"]) -> str:
+def origin_text(origin: Float[np.ndarray, "3"]) -> str:
     """An origin as text: "(500000, 5000000, 300)"."""
     return f"({', '.join(f'{value:.12g}' for value in origin)})"
 
 
-def in_words(places: Float[np.ndarray, "n 3"], origin: Float[np.ndarray, "3"]) -> str:
+def origin_message(places: Float[np.ndarray, "n 3"], origin: Float[np.ndarray, "3"]) -> str:
     """The message that says that coordinates are taken relative to an origin, and why."""
     largest = np.abs(places[np.isfinite(places).all(1)]).max()
     step = np.spacing(np.float32(largest))
     return (
         f"coordinates reach {largest:.4g}, where float32 has steps of {step:.2g}; they are taken relative to "
-        f"the origin {in_numbers(origin)}"
+        f"the origin {origin_text(origin)}"
     )

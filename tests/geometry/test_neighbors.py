@@ -4,7 +4,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gsjax.geometry.neighbors import nearest, neighbor_spacing, on_surfaces, voxel_thin
+from gsjax.geometry.neighbors import drop_flying_pixels, nearest, neighbor_spacing, voxel_thin
 
 POINTS = np.random.default_rng(0).uniform(size=(60, 3))
 
@@ -58,7 +58,7 @@ def test_depth_that_stands_alone_is_on_no_surface(seed, holes):
     random, surface = np.random.default_rng(seed), slope(96, 128)
     off, known = random.uniform(size=surface.shape) < 0.05, random.uniform(size=surface.shape) >= holes
     wrong = surface * 10 ** random.uniform(-1, 1, surface.shape).astype(np.float32)
-    found = on_surfaces(np.where(known, np.where(off, wrong, surface), 0))
+    found = drop_flying_pixels(np.where(known, np.where(off, wrong, surface), 0))
     far = off & known & (np.abs(wrong - surface) > 0.1 * surface)
     assert (found[far] > 0).mean() < 0.06 + 0.25 * holes
     right = ~off & known
@@ -71,10 +71,10 @@ def test_surfaces_edges_lines_and_sparse_depth_are_kept():
     scene[8:16, 10:20] = 0.7
     scene[4, 2:30] = 0.5
     scene[:, 31] = 0
-    kept = on_surfaces(np.stack([scene, scene]))
+    kept = drop_flying_pixels(np.stack([scene, scene]))
     ends = np.zeros(scene.shape, bool)
     ends[4, [2, 29]] = True
     assert (kept == np.where(ends, 0, scene)).all()
     lidar = np.where(np.arange(24 * 32).reshape(24, 32) % 3 == 0, np.geomspace(1, 9, 32, dtype=np.float32), 0)
-    assert (on_surfaces(lidar) == lidar).all()
-    assert on_surfaces(np.full((5, 5), np.nan)).sum() == 0
+    assert (drop_flying_pixels(lidar) == lidar).all()
+    assert drop_flying_pixels(np.full((5, 5), np.nan)).sum() == 0

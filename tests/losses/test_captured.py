@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gsjax.losses.extra import UpToDate, captured
+from gsjax.losses.extra import Recompiling, captured
 
 WEIGHT, TRACES = 5.0, []
 
@@ -80,11 +80,11 @@ def test_what_a_trace_itself_changes_is_no_change(monkeypatch):
         made.append(outside)
         return jax.jit(lambda scene: noted(scene, None, None))
 
-    program = UpToDate((noted,), compiled)
+    program = Recompiling((noted,), compiled)
     counts = []
     for weight in (5.0, 5.0, 2.0, 2.0):
         monkeypatch.setitem(globals(), "WEIGHT", weight)
         program(jnp.zeros(3))
         counts.append(len(made))
     assert counts == [1, 1, 2, 2]
-    assert UpToDate((), lambda outside: lambda x: (outside, x))(3) == ((), 3)
+    assert Recompiling((), lambda outside: lambda x: (outside, x))(3) == ((), 3)

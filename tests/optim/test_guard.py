@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from gsjax.engine.drive import drive
 from gsjax.io.checkpoints import load_checkpoint, save_checkpoint
-from gsjax.optim.guard import LEAST_WINDOW, begun, part_of_step, window_of
+from gsjax.optim.guard import LEAST_WINDOW, new_guard, partial_step, window_of
 from gsjax.optim.method import Run
 from gsjax.optim.step import Step
 
@@ -165,7 +165,7 @@ def test_what_diverges_from_its_first_steps_goes_back_to_the_beginning(after):
 def test_steps_that_are_skipped_at_the_end_of_a_short_run_lose_nothing():
     """79 good ones, and 11 that changed nothing, before there was a window."""
     first, good = jnp.ones(SIZE), jnp.zeros(SIZE)
-    guard = begun(first)
+    guard = new_guard(first)
     for loss in [*np.linspace(4, 0.01, 79), *[np.nan] * 11]:
         guard, _ = guard.watched(float(loss), good, LEAST_WINDOW)
     assert guard.settled(good)[1] is good
@@ -200,7 +200,7 @@ def test_after_an_error_in_a_new_stretch_the_old_best_does_not_return():
 def test_thrown_by_the_last_step_of_a_window_it_is_not_thrown_again():
     """Losses are of the parameters before a step, so none of a window has seen those after its last."""
     good, bad = jnp.zeros(SIZE), jnp.ones(SIZE)
-    guard = begun(good)
+    guard = new_guard(good)
     now = good
     for step in range(1, 402):
         loss = 2.0 if now is bad else 1.0 / step
@@ -265,7 +265,7 @@ def test_long_stretches_of_usual_runs_are_guarded(name):
     """(steps, views, steps of the last stretch): one that ends far above its least loss ends at its best."""
     total, views, stretch = STRETCHES[name]
     window, good, bad = window_of(total, views), jnp.zeros(SIZE), jnp.ones(SIZE)
-    guard = begun(good)
+    guard = new_guard(good)
     for step in range(stretch):
         late = step > 0.95 * stretch
         guard, _ = guard.watched(9.0 if late else 1 / (1 + step), bad if late else good, window)
@@ -281,7 +281,7 @@ def test_noise_alone_is_no_loss(seed, noise):
     """Twenty windows without a trend: the least of twenty means is below the others by chance alone."""
     losses = 1 + noise * np.random.default_rng(seed).normal(size=20 * LEAST_WINDOW)
     params = jnp.zeros(SIZE)
-    guard = begun(params)
+    guard = new_guard(params)
     for loss in losses:
         guard, _ = guard.watched(float(loss), params, LEAST_WINDOW)
     assert guard.returns == 0
@@ -295,7 +295,7 @@ def test_one_bad_photograph_is_no_loss(seed, views):
     """One that is 35 times as far off as the others, in passes over all, while the others improve."""
     random = np.random.default_rng(seed)
     params, window = jnp.zeros(SIZE), window_of(5000, views)
-    guard = begun(params)
+    guard = new_guard(params)
     for step in range(1, 5001):
         if (step - 1) % views == 0:
             order = random.permutation(views)
@@ -310,6 +310,6 @@ def test_half_a_step_is_half_of_each_array_and_integers_pass():
     new = {"a": old["a"] + 3, "half": old["half"] + 1, "count": jnp.int32(2)}
     expected = {"a": old["a"] + 1.5, "half": old["half"] + 0.5, "count": new["count"]}
     for share, result in ((0.5, expected), (1.0, new)):
-        found = part_of_step(new, old, jnp.float32(share))
+        found = partial_step(new, old, jnp.float32(share))
         jax.tree.map(np.testing.assert_array_equal, found, result)
         assert found["half"].dtype == jnp.bfloat16

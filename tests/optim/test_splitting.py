@@ -12,10 +12,10 @@ from gsjax.optim.splitting import (
     RESET_OPACITY,
     SHRINK,
     Pull,
-    divide,
+    accumulate_pull,
+    densify,
     reset_opacities,
     strongly_pulled,
-    watch_pull,
 )
 from gsjax.optim.step import gradient_step, per_field_adam
 from gsjax.scene.gaussians import Gaussians, gaussians_from_activated
@@ -49,7 +49,7 @@ def pulled(*mean: float, slots: int) -> Pull:
 @pytest.mark.thorough
 def test_a_small_one_is_cloned_and_a_large_one_split():
     before = scene([0.05, 0.5, 0.05], slots=6)
-    after, touched = divide(before, pulled(2.0, 3.0, 0.5, slots=6), jax.random.key(0), 6, **OPTIONS)
+    after, touched = densify(before, pulled(2.0, 3.0, 0.5, slots=6), jax.random.key(0), 6, **OPTIONS)
     np.testing.assert_array_equal(is_alive(after), [True] * 5 + [False])
     # The hardest pulled, 1, takes the first vacant slot, 3; 0 takes slot 4.
     np.testing.assert_array_equal(touched, [False, True, False, True, True, False])
@@ -64,7 +64,9 @@ def test_a_small_one_is_cloned_and_a_large_one_split():
 def test_halves_are_sampled_from_the_original():
     slots = 4000
     before = scene([0.5] * (slots // 2), slots)
-    after, _ = divide(before, pulled(*[2.0] * (slots // 2), slots=slots), jax.random.key(1), slots, **OPTIONS)
+    after, _ = densify(
+        before, pulled(*[2.0] * (slots // 2), slots=slots), jax.random.key(1), slots, **OPTIONS
+    )
     origin = np.concatenate([before.means[: slots // 2]] * 2)
     away = np.asarray(after.means) - origin
     np.testing.assert_allclose(away.std(0), 0.5, rtol=0.05)
@@ -73,10 +75,10 @@ def test_halves_are_sampled_from_the_original():
 
 def test_pruned_gaussians_vacate_slots_that_are_filled_at_once():
     before = scene([0.05, 2.0, 0.05], slots=3)
-    after, touched = divide(before, pulled(2.0, 9.0, slots=3), jax.random.key(0), 3, **OPTIONS)
+    after, touched = densify(before, pulled(2.0, 9.0, slots=3), jax.random.key(0), 3, **OPTIONS)
     np.testing.assert_array_equal(touched, [False, True, False])
     np.testing.assert_array_equal(after.means[1], before.means[0])
-    unpulled, _ = divide(before, pulled(slots=3), jax.random.key(0), 3, **OPTIONS)
+    unpulled, _ = densify(before, pulled(slots=3), jax.random.key(0), 3, **OPTIONS)
     np.testing.assert_array_equal(is_alive(unpulled), [True, False, True])
     assert float(unpulled.logit_opacities[1]) == EMPTY_LOGIT
 
@@ -84,7 +86,7 @@ def test_pruned_gaussians_vacate_slots_that_are_filled_at_once():
 @pytest.mark.parametrize(("slots", "filled"), [(3, []), (4, [2]), (5, [2, 1]), (6, [2, 1, 0])])
 def test_where_slots_are_few_the_hardest_pulled_come_first(slots, filled):
     before = scene([0.05] * 3, slots=6)
-    after, touched = divide(before, pulled(2.0, 3.0, 4.0, slots=6), jax.random.key(0), slots, **OPTIONS)
+    after, touched = densify(before, pulled(2.0, 3.0, 4.0, slots=6), jax.random.key(0), slots, **OPTIONS)
     assert int(touched.sum()) == len(filled)
     for place, source in enumerate(filled, start=3):
         np.testing.assert_array_equal(after.means[place], before.means[source])
@@ -98,7 +100,7 @@ def test_pull_is_the_mean_over_the_steps_that_pulled_and_moves_nothing():
     params = Params(a=jnp.asarray(1.0), nudges=jnp.zeros((1, 3, 2)))
     step = gradient_step(
         lambda p, b, **options: loss(p._asdict(), b, **options),
-        per_field_adam({"a": 0.1}, others={"nudges": watch_pull()}),
+        per_field_adam({"a": 0.1}, others={"nudges": accumulate_pull()}),
     )
     state = step.init(params)
     for scale in (1.0, 3.0):

@@ -31,7 +31,7 @@ class Found(NamedTuple):
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
     """Where traces are kept during this test, also those with this module's types."""
-    monkeypatch.setattr(traces, "_OURS", __name__.split(".")[0])
+    monkeypatch.setattr(traces, "_PACKAGE", __name__.split(".")[0])
     libraries = (*checkpoints._LIBRARIES, __name__.split(".")[0])
     monkeypatch.setattr(checkpoints, "_LIBRARIES", libraries)
     before = jax.config.jax_compilation_cache_dir
@@ -134,7 +134,7 @@ def weighted(count, weights):
 
 
 def test_what_others_define_is_not_kept_as_its_sources_are_unknown(folder, monkeypatch):
-    monkeypatch.setattr(traces, "_OURS", "gsjax")
+    monkeypatch.setattr(traces, "_PACKAGE", "gsjax")
     count = Counted()
     for _ in range(2):
         weighted(count, Weights())(1.0)

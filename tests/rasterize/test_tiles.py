@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 import gsjax
 from gsjax.rasterize.frozen import freeze_views, paint_shown
 from gsjax.rasterize.plan import FEW_CHANNELS, Plan
-from gsjax.rasterize.tiles import in_tiles, of_views, read_tiles, untile, write_tiles
+from gsjax.rasterize.tiles import in_tiles, read_tiles, split_views, untile, write_tiles
 
 
 def plan_of(width: int, height: int, tile_size: int = 4) -> Plan:
@@ -26,7 +26,7 @@ def test_tiles_make_an_image_and_come_from_it(width, height, views, channels):
     shape = (views * plan.num_tiles, channels, plan.tile_pixels)
     tiles = jnp.arange(np.prod(shape)).reshape(shape).astype(jnp.float32)
     image = untile(tiles, plan)
-    assert of_views(image, (views,), plan).shape == (views, height, width, channels)
+    assert split_views(image, (views,), plan).shape == (views, height, width, channels)
     np.testing.assert_array_equal(in_tiles(image, plan), tiles)
     some = jnp.asarray([0, len(tiles) - 1])
     np.testing.assert_array_equal(read_tiles(image, some, plan), tiles[some].swapaxes(1, 2))

@@ -39,7 +39,7 @@ from gsjax.methods.protocols import Segmenter
 from gsjax.perception.sam import load_sam
 from gsjax.perception.segmenters import PieceSegmenter
 from gsjax.scene.gaussians import Gaussians
-from gsjax.scene.origin import moved_to
+from gsjax.scene.origin import rebased
 
 _MOST_MOVES = 0.6  # fraction of pixels that change above which everything seems to move
 
@@ -204,7 +204,7 @@ def _read_scene(path: Path, sequence: Sequence, notes: Notes) -> Gaussians:
     gaussians, report = read_drawable(path)
     if report.antialiased:
         notes.warn(f"{path} is to be drawn antialiased, and parts are not: small Gaussians look brighter")
-    return jax.tree.map(jnp.asarray, moved_to(gaussians, report.origin, sequence.origin))
+    return jax.tree.map(jnp.asarray, rebased(gaussians, report.origin, sequence.origin))
 
 
 def _fit_options(options: Options, path: Path, anchor: Anchor, recording: Recording) -> FitOptions:

@@ -19,7 +19,7 @@ from gsjax.methods.parts import PartScene, order_of_frames, trajectory_of
 from gsjax.methods.parts.film import Layer
 from gsjax.methods.parts.timeline import Names
 from gsjax.scene.handles import Blend, HandlePose
-from gsjax.scene.origin import in_world, moved_to, relative_to
+from gsjax.scene.origin import in_world, rebased, relative_to
 
 _FILES = ("parts.npz", "scene.ply", "metrics.json")
 _ARRAYS = {
@@ -111,7 +111,7 @@ def read_parts_about(path: str | Path, origin: Float[np.ndarray, "3"] | None) ->
     layer, names, _, own = _read(Path(path))
     scene = layer.scene
     centers = jnp.asarray(relative_to(in_world(np.asarray(scene.centers), own), origin), float)
-    scene = PartScene(moved_to(scene.gaussians, own, origin), scene.weights, centers)
+    scene = PartScene(rebased(scene.gaussians, own, origin), scene.weights, centers)
     return Layer(scene, layer.trajectory), names
 
 

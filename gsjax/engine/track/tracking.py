@@ -14,7 +14,7 @@ import numpy as np
 
 from gsjax.engine.drive import Clock, Tick, announce, warn_of_lost_losses
 from gsjax.engine.interrupts import raise_if_interrupted, shielded
-from gsjax.losses.extra import ExtraLosses, UpToDate
+from gsjax.losses.extra import ExtraLosses, Recompiling
 from gsjax.methods.track.budget import Costs, Governor, choose, ladder, unused_settings
 from gsjax.methods.track.config import TrackConfig
 from gsjax.methods.track.frames import FrameShape, shape_of
@@ -185,7 +185,9 @@ class _Updates:
     """The compiled update of one configuration, compiled again where a plan has become too small."""
 
     def __init__(self, method: Track, shape: FrameShape, run: Run):
-        self._advance = UpToDate(method.extra_losses, partial(_compiled, method, shape, run.kept.reduction))
+        self._advance = Recompiling(
+            method.extra_losses, partial(_compiled, method, shape, run.kept.reduction)
+        )
         self._key = jax.random.key(method.config.seed)
         self._headroom = method.config.headroom
 

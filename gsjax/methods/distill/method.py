@@ -27,7 +27,7 @@ from gsjax.methods.distill.teacher import Teacher, max_rows
 from gsjax.methods.distill.update import contrast_begins, distill_step
 from gsjax.methods.distill.views import Batch, check_views, frozen_views, in_basis, view_batch
 from gsjax.methods.sampling import shuffled_index
-from gsjax.optim.guard import resting
+from gsjax.optim.guard import inactive
 from gsjax.optim.method import Run
 from gsjax.optim.step import Step, copied
 from gsjax.scene.feature_grid import FeatureGrid, Located
@@ -165,7 +165,7 @@ class Distill:
         the loss is redefined. Arguments as for `Method.between`."""
         step = run.step - self.steps_of_solution(problem)
         if step < 0:
-            return run.having(guard=resting(run.guard))
+            return run.having(guard=inactive(run.guard))
         if step == 0 and problem.untrained is not None:
             key = jax.random.fold_in(jax.random.key(self.config.seed), _FIT)
             solved: FeatureField = run.params

@@ -16,7 +16,7 @@ from gsjax.losses.photometric import photometric_loss, weighted_mean
 from gsjax.methods.fit.config import FitConfig
 from gsjax.methods.fit.model import Model, refined, with_exposure
 from gsjax.optim.densification import EMPTY_LOGIT, exploration, is_alive, relocate, reset_rows
-from gsjax.optim.splitting import Pull, divide, reset_opacities, strongly_pulled, watch_pull
+from gsjax.optim.splitting import Pull, accumulate_pull, densify, reset_opacities, strongly_pulled
 from gsjax.optim.step import Step, all_finite, gradient_step, keep_if, per_field_adam
 from gsjax.rasterize.plan import Plan
 from gsjax.scene.frame import Frame
@@ -136,7 +136,7 @@ def fit_step(config: FitConfig, extra_losses: ExtraLosses = ()) -> Step:
         present += [name for name in ("exposures", "twists") if getattr(model, name) is not None]
         # Means and twists move at a rate of 1 here; `update` scales their steps by rates that decay.
         used = {name: 1.0 if name in ("means", "twists") else rates[name] for name in present}
-        return gradient_step(loss, per_field_adam(used, others={"nudges": watch_pull()}))
+        return gradient_step(loss, per_field_adam(used, others={"nudges": accumulate_pull()}))
 
     def update(params: Model, state, batch: Batch, *, step, key: PRNGKeyArray):
         moved, new_state, info = adam_step(params).update(params, state, batch, step=step, key=key)
@@ -224,7 +224,7 @@ def split(
             sees are pruned too.
     """
     options, pull = config.split, _pull_of(state)
-    moved, touched = divide(
+    moved, touched = densify(
         _without_unseen(model.gaussians, state, all_seen),
         pull,
         key,

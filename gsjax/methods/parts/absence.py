@@ -19,10 +19,8 @@ from gsjax.scene.frame import Frame, one_camera
 from gsjax.scene.handles import skin
 from gsjax.scene.render import plan_render, render
 
-_MISMATCH = (
-    1.5,
-    0.05,
-)  # factor on the anchor's colour difference, and offset, above which a part may be absent
+# Factor on the anchor's colour difference, and offset, above which a part may be absent.
+_MISMATCH = (1.5, 0.05)
 _CAMERAS = 4  # of a frame, for which it is rendered with and without the part
 _CONCLUSIVE = 0.98  # share of the larger loss below which the smaller one is conclusive
 _FRAMES = 2  # in succession from which a part is absent, at least

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gsjax.geometry.neighbors import on_surfaces
+from gsjax.geometry.neighbors import drop_flying_pixels
 from gsjax.losses.photometric import photometric_loss, truncated_l1
 from gsjax.methods.track.config import TrackConfig
 from gsjax.methods.track.frames import prepared_first
@@ -64,7 +64,7 @@ def start_scene(
 
 def _surfaces(depths: np.ndarray) -> np.ndarray:
     """The depths that lie on surfaces, else 0; warns if many do not."""
-    surfaces = on_surfaces(depths)
+    surfaces = drop_flying_pixels(depths)
     share = 1 - (surfaces > 0).sum() / max((depths > 0).sum(), 1)
     if share > _NOISY:
         warnings.warn(
