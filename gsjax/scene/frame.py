@@ -41,7 +41,7 @@ class Frame(eqx.Module):
 
     @property
     def known_depths(self) -> Float[np.ndarray, "c height width"]:
-        """Depths of surfaces (`drop_flying_pixels`) within masks, else 0; zeros without depth. On the host."""
+        """Depths of surfaces (`drop_flying_pixels`) within masks, else 0; 0 without depth. On the host."""
         if self.depths is None:
             return np.zeros(self.images.shape[:-1], np.float32)
         depths = drop_flying_pixels(np.asarray(self.depths))
