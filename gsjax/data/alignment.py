@@ -20,7 +20,7 @@ class Alignment(NamedTuple):
     scale: float
     rotation: Float[np.ndarray, "3 3"]
     translation: Float[np.ndarray, "3"]
-    rotation_deg: Float[np.ndarray, "n"]
+    turned_deg: Float[np.ndarray, "n"]
     moved: Float[np.ndarray, "n"]
     extent: float
 

@@ -146,7 +146,7 @@ class Drive(Iterator[Tick]):
         guard = self.run.guard
         if guard is None:
             return
-        settled, params = guard.settled(self.run.params)
+        settled, params = guard.at_end(self.run.params)
         if settled is not guard:
             self.run = self.run.having(params=params, guard=settled)
             self.tick = None if self.tick is None else replace(self.tick, run=self.run)
@@ -170,7 +170,7 @@ class Drive(Iterator[Tick]):
         self._skipped = self._skipped + 1 if skipped else 0
         if self._losses and self._skipped == _SKIPPED:
             _warn_of_skipped(info)
-        guard, params = guard.watched(loss, params, self._window)
+        guard, params = guard.after_step(loss, params, self._window)
         self.run = self.run.having(params=params, guard=guard, step=run.step + 1)
         if self._progress(self.run.step) >= 1:
             self.settle()

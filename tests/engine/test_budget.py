@@ -76,8 +76,8 @@ def test_earlier_steps_of_a_resumed_run_count(clock):
 
 def test_a_run_that_used_all_its_minutes_needs_more_to_be_resumed(clock):
     with pytest.raises(ValueError, match=r"--minutes 2: the steps of the run to resume took 2.5 min already"):
-        Budget(2.0, clock.now).expect_more_than(150.0)
-    Budget(None, clock.now).expect_more_than(150.0)
+        Budget(2.0, clock.now).check_exceeds(150.0)
+    Budget(None, clock.now).check_exceeds(150.0)
 
 
 def test_what_is_not_necessary_is_done_if_it_can_end_in_time(clock):

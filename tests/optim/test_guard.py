@@ -167,9 +167,9 @@ def test_steps_that_are_skipped_at_the_end_of_a_short_run_lose_nothing():
     first, good = jnp.ones(SIZE), jnp.zeros(SIZE)
     guard = new_guard(first)
     for loss in [*np.linspace(4, 0.01, 79), *[np.nan] * 11]:
-        guard, _ = guard.watched(float(loss), good, LEAST_WINDOW)
-    assert guard.settled(good)[1] is good
-    back = guard.settled(jnp.full(SIZE, jnp.nan))[1]  # unless they have left the finite, unsaid
+        guard, _ = guard.after_step(float(loss), good, LEAST_WINDOW)
+    assert guard.at_end(good)[1] is good
+    back = guard.at_end(jnp.full(SIZE, jnp.nan))[1]  # unless they have left the finite, unsaid
     np.testing.assert_array_equal(back, first)
 
 
@@ -205,7 +205,7 @@ def test_thrown_by_the_last_step_of_a_window_it_is_not_thrown_again():
     for step in range(1, 402):
         loss = 2.0 if now is bad else 1.0 / step
         now = bad if step == 300 else now
-        guard, back = guard.watched(loss, now, LEAST_WINDOW)
+        guard, back = guard.after_step(loss, now, LEAST_WINDOW)
         now = now if back is now else good
         if step == 320:
             np.testing.assert_array_equal(guard.best.params, good)
@@ -268,8 +268,8 @@ def test_long_stretches_of_usual_runs_are_guarded(name):
     guard = new_guard(good)
     for step in range(stretch):
         late = step > 0.95 * stretch
-        guard, _ = guard.watched(9.0 if late else 1 / (1 + step), bad if late else good, window)
-    settled, params = guard.settled(bad)
+        guard, _ = guard.after_step(9.0 if late else 1 / (1 + step), bad if late else good, window)
+    settled, params = guard.at_end(bad)
     assert settled.is_settled or guard.returns
     np.testing.assert_array_equal(params if settled.is_settled else guard.best.params, good)
 
@@ -283,9 +283,9 @@ def test_noise_alone_is_no_loss(seed, noise):
     params = jnp.zeros(SIZE)
     guard = new_guard(params)
     for loss in losses:
-        guard, _ = guard.watched(float(loss), params, LEAST_WINDOW)
+        guard, _ = guard.after_step(float(loss), params, LEAST_WINDOW)
     assert guard.returns == 0
-    assert guard.settled(params)[0] is guard
+    assert guard.at_end(params)[0] is guard
 
 
 @pytest.mark.thorough
@@ -300,9 +300,9 @@ def test_one_bad_photograph_is_no_loss(seed, views):
         if (step - 1) % views == 0:
             order = random.permutation(views)
         loss = 0.7 if order[(step - 1) % views] == 0 else 0.02 + 0.01 * np.exp(-step / 2000)
-        guard, _ = guard.watched(loss * (1 + 0.02 * random.normal()), params, window)
+        guard, _ = guard.after_step(loss * (1 + 0.02 * random.normal()), params, window)
     assert guard.returns == 0
-    assert guard.settled(params)[0] is guard
+    assert guard.at_end(params)[0] is guard
 
 
 def test_half_a_step_is_half_of_each_array_and_integers_pass():

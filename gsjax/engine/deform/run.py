@@ -126,7 +126,7 @@ def run(options: Options, by_preset: Callable[[str], Options]) -> int:
         progress = Progress({"frames, depth, masks, poses and features": data.digest()})
         if options.resume:
             run, progress = load_run(folder.resume, run, progress)
-            budget.expect_more_than(progress.used_seconds)
+            budget.check_exceeds(progress.used_seconds)
             notes.add(f"Resumed after {counted(run.step, 'step')} of an earlier run.")
             if (folder.path / "query").exists():
                 notes.warn(f"{folder.path / 'query'} answers a query of the earlier scene; query again")

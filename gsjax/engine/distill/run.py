@@ -110,7 +110,7 @@ def run(options: Options) -> int:
         )
         if options.resume:
             run, progress = load_run(folder.resume, run, progress)
-            budget.expect_more_than(progress.used_seconds)
+            budget.check_exceeds(progress.used_seconds)
             notes.add(f"Resumed after {counted(run.step, 'step')} of an earlier run.")
         folder.write_config(settings)  # from here on an earlier field is gone
         ticks = drive(method, problem, run)

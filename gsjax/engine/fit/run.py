@@ -108,7 +108,7 @@ def run(options: Options) -> int:
         problem, run = method.start(fitted, cloud, photographs.background)
         if options.resume:
             run, progress = load_run(folder.resume, run, progress)
-            budget.expect_more_than(progress.used_seconds)
+            budget.check_exceeds(progress.used_seconds)
             notes.add(f"Resumed after {counted(run.step, 'step')} of an earlier run.")
             if is_default:  # the slots that an earlier run chose for its minutes are kept
                 config = replace(config, cap=run.params.gaussians.num)

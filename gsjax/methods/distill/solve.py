@@ -75,7 +75,7 @@ class SolveState(NamedTuple):
     rhs: Float[Array, "n r"]
     mass: Float[Array, "n"]
     shown: Float[Array, "n"]
-    lam: Float[Array, ""]
+    tie: Float[Array, ""]
     conjugate: Conjugate | None
     target: Float[Array, ""]
     pixels: Float[Array, ""]
@@ -287,16 +287,16 @@ def _after_vote(field: FeatureField, state: SolveState, neighbors, smoothness: f
     none."""
     seen = state.mass > _LEAST
     votes = jnp.where(seen[:, None], state.total / jnp.maximum(state.mass, _LEAST)[:, None], 0.0)
-    lam = smoothness * state.mass.sum() / jnp.maximum(seen.sum(), 1)
+    tie = smoothness * state.mass.sum() / jnp.maximum(seen.sum(), 1)
     found = _spread(votes, seen | _unlabelled(state), neighbors)
     field = eqx.tree_at(lambda f: f.encoding, field, _zero_unlabelled(found, state))
-    return field, state._replace(rhs=state.total, lam=lam)
+    return field, state._replace(rhs=state.total, tie=tie)
 
 
 def _first_residual(field: FeatureField, state: SolveState, neighbors):
     """After the product with the initial guess: the residual, which gives the first search direction."""
     x = field.encoding
-    residual = state.rhs - state.total - state.lam * _laplacian(x, neighbors)
+    residual = state.rhs - state.total - state.tie * _laplacian(x, neighbors)
     assert state.conjugate is not None
     first = turned(state.conjugate, residual, _preconditioner(state, neighbors))
     return field, state._replace(conjugate=first, loss=_objective(x, residual, state))
@@ -305,7 +305,7 @@ def _first_residual(field: FeatureField, state: SolveState, neighbors):
 def _cg_step(field: FeatureField, state: SolveState, neighbors):
     """After the product with a search direction: an iteration of conjugate gradients."""
     assert state.conjugate is not None
-    product = state.total + state.lam * _laplacian(state.conjugate.direction, neighbors)
+    product = state.total + state.tie * _laplacian(state.conjugate.direction, neighbors)
     scale = _preconditioner(state, neighbors)
     x, after = advanced(field.encoding, state.conjugate, product, scale)
     field = eqx.tree_at(lambda f: f.encoding, field, _zero_unlabelled(x, state))
@@ -325,7 +325,7 @@ def _zero_unlabelled(x: Float[Array, "n r"], state: SolveState) -> Float[Array, 
 def _preconditioner(state: SolveState, neighbors: Int[Array, "n k"]) -> Float[Array, "n"]:
     num, count = neighbors.shape
     pairs = count + jnp.zeros(num, state.mass.dtype).at[neighbors.ravel()].add(1.0)
-    return state.mass + state.lam * pairs + _LEAST
+    return state.mass + state.tie * pairs + _LEAST
 
 
 def _objective(x: Float[Array, "n r"], residual: Float[Array, "n r"], state: SolveState) -> Float[Array, ""]:
