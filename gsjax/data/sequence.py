@@ -70,8 +70,8 @@ class Sequence:
         background: RGB, 0 to 1, composited behind transparent images; None if none is transparent.
 
     Raises:
-        ValueError: shapes disagree, a pose is not a rigid motion, times do not increase, or the background is
-            not from 0 to 1.
+        ValueError: there is no camera, ids of cameras repeat, shapes disagree, intrinsics are not a camera's,
+            a pose is not a rigid motion, times do not increase, or the background is not from 0 to 1.
     """
 
     name: str

@@ -146,6 +146,7 @@ def edge_weights(
         positions, tau_x: positions of the nodes and their length scale, metres.
         features: the teacher's features.
         times, tau_t: times of the frames and their time scale, seconds.
+        edges: the nodes that each node is connected to.
     """
     positions, placed = present(positions)
     features, there = present(features)

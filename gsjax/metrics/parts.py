@@ -132,6 +132,7 @@ def joint_error(found: Joint, true: Joint, middle: Float[np.ndarray, "3"], ancho
     that is nearest to the part.
 
     Args:
+        found, true: the joints.
         middle: centre of the part, world, metres.
         anchor: the frame at which values are taken as 0.
 

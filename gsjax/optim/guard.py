@@ -6,8 +6,8 @@ the best window. A window consists of whole passes over the views, so that each 
 would be a large part of the run, it has some of the views, in their random order. Before the first window,
 the best parameters are those with which the stretch began. A stretch is a period in which losses can be
 compared: a new one begins when parameters or constants are replaced, such as by densification, or when a
-method says that the meaning of its loss has changed. A stretch shorter than a window, such as a frame of
-parts, can only go back to its beginning.
+method says that the meaning of its loss has changed. A stretch shorter than a window can only go back to
+its beginning.
 
 Steps themselves ensure that their results are finite (`gsjax.optim.step`) and that none is far longer than
 usual (`steady_adam`).

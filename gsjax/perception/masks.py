@@ -25,6 +25,12 @@ def labels_of_masks(
     A mask that covers more than `max_fraction` of the image is left out, and so is one that overlaps a mask
     of higher score by more than `max_overlap` (intersection over union). Where masks overlap, the smaller one
     is on top, as an object is on its tray.
+
+    Args:
+        masks: masks of one image.
+        scores: confidence of each mask.
+        max_fraction: largest share of the image, 0 to 1.
+        max_overlap: largest intersection over union, 0 to 1.
     """
     kept: list[int] = []
     for row in np.argsort(-scores, kind="stable"):

@@ -73,7 +73,7 @@ class _Pair(NamedTuple):
     """A rectified pair: two parallel cameras side by side, with the same K.
 
     Attributes:
-        turns: rotations from each camera's own frame to that of its rectified camera.
+        rotations: rotations from each camera's own frame to that of its rectified camera.
         K: intrinsics of both rectified cameras, pixel centres at +0.5.
         size: (width, height) of the rectified images.
         baseline: distance between the cameras, in the unit of the poses.

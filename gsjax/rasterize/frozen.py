@@ -66,6 +66,7 @@ def freeze_views(
 
     Raises:
         ValueError: there are no Gaussians; or as `gsjax.plan`.
+        RuntimeError: the plan is too small for the views, which is a bug.
     """
     if len(means) == 0:
         raise ValueError("means: expected at least one Gaussian to see, found none")

@@ -61,7 +61,7 @@ class SolveState(NamedTuple):
 
     Attributes:
         total: the sums of the current pass over the views.
-        wanted: the right-hand side.
+        rhs: the right-hand side.
         mass: D, how much of each Gaussian is shown by pixels that have a teacher.
         shown: how much of it is shown by all pixels.
         tie: lambda.

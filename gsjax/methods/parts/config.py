@@ -96,7 +96,7 @@ class UnifyConfig:
     tolerance: float = 0.15
     """Join parts whose motions differ by less than this share of the smaller motion."""
     least_gain: float = 0.01
-    """At the end, join a part to another or to the background if the loss rises by less than this share."""
+    """At the end, join a part to another or to the background if the loss rises by at most this share."""
 
     def __post_init__(self):
         expect(self, "unify.", **{one.name: (0, np.inf) for one in fields(self)})

@@ -241,7 +241,7 @@ class Match(NamedTuple):
         far: distances to the nearest points of the surface, metres.
         off: distances to their tangent planes, metres.
         cosines: cosines between both normals.
-        unlike: how unlike their colours are, 0 to 1.
+        color_distance: difference between their colours, 0 to 1.
     """
 
     far: Float[np.ndarray, "*k n"]

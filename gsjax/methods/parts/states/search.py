@@ -145,7 +145,7 @@ def _candidates(
         mixed = random.permutation(len(rows))
         few, part = piece.of(mixed[:_FEW]), piece.of(mixed[:_SOME])
         match = matched(tried, few, new, _REACH * pixel)
-        alike = (match.cosines > SAME_WAY) & (match.unlike < _COLOR)
+        alike = (match.cosines > SAME_WAY) & (match.color_distance < _COLOR)
         costs = np.where(alike, np.minimum(match.far / (_REACH * pixel), 1), 1).mean(-1)
         places = moved(tried, few.points[:: len(few.points) // 8 + 1])
         for guess in tried[_distinct_best(costs, places, _REACH * pixel)]:
