@@ -1,11 +1,11 @@
-"""Makes the gallery, docs/gallery.md with its short films and pictures in docs/gallery, the figure of all
-trades, and the film of the README.
+"""Makes docs/gallery.md with its short films and pictures in docs/gallery, the figure of all speed/accuracy
+trade-offs, and the film of the README.
 
     .venv/bin/python docs/make_gallery.py            # `make gallery`
 
-Small runs on built-in scenes are made first, into runs/gallery, where they are not there yet or were
-stopped: some 20 minutes on two busy cores. Figures of experiments are shown from where they are committed;
-nothing is measured here.
+First, small runs on built-in scenes are written to runs/gallery, unless they are already there and complete:
+some 20 minutes on two busy cores. Figures of experiments are shown from where they are committed; nothing is
+measured here.
 """
 
 import json
@@ -48,11 +48,11 @@ COMMANDS = {
     f"--parts.stream.iterations 20 --parts.refine.iterations 100 --out {RUNS}/furniture",
     "furniture/edit/ops": f"edit {RUNS}/furniture --op ghost:parts=1,opacity=0.15",
 }
-"""What is run for the gallery, by the folder that it leaves."""
+"""The commands run for the gallery, by the folder that each writes."""
 
 
 def main() -> None:
-    """Run what is missing, and write pictures and page."""
+    """Run what is missing, and write the pictures and the page."""
     for folder, command in COMMANDS.items():
         if not made(RUNS / folder, command):
             subprocess.run([sys.executable, "-m", "gsjax.cli", *anew(command)], check=True, cwd=ROOT)
@@ -66,13 +66,13 @@ def main() -> None:
 
 
 def anew(command: str) -> list[str]:
-    """Its words, by which it takes the place of what was stopped."""
+    """The words of a command that replaces an interrupted run."""
     return [*command.split(), *([] if command.startswith("query") else ["--overwrite"])]
 
 
 def made(folder: Path, command: str) -> bool:
-    """Whether what a command leaves is there, and whole: it may have been stopped."""
-    if command.startswith("query"):  # whose answer is put in place whole
+    """Whether the output of a command exists and is complete; the command may have been interrupted."""
+    if command.startswith("query"):  # its answer is written atomically
         return folder.exists()
     if command.startswith("edit"):
         file = folder / "metrics.json"
@@ -81,7 +81,7 @@ def made(folder: Path, command: str) -> bool:
 
 
 def pictures() -> dict[str, np.ndarray]:
-    """Out of the runs: RGB, by the name of the file."""
+    """Pictures from the runs, RGB, by the name of the file."""
     return {"field": read(RUNS / "table/field/query/overview.png")}
 
 
@@ -97,7 +97,7 @@ def films() -> dict[str, Path]:
 
 
 def panels_in_a_row(frames: np.ndarray, gap: int = 4) -> np.ndarray:
-    """Of frames with input and render above, error and labels below: input, render and labels in a row."""
+    """From frames with input and rendering above, error and labels below: all but the error, in a row."""
     height, width = frames.shape[1] // 2, frames.shape[2] // 2
     panels = frames[:, :height, :width], frames[:, :height, width:], frames[:, height:, width:]
     white = np.full((len(frames), height, gap, 3), 255, np.uint8)
@@ -105,8 +105,8 @@ def panels_in_a_row(frames: np.ndarray, gap: int = 4) -> np.ndarray:
 
 
 def write_film(path: Path, video: np.ndarray, most: int = FILM_WIDTH) -> str:
-    """Writes frames [T,H,W,3] as an animated WebP of at most that width, which pages show by themselves;
-    returns its path from the page."""
+    """Writes frames [T,H,W,3] as an animated WebP of at most that width, which browsers play as they are;
+    returns its path relative to the page."""
     frames = [Image.fromarray(frame) for frame in video]
     width, height = frames[0].size
     scale = min(1.0, most / width)
@@ -144,43 +144,43 @@ SECTIONS = {
     "Grasping and policies": (None, ("grasping", "policies")),
     "Rasterizer": (None, ("rasterizer_trade/simulated", "rasterizer_trade/real")),
 }
-"""The page's sections: the picture of a run, and the experiments whose figures are shown."""
+"""The sections of the page: the picture of a run, and the experiments whose figures are shown."""
 
 CAPTIONS = {
-    "tracker_trade": "Errors, IoU and PSNR over update rate; a line for each knob.",
-    "tracker_ablation": "Each variant on both recordings; the line is the full tracker.",
-    "optimizers": "Point error over time; the dotted line is standing still.",
-    "basin": "From how far a displaced carton finds home: gradient cosines (left), success (right).",
-    "parts_ablation": "Each variant; the line is the full discovery.",
-    "parts_trade": "The line joins settings that no faster one beats.",
-    "parts_failures": "Overlap with the hard part, from easy to hopeless.",
-    "parts_tracked": "IoU with the true masks over frames.",
-    "bar_blends": "A bending, twisting bar, moved by handles.",
-    "parts_edits": "Edits of discovered parts.",
-    "field_ladder": "Quality over the seconds that a field takes.",
-    "field_levels": "Parts, a pair and things, asked of one level and of three.",
-    "deform_trade": "One setting changed at a time.",
-    "deform_pulling": "Held-out frames (real): deforming, static, and copies of other frames.",
-    "deform_flow": "Share of pixels below each flow error (real).",
-    "static_fit": "Held-out PSNR over minutes (real).",
-    "fit_trade": "Held-out PSNR over minutes, and over Gaussians (real).",
-    "known_scene": "PSNR of unseen views of known Gaussians.",
-    "grasping": "Success with 95 % intervals, and tracking error as the fingers close.",
-    "policies": "Success with 95 % intervals; dots are training seeds.",
-    "rasterizer_trade/simulated": "Each knob's PSNR and gradient cosine over time.",
-    "rasterizer_trade/real": "The same for garden and guitar.",
+    "tracker_trade": "Errors, IoU and PSNR against the update rate, with one line per knob.",
+    "tracker_ablation": "Each variant on both recordings; the dotted line marks the full tracker.",
+    "optimizers": "Point error against time; the dotted line is the error without any motion.",
+    "basin": "Convergence of a displaced carton: gradient cosine (left), success rate (right).",
+    "parts_ablation": "Each variant; the dotted line marks the full discovery.",
+    "parts_trade": "The line joins the settings that no faster setting beats.",
+    "parts_failures": "IoU with the hard part, from easy cases to hopeless ones.",
+    "parts_tracked": "IoU with the ground-truth masks, frame by frame.",
+    "bar_blends": "Three blends of rotations on a bar that is bent and twisted by handles.",
+    "parts_edits": "Edits of discovered parts: unchanged pixels, requested motion seen, and frame rate.",
+    "field_ladder": "Quality against the time to compute a field.",
+    "field_levels": "Queries for parts, a pair and whole things, with fields of one level and of three.",
+    "deform_trade": "One setting is changed at a time; the star is the reference.",
+    "deform_pulling": "PSNR of held-out frames (real): deforming, static, and copies of other frames.",
+    "deform_flow": "Share of pixels whose scene-flow error is below each value (real).",
+    "static_fit": "Held-out PSNR against time (real).",
+    "fit_trade": "Held-out PSNR against time and against the number of Gaussians (real).",
+    "known_scene": "PSNR of unseen views of a scene whose Gaussians are known.",
+    "grasping": "Success rate with 95 % intervals, and tracking error when the fingers begin to close.",
+    "policies": "Success rate with 95 % intervals; each dot is a training seed.",
+    "rasterizer_trade/simulated": "PSNR and gradient cosine against time for each knob.",
+    "rasterizer_trade/real": "The same for the garden and the guitar.",
 }
-"""What the figure of each experiment shows."""
+"""The caption of each experiment's figure."""
 
 SAYS = {
-    "tracker": ("demo", "Camera 1: input and render above, error and labels below."),
-    "asked": ("demo/field/query", "The can, found once and carried along by the tracked Gaussians."),
-    "parts": ("furniture", "One camera: picture, render, error, and the parts in colours."),
-    "edit": ("furniture/edit/ops", "Only the first part that was found is shown; all else is a ghost."),
-    "field": ("table/field/query", "The can: in the photograph, its scores, alone, left out, recoloured."),
-    "tissue": ("tissue/query", "The scene as reconstructed, and without the tool."),
+    "tracker": ("demo", "Camera 1: input and rendering (top), error and labels (bottom)."),
+    "asked": ("demo/field/query", "The can, found once, then carried along by the tracked Gaussians."),
+    "parts": ("furniture", "One camera: input, rendering, error, and the parts in colour."),
+    "edit": ("furniture/edit/ops", "The first discovered part; everything else is faded."),
+    "field": ("table/field/query", "The can: marked in the photograph, scores, alone, removed, recoloured."),
+    "tissue": ("tissue/query", "The reconstructed scene with and without the tool."),
 }
-"""Which run a picture is of, and what it shows."""
+"""The run that each picture is from, and its caption."""
 
 
 def page(shown: dict[str, str]) -> str:
@@ -188,15 +188,17 @@ def page(shown: dict[str, str]) -> str:
     lines = [
         "# Gallery",
         "",
-        "Films of small runs on built-in scenes (simulated, no results), with their commands, and figures "
-        "of [experiments](experiments.md): `gsjax experiment run NAME` makes each, and "
-        "`experiments/NAME/results.md` has its full caption. `make gallery` takes 20 minutes the first time.",
+        "This page shows films and pictures of small runs on built-in scenes, with the commands that produce "
+        "them, and figures of [experiments](experiments.md). The built-in scenes are simulated, and their "
+        "films are illustrations, not results. `gsjax experiment run NAME` reproduces the figure of an "
+        "experiment; its full caption is in `experiments/NAME/results.md`. `make gallery` takes 20 minutes "
+        "the first time.",
         "",
         "## Speed against accuracy",
         "",
         "![Six plots: errors and scores over time](gallery/trades.png)",
         "",
-        "*[Choosing](choosing.md) explains each.*",
+        "*[Choosing](choosing.md) explains each plot.*",
         "",
     ]
     for title, (picture, experiments) in SECTIONS.items():
@@ -211,7 +213,7 @@ def page(shown: dict[str, str]) -> str:
 
 
 def commands_of(folder: str) -> list[str]:
-    """The commands that leave a folder: its own, after those of the runs that it lies in."""
+    """The commands that write a folder: its own, after those of the runs that contain it."""
     needed = [command for name, command in COMMANDS.items() if f"{folder}/".startswith(f"{name}/")]
     return [f"gsjax {shlex.join(each.replace(f'{RUNS}/', 'runs/gallery/').split())}" for each in needed]
 
@@ -236,11 +238,11 @@ def rows(name: str) -> Iterator[tuple[dict, dict]]:
 
 
 def points() -> list[list[tuple[float, float, bool]]]:
-    """Of each trade: what it costs, what it gives, and whether it is what the others differ from."""
+    """The points of each trade-off: cost, gain, and whether it is the reference that the others vary."""
     tracker = [(o, r) for o, r in rows("tracker_trade") if o["recording"] == "tabletop_1"]
     fast = {"knob": "preset", "value": "fast"}
     fox = [(o["setting"] == "default", r["curve"]) for o, r in rows("fit_trade") if o["scene"] == "fox"]
-    # A region of interest leaves out part of the picture, which is not compared.
+    # A region of interest leaves part of the image unrendered, and that part is not compared.
     garden = [(o, r) for o, r in rows("rasterizer_trade/real") if o["scene"] == "garden"]
     drawn = [(o, r) for o, r in garden if o["knob"] != "roi"]
     return [
@@ -248,7 +250,7 @@ def points() -> list[list[tuple[float, float, bool]]]:
         [(*at, default) for default, curve in fox for at in curve],
         [(r["update_s"], r["point_mm"], o["setting"] == "default") for o, r in rows("parts_trade")],
         [(r["minutes"], r["miou_3d"], o == {"iterations": 100}) for o, r in rows("field_trade")],
-        # Paces were measured beside the first row's, minutes were not; steps are 100 and 300 unless told.
+        # Paces were measured beside the first row's, minutes were not; by default there are 100 + 300 steps.
         [
             (r["pace"] * (100 + o.get("iterations", 300)) / 400, r["psnr"], o == {"kind": "hexplane"})
             for o, r in rows("deform_trade")
@@ -258,7 +260,7 @@ def points() -> list[list[tuple[float, float, bool]]]:
 
 
 def draw_trades(path: Path) -> None:
-    """One plot for each method: every setting that was measured, and the best that each cost buys."""
+    """One plot for each method: every measured setting, and the best result at each cost."""
     drawing = Figure(figsize=(11, 6.4), facecolor="white", layout="constrained")
     for axes, trade, found in zip(drawing.subplots(2, 3).flat, TRADES, points(), strict=True):
         _draw(axes, *trade, found)

@@ -1,9 +1,8 @@
-"""Runs the notebooks of docs/notebooks, and keeps their pictures and texts in them.
+"""Runs the notebooks of docs/notebooks and stores their pictures and printed output in them.
 
     .venv/bin/python docs/make_notebooks.py [NAME ...]    # `make notebooks`
 
-What a cell shows as a page is left out, as hosts of repositories do not show it: it is there when the cell is
-run.
+HTML output is dropped, because repository hosts do not display it: it appears when the cell is run.
 """
 
 import sys
@@ -18,15 +17,15 @@ from nbclient import NotebookClient
 from PIL import Image
 
 FOLDER = Path(__file__).resolve().parent / "notebooks"
-_MOST_SECONDS = 1800  # of a cell
-_QUALITY = 85  # of a picture's JPEG
+_MOST_SECONDS = 1800  # per cell
+_QUALITY = 85  # of JPEG pictures
 
 
 def main(names: list[str]) -> None:
     """Run the named notebooks, or all.
 
     Raises:
-        ValueError: there is none of a name.
+        ValueError: there is no notebook of a given name.
     """
     if unknown := set(names) - {path.stem for path in FOLDER.glob("*.ipynb")}:
         raise ValueError(f"expected names of notebooks in {FOLDER}, found {', '.join(sorted(unknown))}")
@@ -35,13 +34,13 @@ def main(names: list[str]) -> None:
             continue
         print(path.name, flush=True)
         notebook = nbformat.read(path, as_version=4)
-        with TemporaryDirectory() as where:  # what cells write is not kept
+        with TemporaryDirectory() as where:  # files that cells write are not kept
             NotebookClient(notebook, timeout=_MOST_SECONDS, resources={"metadata": {"path": where}}).execute()
         path.write_text(nbformat.writes(cleaned(notebook), indent=1) + "\n", encoding="utf-8")
 
 
 def cleaned(notebook: nbformat.NotebookNode) -> nbformat.NotebookNode:
-    """The notebook without what differs from run to run, and without pages.
+    """The notebook without HTML output and without anything that differs from run to run.
 
     Args:
         notebook: as it was run.
@@ -64,7 +63,7 @@ def cleaned(notebook: nbformat.NotebookNode) -> nbformat.NotebookNode:
 
 
 def joined(outputs: Iterable[nbformat.NotebookNode]) -> list[nbformat.NotebookNode]:
-    """The outputs, with what was printed in succession as one.
+    """The outputs, with consecutive printed outputs joined.
 
     Args:
         outputs: of a cell.
@@ -82,7 +81,7 @@ def smaller(picture: str) -> str:
     """A JPEG picture in base64.
 
     Args:
-        picture: a PNG, as a cell left it.
+        picture: a PNG in base64, as a cell produced it.
     """
     packed = BytesIO()
     Image.open(BytesIO(b64decode(picture))).convert("RGB").save(packed, "JPEG", quality=_QUALITY)
