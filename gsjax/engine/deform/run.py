@@ -103,7 +103,7 @@ def run(options: Options, by_preset: Callable[[str], Options]) -> int:
                     "The camera goes around the scene, but its pictures are not transparent, so the settings "
                     "are those of --preset surst. If they show one object, make them transparent around it."
                 )
-        settings = replace(options, dataset=absolute_path(options.dataset), **choice.absolute_path())
+        settings = replace(options, dataset=absolute_path(options.dataset), **choice.located())
         if options.resume:
             folder.check_config(settings, but=RESUME_MAY_CHANGE)
         how = (options.test_every, options.tools, choice, options.deform.channels)

@@ -170,9 +170,7 @@ def _write(folder: RunFolder, result: DistillResult) -> None:
 def with_paths(options: Options) -> Options:
     """The options with paths that are valid from any folder."""
     images = None if options.images is None else absolute_path(options.images)
-    return replace(
-        options, **options.absolute_path(), scene=Path(absolute_path(str(options.scene))), images=images
-    )
+    return replace(options, **options.located(), scene=Path(absolute_path(str(options.scene))), images=images)
 
 
 def _note_unused(config: DistillConfig, notes: Notes) -> None:

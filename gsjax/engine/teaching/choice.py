@@ -62,7 +62,7 @@ class TeacherChoice(TeacherOptions):
         """Whether the features come from a folder of files."""
         return self.features not in ("auto", NO_TEACHER, *KINDS)
 
-    def absolute_path(self) -> dict[str, Any]:
+    def located(self) -> dict[str, Any]:
         """Its paths in a form that is valid from any folder, by the options that name them."""
         paths = {"sam": self.sam, "weights": self.weights}
         found: dict[str, Any] = {
