@@ -4,7 +4,8 @@ verbs       fit, track, parts, distill, deform: data in, a tick per step, `now.r
 settings    FitConfig, TrackConfig, PartsConfig, DistillConfig, DeformConfig
 data        open_photographs, open_sequence, Photographs, Sequence
 tracking    start_scene, scene_from_shapes
-files       save, load, open_scene, open_field, show, read_gaussians, write_gaussians, read_ply, write_ply
+files       save, load, open_scene, open_field, write_field, show, read_gaussians, write_gaussians, read_ply,
+            write_ply
 scene       Gaussians, Tags, Camera, Frame, render, plan_render
 rasterize   rasterization, plan, Plan, sharded_rasterization, composite_tile
 speed       host_options, keep_freed_memory, keep_programs
@@ -16,6 +17,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from gsjax.data import Photographs, Sequence, open_photographs, open_sequence
     from gsjax.engine.checkpoint import load, open_field, open_scene, save
+    from gsjax.engine.distill.file import write_field
     from gsjax.engine.show import show
     from gsjax.engine.verbs import deform, distill, fit, parts, track
     from gsjax.geometry.cameras import Camera
@@ -41,6 +43,7 @@ __version__ = "0.1.0"
 _HOMES = {
     "gsjax.data": ("Photographs", "Sequence", "open_photographs", "open_sequence"),
     "gsjax.engine.checkpoint": ("load", "open_field", "open_scene", "save"),
+    "gsjax.engine.distill.file": ("write_field",),
     "gsjax.engine.show": ("show",),
     "gsjax.engine.verbs": ("deform", "distill", "fit", "parts", "track"),
     "gsjax.geometry.cameras": ("Camera",),
@@ -100,6 +103,7 @@ __all__ = [
     "show",
     "start_scene",
     "track",
+    "write_field",
     "write_gaussians",
     "write_ply",
 ]

@@ -1,4 +1,4 @@
-"""Recordings, real and simulated: every reader returns the same sequence type."""
+"""Recordings and photographs, real and simulated: every reader returns a `Sequence` or `Photographs`."""
 
 from gsjax.data.bop import read_bop
 from gsjax.data.clip import read_clip

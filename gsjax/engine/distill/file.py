@@ -1,6 +1,8 @@
-"""Reading field.npz, the file of a feature field, which is separate from that of its scene; see
-`DistillResult.write`."""
+"""field.npz, the file of a feature field, which is separate from that of its scene."""
 
+import json
+import os
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -11,20 +13,45 @@ from equinox import nn, tree_at
 
 from gsjax.engine.files import check_arrays, read_arrays
 from gsjax.engine.teaching.source import Source
+from gsjax.io.atomic import write_npz
 from gsjax.io.brief import brief
 from gsjax.io.parsed import parse_json
 from gsjax.methods.distill import DistillResult, FeatureField
-from gsjax.methods.distill.result import FORMAT
 from gsjax.scene.feature_grid import FeatureGrid, FeatureGridConfig
 
 NAME = "field.npz"
 FOLDER = "field"
 """Folder of a run's field, within the run."""
+_FORMAT = 1
+_UNKNOWN = {"kind": "files", "names": {}, "weights": None}  # an unknown source
 _AGAIN = "distil it again with this version of gsjax"
 
 
+def write_field(path: str | os.PathLike, result: DistillResult) -> None:
+    """Write field.npz, which `gsjax query` and `gsjax view` read beside the scene. An existing file is
+    replaced only once the new one is complete.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
+    encoding = result.field.encoding
+    source = _UNKNOWN if result.source is None else result.source.plain()
+    about: dict[str, Any] = {"format": _FORMAT, "source": source, "scene": dict(result.scene)}
+    arrays = {"lift": result.field.lift}
+    if isinstance(encoding, FeatureGrid):
+        assert result.rows is not None
+        about["grid"] = asdict(encoding.config)
+        arrays |= {"rows": result.rows, "table": encoding.table, "bounds": np.array(encoding.bounds)}
+        for i, layer in enumerate(encoding.layers):
+            assert layer.bias is not None
+            arrays |= {f"weight_{i}": layer.weight, f"bias_{i}": layer.bias}
+    else:
+        arrays["vectors"] = encoding
+    write_npz(path, {**arrays, "about": json.dumps(about)})
+
+
 def read_field(path: Path) -> DistillResult:
-    """The field that `DistillResult.write` wrote, without the means of its scene.
+    """The field that `write_field` wrote, without the means of its scene.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -37,7 +64,7 @@ def read_field(path: Path) -> DistillResult:
         about = parse_json(str(arrays["about"]))
         source, scene = Source.of(about["source"]), dict(about["scene"])
         config = FeatureGridConfig(**about["grid"]) if "grid" in about else None
-        if about["format"] != FORMAT:
+        if about["format"] != _FORMAT:
             raise ValueError(f"format {about['format']}")
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise ValueError(

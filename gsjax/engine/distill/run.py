@@ -11,7 +11,7 @@ import jax
 from rich.console import Console
 
 from gsjax.engine.budget import Budget, note_if_few
-from gsjax.engine.distill.file import FOLDER, NAME
+from gsjax.engine.distill.file import FOLDER, NAME, write_field
 from gsjax.engine.distill.judge import judge
 from gsjax.engine.distill.results import asked_by, summarize
 from gsjax.engine.distill.scene import FieldScene, SceneOptions, open_field_scene
@@ -36,8 +36,7 @@ from gsjax.engine.records import digest
 from gsjax.engine.teaching.cache import FeatureCache
 from gsjax.engine.teaching.choice import TeacherChoice
 from gsjax.engine.teaching.teaching import Teaching
-from gsjax.io.atomic import atomic_write
-from gsjax.methods.distill import PRESETS, Distill, DistillConfig, DistillResult
+from gsjax.methods.distill import PRESETS, Distill, DistillConfig
 
 _OF_TRAINING = (
     "encoding",
@@ -126,13 +125,13 @@ def run(options: Options) -> int:
         def first_answer(now: Tick) -> None:
             """Writes the field of the solution, which can be queried while it is trained further."""
             if now.step == solved < total:
-                _write(folder, now.result)
+                write_field(folder.path / NAME, now.result)
                 ask = f"gsjax query {out} {asked_by(teaching.source.kind)}"
                 console.print(f"a first answer is there: {ask}, or gsjax view {out}", soft_wrap=True)
 
         watch(ticks, progress, schedule, folder, console, budget=budget, evaluate=first_answer)
         steps, result = ticks.run.step, ticks.result
-        _write(folder, result)
+        write_field(folder.path / NAME, result)
         with stage(console, "scoring views"):
             judged = judge(folder, scene, teaching, result, options.distill, notes, budget)
         note_if_cut_short(progress, schedule, steps, notes)
@@ -160,11 +159,6 @@ def run(options: Options) -> int:
         }
         finish(folder, found, summarize)
     return exit_code(progress.stopped)
-
-
-def _write(folder: RunFolder, result: DistillResult) -> None:
-    with atomic_write(folder.path / NAME) as temporary:
-        result.write(temporary)
 
 
 def with_paths(options: Options) -> Options:

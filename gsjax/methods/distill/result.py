@@ -1,9 +1,7 @@
 """The result of a distillation: a field that scores the Gaussians of its scene for queries."""
 
-import json
-import os
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from dataclasses import field as default
 from functools import cached_property
 from typing import Any
@@ -20,10 +18,7 @@ from gsjax.methods.protocols import LanguageEncoder
 from gsjax.methods.query import encoded_prompt, relevancy
 from gsjax.scene.feature_grid import FeatureGrid, Located, locate
 
-FORMAT = 1
-"""Format of field.npz."""
 _BEST, _TIE = 32, 0.02  # best Gaussians that decide the level of a query; difference of equal cosines
-_UNKNOWN = {"kind": "files", "names": {}, "weights": None}  # an unknown source
 
 
 @dataclass(frozen=True, eq=False)
@@ -195,28 +190,6 @@ class DistillResult:
         """
         loaded = None if encoder is None else lambda: encoder
         return self.scores(encoded_prompt(self.source, text, negatives, loaded).vectors, level)
-
-    def write(self, path: str | os.PathLike) -> None:
-        """Write field.npz, which `gsjax query` and `gsjax view` read beside the scene."""
-        encoding = self.field.encoding
-        source = _UNKNOWN if self.source is None else self.source.plain()
-        about: dict[str, Any] = {"format": FORMAT, "source": source, "scene": dict(self.scene)}
-        arrays = {"lift": np.asarray(self.field.lift)}
-        if isinstance(encoding, FeatureGrid):
-            assert self.rows is not None
-            about["grid"] = asdict(encoding.config)
-            arrays |= {
-                "rows": self.rows,
-                "table": np.asarray(encoding.table),
-                "bounds": np.array(encoding.bounds),
-            }
-            for i, layer in enumerate(encoding.layers):
-                assert layer.bias is not None
-                arrays |= {f"weight_{i}": np.asarray(layer.weight), f"bias_{i}": np.asarray(layer.bias)}
-        else:
-            arrays["vectors"] = np.asarray(encoding)
-        with open(path, "wb") as stream:
-            np.savez_compressed(stream, **arrays, about=np.array(json.dumps(about)))
 
     @property
     def _dimension(self) -> int:

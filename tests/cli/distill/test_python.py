@@ -7,7 +7,7 @@ import pytest
 
 from gsjax.data import open_sequence, photographs_of
 from gsjax.engine.checkpoint import load, save
-from gsjax.engine.distill.file import read_field
+from gsjax.engine.distill.file import read_field, write_field
 from gsjax.engine.teaching.choice import TeacherChoice
 from gsjax.engine.verbs import distill
 from gsjax.methods.distill import DistillConfig, Teacher, teacher_of_objects
@@ -28,7 +28,7 @@ def shown(pristine):
 
 
 @pytest.mark.thorough
-def test_a_scene_and_photographs_make_a_field_that_answers_and_goes_on(shown, tmp_path):
+def test_a_scene_and_photographs_make_a_field_that_answers_and_goes_on(shown, tmp_path, monkeypatch):
     scene, photographs = shown
     for now in distill(scene, photographs, "classes", SMALL):
         if now.step == 2:
@@ -42,11 +42,21 @@ def test_a_scene_and_photographs_make_a_field_that_answers_and_goes_on(shown, tm
     *_, again = distill(scene, photographs, "classes", SMALL, after=before)
     assert again.step == 4
     np.testing.assert_array_equal(again.result.query("can"), scores)
-    now.result.write(tmp_path / "field.npz")
+    write_field(tmp_path / "field.npz", now.result)
     read = read_field(tmp_path / "field.npz")
     assert (read.source, dict(read.scene)) == (now.result.source, now.result.scene)
     for one, other in zip(read.at(scene.means), now.result.placed, strict=True):
         jax.tree.map(np.testing.assert_array_equal, one, other)
+
+    def interrupted(stream, **arrays):
+        stream.write(b"half of it")
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(np, "savez_compressed", interrupted)
+    with pytest.raises(KeyboardInterrupt):  # the earlier file stays
+        write_field(tmp_path / "field.npz", before.result)
+    assert [file.name for file in tmp_path.glob("*field*")] == ["field.npz"]
+    assert len(read_field(tmp_path / "field.npz").field.lift) == len(now.result.field.lift)
 
 
 @pytest.mark.thorough
@@ -78,7 +88,7 @@ def test_features_on_three_levels_are_learned_together(shown, pristine, tmp_path
             found = np.asarray(result.scores(vectors) > 0.5)
             assert (found & wanted).sum() / (found | wanted).sum() > 0.7
             np.testing.assert_array_equal(result.scores(vectors), result.scores(vectors, level))
-    result.write(tmp_path / "field.npz")
+    write_field(tmp_path / "field.npz", result)
     assert read_field(tmp_path / "field.npz").levels == result.levels
     with pytest.raises(ValueError, match="level: expected small, medium, large, found huge"):
         result.scores(codes[:1], "huge")
