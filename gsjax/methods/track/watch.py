@@ -47,7 +47,7 @@ class SearchResult(NamedTuple):
     confirmed: Bool[Array, "k"]  # groups for which shifts or rotations found no better place
     relocation: Relocation  # where each group may be instead, valid only where it was tried
     relocation_tried: Bool[Array, "k"]
-    leads: Float[Array, "k"]  # see `search_turns`; infinite if unknown
+    leads: Float[Array, "k"]  # see `search_rotations`; infinite if unknown
 
 
 class Watch(NamedTuple):
