@@ -17,11 +17,11 @@ from plyfile import PlyData
 
 FORMAT = 1
 
-_UNSTEADY_KEYS = {"seconds", "machine", "fps", "from_cache"}
-_UNSTEADY_ENDINGS = ("_seconds", "_s", "_ms", "_hz", "_mb")
-_UNSTEADY_ARRAYS = {"update_s"}
+_VOLATILE_KEYS = {"seconds", "machine", "fps", "from_cache"}
+_VOLATILE_ENDINGS = ("_seconds", "_s", "_ms", "_hz", "_mb")
+_VOLATILE_ARRAYS = {"update_s"}
 _OPTION_KEYS = {"photographs"}
-"""Text entries of NPZ files that hold names of options, such as how a dataset was chosen."""
+"""Keys in the JSON text of NPZ files whose values hold names of options: how a dataset was chosen."""
 _TIME = re.compile(r"\d[\d.,]*\s*(?:ms|s|seconds?|min|minutes?|hz|mb|gib|times a second)\b", re.IGNORECASE)
 _NUMBER = re.compile(r"\d+(?:[.,]\d+)*")
 _QUANTILES = (0.0, 0.05, 0.25, 0.5, 0.75, 0.95, 1.0)
@@ -58,7 +58,7 @@ def _sketch(values: np.ndarray) -> list[float]:
 
 
 def describe_text(text: str) -> dict[str, Any]:
-    """The value of JSON text without unsteady entries and names of options; the length of any other text."""
+    """The value of JSON text without volatile entries and names of options; the length of any other text."""
     try:
         value = json.loads(text)
     except ValueError:
@@ -73,7 +73,7 @@ def without_volatile(value: Any, left_out: Iterable[str] = ()) -> Any:
         return {
             key: without_volatile(item, left_out)
             for key, item in value.items()
-            if not (key in left_out or key in _UNSTEADY_KEYS or key.endswith(_UNSTEADY_ENDINGS))
+            if not (key in left_out or key in _VOLATILE_KEYS or key.endswith(_VOLATILE_ENDINGS))
         }
     if isinstance(value, list):
         return [without_volatile(item, left_out) for item in value if not _is_after_a_time(item)]
@@ -110,7 +110,7 @@ def describe_file(path: Path) -> dict[str, Any]:
     """The digest of one file: {"arrays": ...} or {"says": ...}; for other files, such as videos, reports and
     settings, only their existence is recorded."""
     if path.suffix in (".npz", ".ply", ".png"):
-        arrays = {name: array for name, array in _arrays(path) if name not in _UNSTEADY_ARRAYS}
+        arrays = {name: array for name, array in _arrays(path) if name not in _VOLATILE_ARRAYS}
         return {
             "arrays": {
                 name: describe_text(str(array)) if array.dtype.kind == "U" else describe_array(array)

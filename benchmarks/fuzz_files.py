@@ -54,7 +54,7 @@ class Case(NamedTuple):
 
 @contextmanager
 def bounded(seconds: float = SECONDS, gib: float = GIB) -> Iterator[None]:
-    """Raise Overtime after `seconds` of computing; needing more than `gib` of new memory is a MemoryError."""
+    """Raise Overtime after `seconds` of computing, MemoryError if more than `gib` of new memory is needed."""
 
     def stop(*_: object) -> None:
         raise Overtime(f"more than {seconds:g} s")

@@ -108,7 +108,7 @@ def _end_with_its_page(served: Callable[[], None]) -> None:
         raise KeyboardInterrupt
 
     Viewer.wait = wait
-    os._exit = sys.exit  # by which the command line exits after Ctrl-C, before the record is written
+    os._exit = sys.exit  # the command line leaves by os._exit after Ctrl-C; the record is written later
 
 
 def _union(spans: list[tuple[float, float]]) -> float:

@@ -61,7 +61,7 @@ class Options(Common):
     views: Literal["held-out", "train", "all"] = "held-out"
     """Which photographs to score: held-out ones, training ones, or both."""
     images: str | None = None
-    """Present location of the photographs; default: where the fit found them."""
+    """Current location of the photographs; default: where the fit found them."""
     lpips_weights: Path | None = None
     """Weights of LPIPS, a .npz or .safetensors file or a folder of them; without them LPIPS is not scored."""
 

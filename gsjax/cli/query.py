@@ -68,9 +68,9 @@ class FieldOptions:
     """For the field of a run of `gsjax track`: film what was found over all frames; its positions in all
     frames are written in any case."""
     scene: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
-    """Present path of the scene's file, if it was moved (default: its first path, or next to the field)."""
+    """Current path of the scene's file, if it was moved (default: its first path, or next to the field)."""
     images: Annotated[str | None, tyro.conf.arg(metavar="FOLDER")] = None
-    """Present folder of the photographs, if they were moved."""
+    """Current folder of the photographs, if they were moved."""
 
 
 @dataclass(frozen=True)

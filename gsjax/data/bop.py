@@ -34,7 +34,7 @@ from gsjax.data.validation import check_intrinsics, check_poses
 from gsjax.io.brief import shortened
 
 CAMERAS, POSES = "scene_camera.json", "scene_gt.json"
-_CAMERA = "camera"
+_STATIC_CAMERA = "camera"
 
 
 class _View(NamedTuple):
@@ -182,12 +182,12 @@ def _viewmats(
 ) -> dict[int, Float[np.ndarray, "4 4"]]:
     """World to camera, metres, in each frame where it is known."""
     objects = sorted({instance.number for some in instances.values() for instance in some})
-    if world == _CAMERA:
+    if world == _STATIC_CAMERA:
         return {number: np.eye(4) for number in views}
     if world is not None:
         if not world.isdecimal() or int(world) not in objects:
             listed = f"the number of an object ({shortened(map(str, objects), 8)})"
-            raise ValueError(f"{root}: world must be {_CAMERA} or {listed}, got {world!r}")
+            raise ValueError(f"{root}: world must be {_STATIC_CAMERA} or {listed}, got {world!r}")
         own = {n: [i.pose for i in some if i.number == int(world)] for n, some in instances.items()}
         if several := [n for n, poses in own.items() if len(poses) > 1]:
             expected = f"one object {world}, as it is to be the world"
@@ -198,7 +198,7 @@ def _viewmats(
     known = {n: view.viewmat for n, view in views.items() if view.viewmat is not None}
     if views and not known:
         choices = f" or an object that does ({shortened(map(str, objects), 8)})" if objects else ""
-        advice = f"Set world (--read.world) to what stands still: {_CAMERA}{choices}."
+        advice = f"Set world (--read.world) to what stands still: {_STATIC_CAMERA}{choices}."
         raise DataError(root / CAMERAS, "poses of the camera (cam_R_w2c, cam_t_w2c)", "none", advice)
     _check(root / CAMERAS, {n: [pose] for n, pose in known.items()}, "Correct it, or remove that frame.")
     return known

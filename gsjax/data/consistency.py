@@ -29,7 +29,7 @@ _FACTORS = np.geomspace(1e-3, 1e3, 271)  # 5 % apart
 _AGREES = 0.05  # relative difference of two depths of one surface
 _TOLERATED = 1.25  # a smaller factor may be noise, or a calibration that is slightly off
 _LEAST_SHARE = 0.2  # of the points must agree with some factor, for a verdict
-_LEAST_RATIO = 2.0  # points that agree, relative to no factor or to the poses as given
+_LEAST_RATIO = 2.0  # of the points that agree to those that agree without a factor, or as given
 _ANGLE = np.deg2rad(40)  # between views that may see the same surface
 _FLIP = np.diag([1.0, -1.0, -1.0, 1.0])  # between the axes of OpenCV's and of OpenGL's cameras
 _CONVENTIONS = {
@@ -67,7 +67,7 @@ def check_recording(sequence: Sequence) -> None:
         return
     Ks, viewmats, load = sequence.Ks, sequence.viewmats, sequence.load_depth
     pairs = list(
-        _nearby_pairs(Ks[:, 0], viewmats[:, 0], partial(_at, load))
+        _separated_pairs(Ks[:, 0], viewmats[:, 0], partial(_at, load))
         if cameras == 1
         else _simultaneous_pairs(Ks[0], viewmats[0], partial(load, 0))
     )
@@ -96,7 +96,7 @@ def check_photographs(photographs: Photographs) -> None:
     views = [_View(Ks[i], viewmats[i], depth) for i, depth in depths if depth is not None]
     factor, others = _factor_of_points(views, points), "the points that come with the poses"
     if factor is None:
-        pairs = _nearby_pairs(Ks, viewmats, load)
+        pairs = _separated_pairs(Ks, viewmats, load)
         factor, others = _factor_of_pairs(list(pairs)), "that of other views"
     _warn_of_factor(name, factor, others)
 
@@ -133,7 +133,7 @@ def _depth(load: Callable[[], np.ndarray | None]) -> Float[np.ndarray, "height w
     return np.where(valid, depth, 0)
 
 
-def _nearby_pairs(
+def _separated_pairs(
     Ks: Float[np.ndarray, "n 3 3"],
     viewmats: Float[np.ndarray, "n 4 4"],
     load: Callable[[int], np.ndarray | None],

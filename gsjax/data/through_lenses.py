@@ -27,8 +27,8 @@ class LensViews:
     Attributes:
         Ks: intrinsics in pixels, pixel centres at +0.5, [N,3,3].
         fisheye: k1 to k4 of each, [N,4]; None if all views are pinhole views.
-        views: map of each: (stored picture, OpenCV interpolation flag) -> picture in the view.
-        coverage: which pixels of each its fisheye covers; None if all.
+        views: for each, a map (stored picture, OpenCV interpolation flag) -> picture in the view.
+        coverage: for each, the pixels that its fisheye covers; None if all.
     """
 
     Ks: Float[np.ndarray, "n 3 3"]

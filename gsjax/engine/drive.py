@@ -202,7 +202,7 @@ def drive(
 
 def _guard_of(before: Run, run: Run) -> Guard:
     """The guard for the next step. It starts afresh when losses are no longer comparable: when parameters or
-    constants were replaced, or `between` dropped it. A resting guard keeps resting."""
+    constants were replaced, or `between` dropped it. An inactive guard stays so."""
     if run.guard is not None and run.guard.is_resting:
         return run.guard
     old, new = (jax.tree.leaves((one.params, one.kept)) for one in (before, run))

@@ -15,7 +15,7 @@ def completion(stopped: BaseException | None, *, report: bool = True) -> dict[st
 
     Args:
         stopped: what ended it early, or None.
-        report: whether it writes a report last; it is unfinished without one.
+        report: whether it writes a report last; if so, it is unfinished until it has one.
     """
     why = None if stopped is None else reason(stopped)
     return {"complete": stopped is None, "report": report, "stopped": why}

@@ -302,9 +302,9 @@ class RunFolder:
 
 @contextmanager
 def replaced_folder(path: Path, written: Sequence[str]) -> Iterator[Path]:
-    """A new folder to write into. If the block succeeds, it replaces what gsjax left at `path` earlier; until
-    then, and after an exception (Ctrl-C too), the earlier folder stays as it was. Meanwhile no other process
-    can write a folder of that name, or replace the run that contains it.
+    """A new folder to write into, which replaces what gsjax left at `path` earlier if the block succeeds.
+    Until then, and after an exception (Ctrl-C too), the earlier folder stays as it was. Meanwhile no other
+    process can write a folder of that name, or replace the run that contains it.
 
     Args:
         path: the folder.

@@ -128,7 +128,7 @@ def locked(folder: Path, part: str = "", *, shared: bool = False) -> Iterator[No
     path = folder.resolve() / (f".{part}{LOCK}" if part else LOCK)
     held = _held.get(path)
     if held is None:
-        held = _acquired(folder, path, shared)
+        held = _open_and_claim(folder, path, shared)
     elif held.writer.shared and not shared:
         alone = replace(held.writer, shared=False)
         try:
@@ -149,7 +149,7 @@ def locked(folder: Path, part: str = "", *, shared: bool = False) -> Iterator[No
                 _release(path, held)
 
 
-def _acquired(folder: Path, path: Path, shared: bool) -> _Held | None:
+def _open_and_claim(folder: Path, path: Path, shared: bool) -> _Held | None:
     """Acquire the lock for this process; None if a shared one cannot be written."""
     writer, made = Writer(shared=shared), []
     while True:

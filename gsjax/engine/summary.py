@@ -46,8 +46,8 @@ class Score(NamedTuple):
     Attributes:
         head, key, unit, decimals, better: of its column.
         value: metrics.json -> the number; None where there is none.
-        of: what two runs must share for it to be comparable: the data, also the held-out views, or also the
-            machine.
+        of: what two runs must share for it to be comparable: the data; the data and the held-out views; or
+            these and the machine.
     """
 
     head: str

@@ -84,7 +84,7 @@ def _one_paragraph(text: str | Callable[[], str | None] | None) -> Callable[[], 
 
 
 def without_commas(kind: Any, arguments: Sequence[str]) -> list[str]:
-    """A command line with comma-separated lists of numbers, `--read.K 525,525,320,240`, split into words.
+    """A command line in which comma-separated numbers, `--read.K 525,525,320,240`, are split into words.
 
     Args:
         kind, arguments: as for `expect_known`.

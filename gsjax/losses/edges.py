@@ -104,7 +104,8 @@ def temporal_edges(
 
 def similar_edges(features: Features, k: int, window: int = 0, valid: NodeMask | None = None) -> Edges:
     """Edges from each node to the `k` nodes of highest cosine similarity in its frame (GaussianClin, eq. 7),
-    or with a `window` in each of the other frames at most that far away. Zero features have no edges.
+    or with a `window` in each of the other frames at most that far away. Nodes whose features
+    are zero have no edges.
 
     Args:
         features: features of n nodes in t frames.

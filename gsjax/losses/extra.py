@@ -38,7 +38,7 @@ ExtraLoss = Callable[..., Float[Array, ""]]
 - its rendering (`gsjax.scene.render.Rendered`): colours, depths and alphas of C cameras,
 - the frame that these cameras saw (`gsjax.scene.frame.Frame`): images [C,H,W,3], 0 to 1, and depths,
 
-and, if it has keyword-only arguments without defaults of these names, of
+and, if it has keyword-only arguments of these names without defaults, of
 
 - `index`: the position of the photograph or frame among those that the method was given,
 - `camera`: the position of its camera (`parts`),

@@ -28,10 +28,7 @@ LEAST_WINDOW = 100
 _WINDOWS, _MOST_STEPS = 50, 200  # most windows in a run; with this many steps in each, there may be more
 _LEAST_WINDOWS = 8  # fewest windows in a run for each to consist of whole passes
 _TAIL = 20  # steps that confirm a candidate, and most of which must not be worse at the end
-_DIVERGED, _DIVERGED_SIGMA = (
-    0.25,
-    4.0,
-)  # increase at which a loss has diverged: relative, and in standard errors
+_DIVERGED, _DIVERGED_SIGMA = 0.25, 4.0  # increase of a diverged loss: relative, and in standard errors
 _WORSE, _WORSE_SIGMA = 0.02, 3.0  # the same at the end of a run, to go back to the best
 _SMALLER = 0.5  # factor on steps after a return
 _FIRST = 5  # first losses, the largest of which stands for the initial parameters
@@ -160,8 +157,8 @@ class Guard(eqx.Module):
             tail = tail[~np.isnan(tail)]
         latest = ((tail if self.best is None else self.losses, np.mean), (tail, np.median))
         if any(level.is_exceeded(losses, _WORSE, _WORSE_SIGMA, statistic) for losses, statistic in latest):
-            at_end = replace(self, losses=np.zeros(0), steps=0, candidate=None, is_settled=True)
-            return at_end, _restored(level)
+            settled = replace(self, losses=np.zeros(0), steps=0, candidate=None, is_settled=True)
+            return settled, _restored(level)
         return self, params
 
     def _returned(self, params: PyTree, smaller: float) -> tuple["Guard", PyTree]:

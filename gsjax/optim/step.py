@@ -103,7 +103,7 @@ def steady_adam(rate: Any, eps: float = 1e-15, decay: float = 0.0) -> optax.Grad
     In plain Adam it is 31, whatever the size of the gradient, if those before were much smaller: the first
     moment is then (1 - b1) g, the second (1 - b2) g^2, and the first decays slowly. So one badly rendered
     frame could ruin what all frames share. Here gradients enter the first moment clipped to ten roots of the
-    second, which affects none that occur in one step of a hundred or more often. The state is that of
+    second, which affects no gradient that recurs in one step of a hundred or more often. The state is that of
     `optax.adam`.
 
     Args:

@@ -40,8 +40,8 @@ def labels_on_levels(
 
 
 def labels_on_level(labels: Int[np.ndarray, "levels H W"], level: Level) -> Int[np.ndarray, "H W"]:
-    """Labels on one level; where it has none, those of the next larger level or, if that has none either, of
-    the next smaller.
+    """Labels on one level; where it has none, those of the nearest larger level that has one or, if none has,
+    of the nearest smaller.
 
     Args:
         labels: on all levels; 0 where there is none.
@@ -57,8 +57,8 @@ def joined_levels(
     ids: Sequence[Int[np.ndarray, "H W"]], codebooks: Sequence[Float[np.ndarray, "_ C"]]
 ) -> tuple[Int[np.ndarray, "H W"], Float[np.ndarray, "k channels"], Bool[np.ndarray, "H W levels"]]:
     """The masks of all levels as one image of ids, whose codebook concatenates the embeddings of a pixel on
-    all levels. On a level where a pixel has no mask, it takes that of the next larger level or, if there is
-    none, of the next smaller; the levels filled in this way are returned too.
+    all levels. On a level where a pixel has no mask, it takes that of the nearest larger level that has one
+    or, if there is none, of the nearest smaller; the levels filled in this way are returned too.
 
     Args:
         ids: row of the level's codebook for each pixel; -1 where there is none. The smallest level is first.

@@ -149,8 +149,9 @@ def _features(picture: UInt8[np.ndarray, "H W 3"], mask: Bool[np.ndarray, "H W"]
 
 
 def _pairs(viewmats: Float[np.ndarray, "n 4 4"]) -> list[tuple[int, int]]:
-    """Pairs of each view with its neighbours: those at other positions with the smallest sum of the angle
-    between the optical axes and the distance, relative to the largest distance."""
+    """Pairs of each view with its neighbours: of the views at other positions and less than `_MAX_ANGLE`
+    away, those with the smallest sum of the angle between the optical axes, in radians, and the distance as a
+    fraction of the largest."""
     rotations = viewmats[:, :3, :3]
     centers = -np.einsum("nji,nj->ni", rotations, viewmats[:, :3, 3])
     apart = np.linalg.norm(centers[:, None] - centers, axis=-1)

@@ -105,8 +105,9 @@ def _summed(splats: Splats, lists: Lists, reads, d_values, behind, plan: Plan, l
     """Sums over the pixels of each Gaussian: dL/dpower times dx, dy, dx^2, dx dy, dy^2 and 1 [n, 6], where
     (dx, dy) leads from its centre to the pixel, and the gradients of its values [n, channels].
 
-    `behind` [passes, tiles, pixels] is the sum over what each pass composites, and in the first one also the
-    transmittance, times the respective gradients. Without it the first result is empty.
+    `behind` [passes, tiles, pixels] is the sum, over the values that a pass composites, of value times
+    gradient, plus in the first pass the transmittance times its gradient. Without it the first result is
+    empty.
     """
     from gsjax.rasterize.kernels import compositing as kernels
     from gsjax.rasterize.kernels.sums import row_sums

@@ -1,4 +1,4 @@
-"""Observations of a set of cameras at one moment: the form of input that all losses and methods share."""
+"""What a set of cameras observed at one moment: the form of input that all losses and methods share."""
 
 from functools import partial
 from typing import Any, TypeVar

@@ -31,7 +31,7 @@ _TURN = np.deg2rad(80.0)
 _FRAMES = 15.0  # duration of all motions
 
 
-class _Part(NamedTuple):
+class _PartModel(NamedTuple):
     """Solids of the part relative to the centre of its body at rest, that centre, and the joint."""
 
     solids: list[Primitive]
@@ -115,7 +115,7 @@ def _room(seed: int) -> list[Primitive]:
     ]
 
 
-def _wheel(spokes: float, share: Float[np.ndarray, "t"], seed: int) -> _Part:
+def _wheel(spokes: float, share: Float[np.ndarray, "t"], seed: int) -> _PartModel:
     """An upright wheel that faces the cameras, with a rim of short boards, on a post."""
     steel = Texture("noise", ((0.12, 0.30, 0.50), (0.36, 0.58, 0.80)), 0.03, seed=20 * seed + 4)
     middle, radius, board = np.array([-0.02, 0.08, 0.24]), 0.17, 0.012
@@ -128,27 +128,27 @@ def _wheel(spokes: float, share: Float[np.ndarray, "t"], seed: int) -> _Part:
     solids.append(
         _at(_WORLD, (0.02, 0.02, middle[2] / 2), steel, [middle[0] - 0.05, middle[1], middle[2] / 2])
     )
-    return _Part(solids, middle, Joint("revolute", np.array([1.0, 0, 0]), middle, _TURN * share))
+    return _PartModel(solids, middle, Joint("revolute", np.array([1.0, 0, 0]), middle, _TURN * share))
 
 
-def _small(far: float, share: Float[np.ndarray, "t"], seed: int) -> _Part:
+def _small(far: float, share: Float[np.ndarray, "t"], seed: int) -> _PartModel:
     """A block that slides along the wall."""
     blue = Texture("checker", ((0.16, 0.30, 0.52), (0.60, 0.72, 0.86)), 0.03, seed=20 * seed + 4)
     middle = np.array([0.0, 0.10, 0.08])
     solids = [_at(_PART, (0.06, 0.08, 0.08), blue, np.zeros(3))]
-    return _Part(solids, middle, Joint("prismatic", np.array([0.0, 1.0, 0.0]), middle, far * share))
+    return _PartModel(solids, middle, Joint("prismatic", np.array([0.0, 1.0, 0.0]), middle, far * share))
 
 
-def _thin(wide: float, share: Float[np.ndarray, "t"], seed: int) -> _Part:
+def _thin(wide: float, share: Float[np.ndarray, "t"], seed: int) -> _PartModel:
     """A rod that swings about its foot, in front of the wall."""
     green = Texture("stripes", ((0.16, 0.42, 0.24), (0.62, 0.80, 0.48)), 0.03, seed=20 * seed + 4)
     foot, half = np.array([0.0, 0.16, 0.02]), 0.16
     middle = foot + np.array([0.0, 0.0, half])
     solids = [_at(_PART, (wide / 2, wide / 2, half), green, np.zeros(3))]
-    return _Part(solids, middle, Joint("revolute", np.array([1.0, 0, 0]), foot, _TURN * share))
+    return _PartModel(solids, middle, Joint("revolute", np.array([1.0, 0, 0]), foot, _TURN * share))
 
 
-def _flush(out: float, share: Float[np.ndarray, "t"], seed: int) -> _Part:
+def _flush(out: float, share: Float[np.ndarray, "t"], seed: int) -> _PartModel:
     """A panel that slides in a frame of the same wood."""
     wood = Texture("noise", ((0.55, 0.40, 0.26), (0.74, 0.58, 0.40)), 0.05, seed=20 * seed + 4)
     thick, wide, high, low = 0.015, 0.11, 0.13, 0.18
@@ -156,7 +156,7 @@ def _flush(out: float, share: Float[np.ndarray, "t"], seed: int) -> _Part:
     middle = np.array([front + out - thick, -0.08, low])
     solids = [_at(_PART, (thick, wide, high), wood, np.zeros(3))]
     solids.append(_at(_WORLD, (thick, 0.36, 0.17), wood, [_WALL_FRONT + thick - 1e-3, 0.06, low]))
-    return _Part(solids, middle, Joint("prismatic", np.array([0.0, 1.0, 0.0]), middle, 0.22 * share))
+    return _PartModel(solids, middle, Joint("prismatic", np.array([0.0, 1.0, 0.0]), middle, 0.22 * share))
 
 
 def _at(body: int, size: tuple[float, ...], texture: Texture, center) -> Primitive:

@@ -112,7 +112,7 @@ class Experiment:
         return {"options": cell.options, "seed": cell.seed, "error": error, **unknown, **outcome, **made}
 
     def is_done(self, record: dict[str, Any] | None) -> bool:
-        """Whether a record is of a cell that ran with the present script and did not fail."""
+        """Whether a record is of a cell that ran with the current script and did not fail."""
         return record is not None and record["error"] is None and record["script"] == self.fingerprint
 
     def records(self) -> list[dict[str, Any]]:
