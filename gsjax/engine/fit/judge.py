@@ -47,7 +47,7 @@ class Judge:
         sizes: common sizes of photographs; a smaller photograph is rendered at one of these, whose program
             is already compiled.
         plans: a large enough plan for each size of photograph.
-        view_s: seconds that the last view took; infinite until a view did not have to be compiled.
+        view_s: seconds that the last view took; infinite until one needed no compiling.
     """
 
     config: FitConfig

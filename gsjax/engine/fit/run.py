@@ -102,7 +102,7 @@ def run(options: Options) -> int:
         width, height = photographs.sizes[photographs.sizes.prod(1).argmax()].tolist()
         config = options.fit
         if options.minutes is not None and is_default:
-            config = _affordable(config, (width, height), options.minutes, notes, console)
+            config = _settings_within_minutes(config, (width, height), options.minutes, notes, console)
         config, cloud = start_from(photographs, fitted, config, console)
         method = Fit(config)
         problem, run = method.start(fitted, cloud, photographs.background)
@@ -181,10 +181,10 @@ def _at_scale(photographs: Photographs, scale: float | None, notes: Notes, conso
     return scaled
 
 
-def _affordable(
+def _settings_within_minutes(
     config: FitConfig, size: tuple[int, int], minutes: float, notes: Notes, console: Console
 ) -> FitConfig:
-    """The settings that pay off in these minutes, which are also printed and noted."""
+    """The settings that pay off in these minutes; also prints and notes them."""
     found, steps = settings_within(config, size, minutes)
     words = (
         f"up to {found.cap:,} Gaussians with colours of degree {found.sh_degree}, as there should be time "

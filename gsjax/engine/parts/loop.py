@@ -75,8 +75,8 @@ class Loop:
             self.notes.warn("no part is needed to explain the pictures; the result is the canonical scene")
 
     def refine(self) -> None:
-        """Fit the scene and all poses to all frames. If an OSError ends this early, the run still counts as
-        complete."""
+        """Fit the scene and all poses to all frames, unless it is stopped. If an OSError ends this early, the
+        run still counts as complete."""
         steps, begun = self.method.steps_of_refinement(self.problem), perf_counter()
         first, total = self.method.steps_of_frames(self.problem), self.method.total(self.problem)
         skipped = self.progress.skipped

@@ -106,7 +106,7 @@ def init_field(
 
 
 def expect_finite(means: Float[Array, "n 3"]) -> Float[np.ndarray, "some 3"]:
-    """The finite ones among the centres of Gaussians. On the host.
+    """The centres of Gaussians, without those that are not finite. On the host.
 
     Args:
         means: centres, metres.

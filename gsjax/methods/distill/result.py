@@ -18,7 +18,7 @@ from gsjax.methods.protocols import LanguageEncoder
 from gsjax.methods.query import encoded_prompt, relevancy
 from gsjax.scene.feature_grid import FeatureGrid, Located, locate
 
-_BEST, _TIE = 32, 0.02  # best Gaussians that decide the level of a query; difference of equal cosines
+_BEST, _TIE = 32, 0.02  # best Gaussians that decide the level of a query; largest gap that is a tie
 
 
 @dataclass(frozen=True, eq=False)

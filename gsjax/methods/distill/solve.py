@@ -232,8 +232,8 @@ def _backprojected(values: Float[Array, "seen c"], batch: Batch, config: Distill
         view, strip_plan = strip_of(batch.view, plan, number * rows, rows)
         (image, alphas), back = jax.vjp(lambda some: paint_shown(view, some, strip_plan), values)
         inside = number * high + jnp.arange(high) < plan.height
-        rhs, *numbers = cotangent(number * high, inside, image, alphas)
-        (found,) = back((rhs, jnp.zeros_like(alphas)))
+        pixels, *numbers = cotangent(number * high, inside, image, alphas)
+        (found,) = back((pixels, jnp.zeros_like(alphas)))
         return jax.tree.map(jnp.add, carry, (found, *numbers)), None
 
     zero = jnp.zeros((), values.dtype)
@@ -283,8 +283,8 @@ def _after_pass(field: FeatureField, state: SolveState, batch: SolveBatch, confi
 
 def _after_vote(field: FeatureField, state: SolveState, neighbors, smoothness: float):
     """After the vote, which is the initial guess. Gaussians that no pixel shows get the mean of their
-    neighbours; those shown by pixels without a teacher get zeros, as they lie beside objects but belong to
-    none."""
+    neighbours; those of whose pixels hardly any has a teacher get zeros, as they lie beside objects but
+    belong to none."""
     seen = state.mass > _LEAST
     votes = jnp.where(seen[:, None], state.total / jnp.maximum(state.mass, _LEAST)[:, None], 0.0)
     tie = smoothness * state.mass.sum() / jnp.maximum(seen.sum(), 1)
@@ -313,12 +313,12 @@ def _cg_step(field: FeatureField, state: SolveState, neighbors):
 
 
 def _unlabelled(state: SolveState) -> Bool[Array, "n"]:
-    """The Gaussians that pixels show, of which hardly any has a teacher."""
+    """The Gaussians that pixels show, but hardly any pixel that has a teacher."""
     return (state.shown > _LEAST) & (state.mass <= _TAUGHT * state.shown)
 
 
 def _zero_unlabelled(x: Float[Array, "n r"], state: SolveState) -> Float[Array, "n r"]:
-    """The vectors, zero for untaught Gaussians."""
+    """The vectors, zero for unlabelled Gaussians."""
     return jnp.where(_unlabelled(state)[:, None], 0.0, x)
 
 

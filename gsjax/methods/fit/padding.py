@@ -8,7 +8,7 @@ from jaxtyping import Float, Int
 
 from gsjax.scene.frame import Frame
 
-_MAX_SIZES = 2  # sizes: one for portrait and one for landscape photographs
+_MAX_SIZES = 2  # sizes, enough to keep portrait and landscape photographs apart
 _MIN_SAVING = 0.25  # share of all pixels that a second size must save
 _CELLS = 8  # per axis of the grid on which similar sizes are merged first, if there are more sizes than cells
 

@@ -30,9 +30,9 @@ def absences(problem: Problem, discovery: Discovery, config: PartsConfig) -> Boo
     """The frames from which each part is absent; None if no part ever is.
 
     Each part is tested twice in each frame. The first test compares the colours at the projections of its
-    Gaussians, as in the search for parts that jump. Only if these differ, the frame is rendered with the part
-    and without it. If that is inconclusive, as for an occluded part, the part is present if it was in the
-    neighbouring frame towards the anchor, in which all parts are.
+    Gaussians, as in the search for parts that jump. If these match clearly worse than at the anchor, the
+    frame is rendered with the part and without it. If that is inconclusive, as for an occluded part, the part
+    is present if it was in the neighbouring frame towards the anchor, in which all parts are.
 
     Args:
         problem: the recording.

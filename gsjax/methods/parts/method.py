@@ -44,7 +44,7 @@ from gsjax.scene.gaussians import Gaussians
 from gsjax.scene.render import plan_render
 
 _LEAST_STEPS, _PASSES = 400, 2  # of the refinement, by default; passes over all pictures
-_SHARE_OF_SMALLER = 0.5  # of the refinement, which uses pictures no larger than those of tracking
+_SHARE_OF_SMALLER = 0.5  # share of the refinement with pictures no larger than those of tracking
 
 
 @dataclass(frozen=True)

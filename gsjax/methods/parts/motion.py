@@ -20,7 +20,7 @@ from gsjax.scene.gaussians import Gaussians
 from gsjax.scene.render import Rendered
 
 _SMOOTH = 8  # neighbouring Gaussians that are judged together
-_ONE_FRAME_IN = 8  # what may move changes in at least one of so many frames
+_ONE_FRAME_IN = 8  # a Gaussian that may move changes in at least one of this many frames
 _SEEN = 1e-3  # pixels that a Gaussian must cover to provide evidence
 _TOUCHING = 16  # neighbours that may touch a Gaussian
 _LEAST_WEIGHT = 0.1  # of all parts together, below which the masks do not determine the part

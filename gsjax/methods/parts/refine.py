@@ -1,5 +1,5 @@
 """Refinement over all frames: gradient descent on the scene, so far fitted to the canonical frame alone, and
-on all poses, so far each found from the previous one. Each step draws a picture from any frame. Only here can
+on all poses, so far each found from the previous one. Each step uses a picture of any frame. Only here can
 the scene learn surfaces that are revealed later, and the shadows that move with parts.
 
 The paper leaves the canonical scene fixed. So do we while parts are still being discovered: a scene that may

@@ -1,5 +1,5 @@
 """Sizes of the pictures used for tracking, and the width of a pixel, the unit of distances. Recordings with
-larger pictures are tracked at the same sizes; only the refinement uses their full resolution."""
+larger pictures are tracked at about the same sizes; only the refinement uses their full resolution."""
 
 import math
 

@@ -24,7 +24,7 @@ from gsjax.methods.track.config import AlignConfig
 from gsjax.methods.track.points import Points, ToneImages, carry, rotated, sum_of_three
 from gsjax.optim.compiler import in_memory
 
-_CHANNELS = (3, 1)  # number of channels of colour, each counted with the mean of the three, and of depth
+_CHANNELS = (3, 1)  # weights in the cost: of colour, the mean of three channels, and of depth
 
 
 class Sample(NamedTuple):

@@ -159,7 +159,7 @@ class GrowConfig:
     """Largest distance from a pixel to a Gaussian whose object it continues, metres."""
     color: float = 0.15
     """Largest difference of their colours, 0 to 1. The squares of distance and difference, each relative to
-    its limit, add up; the nearest Gaussian wins, and may be of the background."""
+    its limit, add up; the Gaussian with the least sum wins, and may be of the background."""
 
     def __post_init__(self):
         expect(self, "track.grow.", **dict.fromkeys(("min_gap", "distance", "color"), ABOVE_ZERO))

@@ -39,7 +39,7 @@ class Confidence(NamedTuple):
     """How well the images agree with where each group is believed to be."""
 
     agreement: Float[Array, "k"]  # fraction of the visible points that look as at first, 0 to 1
-    coverage: Float[Array, "k"]  # the same of all points, including occluded ones and those outside the image
+    coverage: Float[Array, "k"]  # the same as a share of all points: hidden and outside ones do not agree
     conclusive: Bool[Array, "k"]  # whether enough points were visible
 
 

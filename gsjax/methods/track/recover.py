@@ -237,8 +237,8 @@ def guesses_spun(
     guess: Float[Array, "6"],
     config: AlignConfig,
 ) -> Float[Array, "n 6"]:
-    """The guess of the last frame, as it is or flipped about one of its axes, and spun about one by any
-    angle, because objects that look alike when rotated (cans, boxes) are often found rotated at first.
+    """The guess of the last frame, as it is or flipped about an axis of the group, and spun about an axis by
+    any angle, because objects that look alike when rotated (cans, boxes) are often found rotated at first.
 
     Args:
         key: random key.

@@ -24,7 +24,7 @@ _TEMPERATURE = 0.1  # difference of costs that changes odds by a factor of e
 _PULL = 0.5  # weight of the cameras' evidence, relative to a connection
 _ITERATIONS = 300
 _APART = 0.5  # spacings by which the two sides of a thin plate are kept apart
-_TURNS = 3  # alternations between the labels and which points take places
+_ROUNDS = 3  # alternations between labels and which points take the places
 
 
 def connections(surface: Surface, spacing: float) -> csr_array:
@@ -91,7 +91,7 @@ def labels_of(
     costs = costs + np.clip(_UNKNOWN - costs, 0, [0, *[_MOVES] * (len(motions) - 1)])
     worth = np.maximum(_UNKNOWN - costs, 0)
     shares = _diffused(costs, links)
-    for _ in range(_TURNS):
+    for _ in range(_ROUNDS):
         taken = np.zeros(costs.shape)
         for k, j, rows, others in claims:
             taken[rows, k] = np.maximum(taken[rows, k], shares[others, j])

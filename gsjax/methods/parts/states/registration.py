@@ -21,7 +21,7 @@ SAME_WAY = 0.6
 """Least cosine between normals of points that may correspond."""
 _CLOSER = 0.75  # factor on the reach from round to round
 _SLIDE_WEIGHT = 0.01  # weight of the penalty on sliding along the rotation axis, relative to the points ...
-_SLIDE_LIMIT = 0.3  # ... and the slide beyond which it pulls no harder, in reaches
+_SLIDE_LIMIT = 0.3  # ... and the slide beyond which it residuals no harder, in reaches
 _LEAST_TURN = 0.05  # radians; a motion that rotates by less counts as a translation
 _DARK, _LIT = 0.02, np.log(2.5)  # brightness that is not informative; largest log change of the lighting
 _CONTRAST = 0.1  # difference in brightness that counts as much as the reach
@@ -163,10 +163,10 @@ def registered(
         pairs = _pairs(motion, part, target, near)
         if pairs.counts.sum() < 6:
             return motion
-        pulls = [_to_planes(pairs, target.surface), _to_brightness(pairs, part, target.surface, near)]
+        residuals = [_to_planes(pairs, target.surface), _to_brightness(pairs, part, target.surface, near)]
         if target.edges is not None:
-            pulls.append(_to_edges(motion, edges, target.edges, near))
-        at, along, gaps = (np.concatenate(values) for values in zip(*pulls, strict=True))
+            residuals.append(_to_edges(motion, edges, target.edges, near))
+        at, along, gaps = (np.concatenate(values) for values in zip(*residuals, strict=True))
         middle = at.mean(0)
         weights = 1 / (1 + (gaps / (0.3 * near)) ** 2) ** 2
         slopes = np.concatenate([np.cross(at - middle, along), along], -1)

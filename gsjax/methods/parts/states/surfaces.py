@@ -17,9 +17,9 @@ from gsjax.optim.compiler import host_jit
 from gsjax.scene.frame import Frame
 
 _NOISE_SCALE = 1.65  # median of absolute second differences of white noise, in standard deviations
-_LEAST_NOISE, _MOST_NOISE = 5e-4, 4.0  # of depth, relative; largest noise, in standard deviations
+_LEAST_NOISE, _MOST_NOISE = 5e-4, 4.0  # of depth, relative; differences up to so many deviations are noise
 _WIDTH = 3.0  # of the filter, pixels
-_FAR_AWAY = 20.0  # how far unknown depth is put behind all other, in differences that are noise
+_FAR_AWAY = 20.0  # how far unknown depth is put behind all other, in largest differences of noise
 _LEAST_FACING = 0.25  # cosine between line of sight and normal below which a normal is poorly known
 _STEEPEST = 6.0  # pixels between the points of neighbouring pixels above which there is an edge
 _FACES = 0.2  # cosine between line of sight and normal below which a camera does not judge a point

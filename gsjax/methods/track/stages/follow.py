@@ -149,9 +149,9 @@ def _relocation(
 
 
 def in_search_round(count: Int[Array, ""], num_objects: int) -> Bool[Array, "k"]:
-    """Groups that are searched for elsewhere in this frame if in doubt: each in two frames of four, because
-    relocation takes two, and is followed in the other two. Odd and even ones alternate, so that no update
-    searches for all."""
+    """Groups that are searched for elsewhere in this frame if in doubt: each in two of four frames, because a
+    relocation takes two; in the other two, the group is followed. Odd and even groups alternate, so that no
+    update searches for all."""
     return (count + 2 * jnp.arange(num_objects)) % 4 < 2
 
 
