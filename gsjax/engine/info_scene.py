@@ -38,7 +38,7 @@ def _facts_of(file: Path, gaussians: Gaussians, report: SceneReport) -> dict[str
     if gaussians.num:
         means = in_world(np.asarray(gaussians.means), report.origin)
         low, high = np.percentile(means, [1, 99], axis=0)
-        facts["places"] = " to ".join(f"({', '.join(f'{x:.2f}' for x in end)})" for end in (low, high))
+        facts["extent"] = " to ".join(f"({', '.join(f'{x:.2f}' for x in end)})" for end in (low, high))
         facts["sizes"] = "{:.2g} to {:.2g}".format(*np.percentile(gaussians.scales, [1, 99]))
         opacities = np.asarray(gaussians.opacities)
         facts["opacities"] = "{:.2f} to {:.2f}".format(*np.percentile(opacities, [1, 99]))

@@ -43,8 +43,8 @@ def data_in_words(dataset: str, data: tuple[Any, ...] | None) -> str:
     size = f"{dataset} at {data[0]}x{data[1]}"
     if len(data) == 2:
         return size
-    if isinstance(data[2], str):  # the views or frames that it was judged by, and their numbers
+    if isinstance(data[2], str):  # the views or frames that it was scored on, and their numbers
         return f"{size}, " + ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in data[3])
     (first, last, count), (tracked, held_out) = data[2:]
-    by = f", judged by {[*held_out]}" if held_out else ""
+    by = f", scored on {[*held_out]}" if held_out else ""
     return f"{size}, {counted(count, 'frame')} {first} to {last}, cameras {[*tracked]}{by}"

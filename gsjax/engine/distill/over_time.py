@@ -105,7 +105,7 @@ class OverTime:
         try:
             return self._film(self.saved, path, paint(selected), camera, drawer, console)
         except (ValueError, OSError) as error:
-            notes.warn(f"what was found is not filmed: {describe(error)}")
+            notes.warn(f"the selection is not filmed: {describe(error)}")
             return {}
 
     def _film(
@@ -143,12 +143,12 @@ def over_time_of(run: FieldRun, notes: Notes) -> OverTime | None:
     try:
         saved: SavedRun | None = open_run(folder)
     except (ValueError, OSError) as error:
-        notes.warn(f"what is found is not filmed: {describe(error)}")
+        notes.warn(f"the selection is not filmed: {describe(error)}")
         saved = None
     try:
         tracking, origin = read_tracking(folder) if saved is None else (saved.tracking, run.origin)
     except (ValueError, OSError) as error:
-        notes.warn(f"what is found is not followed over time: {describe(error)}")
+        notes.warn(f"the selection is not followed over time: {describe(error)}")
         return None
     return if_same_size(run, OverTime(tracking, origin, saved), notes)
 
@@ -163,5 +163,5 @@ def if_same_size(run: FieldRun, over_time: OverTime, notes: Notes) -> OverTime |
     """
     if over_time.tracking.scene.gaussians.num == run.gaussians.num:
         return over_time
-    notes.warn("what is found is not followed over time: some Gaussians of the run cannot be drawn")
+    notes.warn("the selection is not followed over time: some Gaussians of the run cannot be drawn")
     return None

@@ -289,10 +289,10 @@ def _note_unscored(
         notes.add("Depth was not scored: the recording has none.")
     for name, scored in found["objects"].items():
         if scored["gaussians"] == 0:
-            notes.add(f"{name}: not tracked, it is not in the first mask.")
+            notes.add(f"{name}: not tracked, because it is not in the first mask.")
         elif sequence.truth is not None and scored["gaussians_scored"] == 0:
             posed = name in sequence.truth.names
-            why = "no Gaussian certainly belongs to it" if posed else "the truth holds no pose of it"
+            why = "no Gaussian certainly belongs to it" if posed else "the ground truth has no pose of it"
             notes.add(f"{name}: motion not scored, {why}.")
     if tracking.chosen is not None and not tracking.chosen.fits:
         base = f"{1e3 * tracking.chosen.costs.base:.0f} ms"
@@ -300,7 +300,7 @@ def _note_unscored(
             f"no settings keep the budget on this machine; {tracking.chosen.name} take {base} an update"
         )
     if tracking.skipped:
-        notes.add(f"Skipped, as numbers were not finite: {counted(tracking.skipped, 'update')}.")
+        notes.add(f"Skipped, because numbers were not finite: {counted(tracking.skipped, 'update')}.")
 
 
 def _note_lost(
@@ -310,7 +310,7 @@ def _note_lost(
     names: dict[int, str],
     notes: Notes,
 ) -> None:
-    """Note when each object was lost, its rotation unknown, in doubt in the end, or seen by no camera."""
+    """Note when each object was lost, its rotation unknown, in doubt at the end, or seen by no camera."""
     groups = labels_of_groups(tracking, values)[1:]
     unseen = (~np.asarray(tracking.visible, bool).reshape(len(tracking.visible), len(groups))).sum(axis=0)
     labels = sorted({*groups.tolist()} - {0})
@@ -329,12 +329,14 @@ def _note_lost(
         agrees = found["objects"][names[label]]["agrees_last"]
         if agrees is not None and agrees < DOUBTFUL and not to_the_end:
             notes.say(
-                f"{names[label]}: in the end only {agrees:.0%} of what is seen of it, or of a part of it, "
-                "agrees with the pictures; it shows other sides, or is not where it is drawn."
+                f"{names[label]}: at the end, only {agrees:.0%} of its visible part, or of one of its rigid "
+                "parts, agrees with the images; it shows other sides, or is not where it is drawn."
             )
     for label in sorted({*groups.tolist()}):
         frames = unseen[groups == label].max()
         if frames:
             name = names.get(label, f"object {label}")
             unseen_in = counted(int(frames), "frame")
-            notes.add(f"{name}: no camera saw it, or a part of it, in {unseen_in}; it stood still then.")
+            notes.add(
+                f"{name}: no camera saw it, or one of its rigid parts, in {unseen_in}; it was not moved then."
+            )

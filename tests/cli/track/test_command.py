@@ -117,7 +117,7 @@ def test_a_run_from_end_to_end(pristine, tmp_path, gsjax_track, opened):
         assert (run / "plots" / plot).stat().st_size > 1000
     page = (run / "report.html").read_text()
     assert page.count("data:video/mp4") == 3
-    assert "the truth holds no pose of it" in page
+    assert "the ground truth has no pose of it" in page
 
 
 @pytest.mark.parametrize(("signals", "name"), [((), "Ctrl-C"), (("SIGTERM",), "SIGTERM")])
@@ -236,8 +236,8 @@ def test_a_run_says_what_was_lost_and_whose_turn_is_not_known(
         "can: its rotation is unknown from frame 2 on: other rotations agree as well.",
         "ball: lost in 1 frame, number 1.",
         "ball: its rotation is unknown from frame 3 on: other rotations agree as well.",
-        "ball: in the end only 50% of what is seen of it, or of a part of it, agrees with the pictures; "
-        "it shows other sides, or is not where it is drawn.",
+        "ball: at the end, only 50% of its visible part, or of one of its rigid parts, agrees with the "
+        "images; it shows other sides, or is not where it is drawn.",
     ]
     objects = found["objects"]
     lost = {name: o["frames_lost"] for name, o in objects.items() if o["frames_lost"]}
