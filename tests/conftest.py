@@ -1,4 +1,4 @@
-"""What every test shares: annotations are checked while tests run, and floats are float32 unless asked."""
+"""Setup shared by all tests: annotations are checked at run time, and floats are float32 by default."""
 
 import gc
 import os
@@ -8,27 +8,27 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
 
-# Several workers may share one GPU: none of them may take most of its memory at the start.
+# Several workers may share one GPU, so none of them may preallocate most of its memory.
 os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
-# Most of the time goes into compiling. So programs are kept on disk, for both workers, the processes that
-# tests start, and the next run; they are found by what they compute, so no change of the code is missed.
+# Most of the time is spent compiling, so compiled programs are cached on disk for both workers, the processes
+# that tests start, and the next run. They are keyed by what they compute, so no change of the code is missed.
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(ROOT / ".pytest_cache" / "xla"))
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "0")
-# Compiled without optimising, in a third of the time, which is what tests of small scenes wait for.
-# `make test-all` has XLA's own settings.
+# Compiling without optimisations takes a third of the time, which dominates tests of small scenes.
+# `make test-all` uses XLA's own settings.
 flags = "--xla_backend_optimization_level=0"
-if version("jaxlib").startswith("0.10."):  # XLA ends a process that names a flag it has not
+if version("jaxlib").startswith("0.10."):  # XLA aborts on unknown flags
     flags += " --xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1"
 os.environ.setdefault("XLA_FLAGS", flags)
 
-# Programs need not name the lines that they come from, which takes some of the time of tracing.
+# Source locations are left out of programs, since recording them slows down tracing.
 os.environ.setdefault("JAX_TRACEBACK_IN_LOCATIONS_LIMIT", "0")
 
-# JAX's traces are many objects that live on; to look through all of them again and again takes a tenth.
+# JAX's traces are many long-lived objects; scanning them in each collection takes a tenth of it.
 gc.set_threshold(100_000, 50, 50)
 
-# What a shell starts in the background ignores Ctrl-C, and so would what tests start.
+# Background processes of a shell ignore Ctrl-C, and processes started by tests would inherit that.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
 from jaxtyping import install_import_hook
@@ -52,13 +52,15 @@ from gsjax.optim.compiler import forget_programs
 hypothesis.settings.register_profile("gsjax", deadline=None, max_examples=25, derandomize=True, database=None)
 hypothesis.settings.load_profile("gsjax")
 
-MOST_MAPS, MOST_MB = 20_000, 3_000  # what programs of earlier files may hold
+MOST_MAPS, MOST_MB = 20_000, 3_000  # limits for programs compiled by earlier files
 
 
 @pytest.fixture(autouse=True, scope="module")
 def forget_compiled():
-    """Compiled programs hold memory, and memory maps, of which Linux grants a process 65,530: too few for all
-    tests."""
+    """Drops the compiled programs of earlier files once they hold too much.
+
+    They take memory and memory maps; Linux allows a process 65,530 maps, too few for all tests.
+    """
     yield
     most = 0 if resident_mb() > MOST_MB else MOST_MAPS
     if forget_programs(most):
@@ -67,14 +69,14 @@ def forget_compiled():
 
 @pytest.fixture
 def x64():
-    """The test runs with 64-bit types. Ask for it by `@pytest.mark.usefixtures("x64")`."""
+    """Runs the test with 64-bit types; request it by `@pytest.mark.usefixtures("x64")`."""
     with jax.enable_x64(True):
         yield
 
 
 @pytest.fixture
 def as_users_run():
-    """Annotations unchecked, as in use."""
+    """Disables the run-time check of annotations, as for users."""
     jaxtyping.config.update("jaxtyping_disable", True)
     yield
     jaxtyping.config.update("jaxtyping_disable", False)
@@ -82,7 +84,7 @@ def as_users_run():
 
 @pytest.fixture(scope="session")
 def shared_data() -> Path:
-    """The folder of recordings, which are not part of the repository; without it the test is skipped.
+    """Returns the folder of recordings, which are not part of the repository; skips if it is missing.
 
     It is where the benchmarks look for them: `$GSJAX_DATA`, or `../shared/data` beside the checkout.
     """

@@ -1,7 +1,7 @@
 """`python tests/floors.py [EXTRA ...]` prints the lowest versions that pyproject.toml allows, for `pip -c`.
 
-`make test-floors` installs them and runs tests with them, so that what pyproject.toml promises is true. What
-those packages need in turn is the newest that suits them, as in an environment that has grown old.
+`make test-floors` installs these versions and runs tests with them, which verifies the lower bounds. Their
+own dependencies are the newest compatible versions, as in an environment that has grown old.
 """
 
 import re
@@ -15,10 +15,10 @@ _REQUIREMENT = re.compile(r"(?P<name>[\w.-]+)(\[(?P<extras>[\w,-]+)\])?(>=|==)?(
 
 
 def floors(project: dict[str, Any], extras: list[str]) -> dict[str, str]:
-    """The lowest version of each package that a `[project]` table and some of its extras name.
+    """Returns the lowest version of each package that a `[project]` table and the given extras require.
 
     Raises:
-        ValueError: there is no such extra, a requirement has no lowest version, or a package has two.
+        ValueError: an extra does not exist, a requirement has no lowest version, or a package has two.
     """
     optional, found, left = project["optional-dependencies"], {}, list(extras)
     requirements = list(project["dependencies"])
@@ -34,7 +34,7 @@ def floors(project: dict[str, Any], extras: list[str]) -> dict[str, str]:
     for requirement in requirements:
         parts = _REQUIREMENT.fullmatch(requirement)
         if parts and parts["name"] == project["name"]:
-            continue  # the extras that it takes in were read above
+            continue  # the project's own extras, expanded above
         if not parts or not parts["version"]:
             raise ValueError(
                 f"pyproject.toml: expected NAME>=VERSION or NAME==VERSION, found {requirement!r}"

@@ -1,7 +1,7 @@
-"""The page of what `import gsjax` offers, and whether CHANGELOG.md says what changed in it.
+"""Generates the page of public names, and checks that CHANGELOG.md mentions every change to them.
 
 python -m tests.public_api              # writes docs/api/public.md
-python -m tests.public_api release    # and what the next changes are compared with
+python -m tests.public_api release    # and the record that later changes are compared with
 """
 
 import ast
@@ -19,7 +19,7 @@ import gsjax
 ROOT = Path(__file__).resolve().parents[1]
 PAGE, RELEASED = ROOT / "docs/api/public.md", ROOT / "tests/released_api.json"
 AGAIN = "python -m tests.public_api"
-"""What to run where the page is not current."""
+"""The command that brings the page up to date."""
 _INTRODUCTION = """# What is promised
 
 What `import gsjax` offers: these names, as they are written here, and the settings within settings with their
@@ -33,7 +33,7 @@ move in any version.
 
 
 def signatures() -> dict[str, str]:
-    """What is promised of each public name, and of the settings within settings, as source."""
+    """Returns the signature of each public name, and of each nested config class, as source."""
     named = {name: inspect.unwrap(getattr(gsjax, name)) for name in gsjax.__all__}
     within = {}
     for name, thing in named.items():
@@ -43,7 +43,7 @@ def signatures() -> dict[str, str]:
 
 
 def _within(name: str, settings: object) -> dict[str, type]:
-    """The classes of settings within settings, by where they are."""
+    """Returns the nested config classes by their paths, such as `TrackConfig.grow`."""
     found = {}
     for field in dataclasses.fields(settings):
         value = getattr(settings, field.name)
@@ -54,15 +54,16 @@ def _within(name: str, settings: object) -> dict[str, type]:
 
 
 def page() -> str:
-    """The page, from the source of the public names."""
+    """Returns the page, generated from the source of the public names."""
     blocks = [f"## {name}\n\n```\n{signature}\n```\n" for name, signature in signatures().items()]
     return _INTRODUCTION + "\n" + "\n".join(blocks)
 
 
 def unmentioned() -> list[str]:
-    """Public names that came or went since the last release, and members of others that differ from it, which
-    the changelog's newest section does not have in backticks; a member's class has to stand in the same
-    paragraph."""
+    """Returns the changes since the last release that the changelog's newest section does not mention.
+
+    A change is mentioned if its name is in backticks, for a member together with its class in one paragraph.
+    """
     newest = re.split(r"^## ", (ROOT / "CHANGELOG.md").read_text(), flags=re.MULTILINE)[1]
     code = (" ".join(re.findall(r"`([^`]*)`", paragraph)) for paragraph in newest.split("\n\n"))
     quoted = [set(re.findall(r"\w+", text)) for text in code]
@@ -70,7 +71,7 @@ def unmentioned() -> list[str]:
 
 
 def changed() -> list[str]:
-    """What differs from the last release: names, or members of a class that it has too, as `Name.member`."""
+    """Returns what differs from the last release: names, or `Name.member` for classes that exist in both."""
     before, now, found = json.loads(RELEASED.read_text()), digests(), []
     for name in sorted(before.keys() | now.keys()):
         old, new = before.get(name, {}), now.get(name, {})
@@ -81,7 +82,7 @@ def changed() -> list[str]:
 
 
 def broken() -> list[str]:
-    """Public names of the last release, or their members, that a patch version has changed or lacks."""
+    """Returns changes to released names and their members if this is a patch version, which allows none."""
     if gsjax.__version__.split(".")[2] == "0":
         return []
     before = json.loads(RELEASED.read_text())
@@ -89,7 +90,7 @@ def broken() -> list[str]:
 
 
 def digests() -> dict[str, dict[str, str]]:
-    """A short digest of each line of each signature, by the member that it declares; "" for the first."""
+    """Returns a digest of each line of each signature, keyed by the member it declares ("" for the first)."""
     return {name: _digests(text.splitlines()) for name, text in signatures().items()}
 
 

@@ -1,7 +1,7 @@
-"""Public docstrings are full: read from the source, in every layer.
+"""Public docstrings are complete in every layer; this is checked on the source.
 
-A docstring is full if it opens with a sentence, tells of each parameter (of one or two, the sentence may do),
-says what is raised, and gives the shapes of arrays that their annotations leave open.
+A docstring is complete if it opens with a sentence, mentions each parameter (optional for one or two), says
+what is raised, and gives the shapes of arrays that their annotations leave open.
 """
 
 import ast
@@ -17,7 +17,7 @@ LAYERS = (
     *("geometry", "rasterize", "scene", "losses", "optim", "methods"),
     *("perception", "metrics", "data", "io", "viz", "engine", "cli"),
 )
-FEW = 2  # so many parameters may be left to their names and annotations
+FEW = 2  # up to this many parameters need no description
 ERRORS = ("ValueError", "TypeError", "OSError", "DataError")
 OPEN_SHAPE = re.compile(r"^(np\.ndarray|(jax\.)?Array)$|\[(np\.ndarray|Array), ['\"]\.\.\.['\"]\]")
 
@@ -27,7 +27,7 @@ Definition = ast.Module | ast.ClassDef | ast.FunctionDef
 
 
 def definitions(tree: ast.Module) -> Iterator[tuple[str, Definition]]:
-    """All that is public in a module, and the module itself; no method that a base class documents."""
+    """Yields a module and its public definitions, except methods that a base class documents."""
     yield "the module", tree
     told = documented(tree)
     for node in tree.body:
@@ -41,7 +41,7 @@ def definitions(tree: ast.Module) -> Iterator[tuple[str, Definition]]:
 
 
 def documented(tree: ast.Module) -> dict[str, set[str]]:
-    """By class that a module has or takes from another of ours, the methods that it or its bases document."""
+    """Returns, by class defined in a module or imported, the methods that it or its bases document."""
     told: dict[str, set[str]] = {}
     for node in tree.body:
         if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("gsjax."):
@@ -58,7 +58,7 @@ def documented(tree: ast.Module) -> dict[str, set[str]]:
 
 @cache
 def documented_in(file: Path) -> dict[str, set[str]]:
-    """The same of a file."""
+    """Returns `documented` of a file; cached."""
     return documented(ast.parse(file.read_text(encoding="utf-8")))
 
 
@@ -67,7 +67,7 @@ def methods(node: ast.ClassDef) -> list[ast.FunctionDef]:
 
 
 def faults(node: Definition) -> Iterator[str]:
-    """What the docstring of one definition lacks."""
+    """Yields what the docstring of one definition lacks."""
     text = ast.get_docstring(node)
     if not text:
         yield "has no docstring"
@@ -91,13 +91,13 @@ def faults(node: Definition) -> Iterator[str]:
 
 
 def tells_of(text: str, name: str) -> bool:
-    """Whether a docstring has a parameter's name, or each word of it, also in the plural or the singular."""
+    """Whether a docstring contains a parameter's name, or each word of it, in the singular or plural."""
     words = [word.removesuffix("s") for word in name.split("_") if word]
     return all(re.search(rf"(?<![a-zA-Z]){re.escape(word)}", text, re.IGNORECASE) for word in words)
 
 
 def is_of_its_class(argument: ast.arg) -> bool:
-    """Whether an argument is called as its class is, `config: TrackConfig`: the class tells of it."""
+    """Whether an argument is named after its class (`config: TrackConfig`), which then documents it."""
     if argument.annotation is None:
         return False
     classes = re.findall(r"[A-Z]\w*", ast.unparse(argument.annotation).split("[")[0])
@@ -106,7 +106,7 @@ def is_of_its_class(argument: ast.arg) -> bool:
 
 
 def raises(function: ast.FunctionDef) -> Iterator[str]:
-    """Names of what the body raises by itself, functions within it left out."""
+    """Yields the names of the exceptions that the body raises, nested functions excluded."""
     pending: list[ast.AST] = list(function.body)
     while pending:
         node = pending.pop()
@@ -119,7 +119,7 @@ def raises(function: ast.FunctionDef) -> Iterator[str]:
 
 
 def not_full(source: str) -> list[str]:
-    """One message, from the line on, for each fault in a module."""
+    """Returns one message for each fault in a module, starting with the line number."""
     tree = ast.parse(source)
     if not tree.body:  # an empty __init__.py
         return []

@@ -1,4 +1,4 @@
-"""The floors of dependencies, and the version, as pyproject.toml tells them."""
+"""The lowest versions of dependencies, and the version of gsjax, as pyproject.toml gives them."""
 
 import importlib.util
 import re

@@ -1,4 +1,4 @@
-"""What an import loads. How long it takes is measured by `python -m benchmarks.imports`."""
+"""Which modules an import loads. How long it takes is measured by `python -m benchmarks.imports`."""
 
 import ast
 import json
@@ -11,14 +11,14 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
-# Those of extras, which need not be there, and those that only some commands need.
+# Packages of extras, which may be missing, and (LATE) packages that only some commands need.
 OPTIONAL = {"viser", "torch", "transformers", "mujoco", "pycolmap", "tensorboardX", "distributed", "dask"}
 OPTIONAL |= {"OpenEXR", "rosbags", "pyrealsense2"}
 LATE = {"matplotlib", "skimage", "jaxopt", "imageio_ffmpeg", "rich", "tyro", "PIL"}
 
 
 def loaded(program: str) -> set[str]:
-    """The top-level modules that stand in `sys.modules` after a program of its own process."""
+    """Returns the top-level modules in `sys.modules` after a program has run in a process of its own."""
     ending = "\nimport json, sys; print(json.dumps(sorted({name.split('.')[0] for name in sys.modules})))"
     command = [sys.executable, "-c", program + ending]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True, timeout=300)
@@ -74,7 +74,7 @@ jax.distributed.initialize(f"localhost:{port}", 1, 0)
 
 @pytest.mark.thorough
 def test_no_module_starts_the_backend_of_jax():
-    """What configures it, such as `jax.distributed.initialize`, may follow an import."""
+    """So calls that configure it, such as `jax.distributed.initialize`, may follow an import."""
     files = [file.relative_to(ROOT).with_suffix("") for file in (ROOT / "gsjax").rglob("*.py")]
     names = sorted(".".join(file.parts).removesuffix(".__init__") for file in files)
     done = subprocess.run([sys.executable, "-c", EACH, *names], cwd=ROOT, capture_output=True, text=True)
@@ -84,7 +84,7 @@ def test_no_module_starts_the_backend_of_jax():
 @pytest.mark.thorough
 @pytest.mark.parametrize("backend", ["module://nowhere.backend_inline", "nonsense", "qtagg", "absent", "AGG"])
 def test_plots_need_no_backend_of_matplotlib(backend, tmp_path):
-    """A notebook hands its own to the programs that it starts, and it need not be there."""
+    """A notebook passes its own backend to the programs it starts, where it may not be installed."""
     program = (
         "import os, sys\nfrom gsjax.viz import plots\nimport matplotlib\n"
         "plots.save(plots.update_time([0.1, 0.2]), sys.argv[1])\n"
@@ -100,13 +100,13 @@ def test_plots_need_no_backend_of_matplotlib(backend, tmp_path):
     )
     there = {"qtagg", "AGG", "module://nowhere.backend_inline"}
     given, used = done.stdout.splitlines()
-    assert given == backend  # for programs that this one starts
+    assert given == backend  # unchanged, for child processes
     assert (used.lower() == backend.lower()) == (backend in there)
 
 
 @pytest.mark.thorough
 def test_what_is_told_to_install_is_there():
-    """Each `extras.load(module, extra, ...)` names an extra that asks for the module's package."""
+    """Each `extras.load(module, extra, ...)` names an extra that requires the module's package."""
     asked = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
     calls = [
         (node.args[0], node.args[1].value)

@@ -1,4 +1,4 @@
-"""The layers of the package, read from its imports; docs/architecture.md says why they are as they are."""
+"""The imports of the package respect its layers, which docs/architecture.md explains."""
 
 import ast
 from collections.abc import Iterator
@@ -11,7 +11,7 @@ ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "gsjax"
 SHORT = ("gsjax", "tests", "benchmarks")
 BELOW_COMMANDS = ("experiments", "benchmarks")
-"""Folders whose files stand on the engine and what is below it, as commands do."""
+"""Folders whose files build on the engine and the layers below it, as commands do."""
 MAX_LINES = 400
 
 STACK = ("geometry", "rasterize", "scene", "losses", "optim", "methods")  # each may import those before it
@@ -23,16 +23,17 @@ BESIDE = {
     "viz": {"geometry", "scene"},
 }
 ALLOWED = {layer: set(STACK[:i]) for i, layer in enumerate(STACK)} | BESIDE
-ANYWHERE = {"extras"}  # the one module that stands in no layer
+ANYWHERE = {"extras"}  # the one module that belongs to no layer
 ALLOWED["optim"] |= {"io"}  # keeps traces on disk
 ALLOWED["engine"] = {*STACK, *BESIDE}
 ALLOWED["cli"] = {*STACK, *BESIDE, "engine"}
 
 
 def imported_modules(file: Path, root: Path) -> Iterator[tuple[int, str]]:
-    """(line, dotted name) of every import of `file`, also those inside functions, relative ones resolved.
+    """Yields (line, dotted name) of every import in `file`, those inside functions included.
 
-    `from package import name` yields `package.name`: whether that is a module or not, its layer is the same.
+    Relative imports are resolved. `from package import name` yields `package.name`: whether that is a module
+    or not, its layer is the same.
     """
     package = (root.name, *file.relative_to(root).parent.parts)
     for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"), str(file))):
@@ -49,7 +50,7 @@ def violations(root: Path) -> list[str]:
     messages = []
     for file in sorted(root.rglob("*.py")):
         where = file.relative_to(root)
-        if len(where.parts) == 1:  # __init__.py and __main__.py of the package show what the layers hold
+        if len(where.parts) == 1:  # the package's own __init__.py and __main__.py may import any layer
             continue
         layer = where.parts[0]
         if layer not in ALLOWED:
@@ -107,7 +108,7 @@ def test_experiments_and_benchmarks_stand_on_the_engine(folder):
 
 @pytest.mark.parametrize("folder", BELOW_COMMANDS)
 def test_what_experiments_and_benchmarks_import_exists(folder):
-    """Few of them run in a test, so a name that moved would be missed when they are next needed."""
+    """Few of them run in a test, so a broken import would go unnoticed until they are next needed."""
 
     def exists(module: str, name: str) -> bool:
         try:
@@ -134,7 +135,7 @@ def test_files_stay_short(folder):
 
 @pytest.fixture
 def toy(tmp_path):
-    """Writes one file of a toy package named gsjax, and returns what the checkers say of it."""
+    """Returns a function that writes one file of a toy package named gsjax and returns the faults found."""
 
     def check(path: str, source: str) -> list[str]:
         file = tmp_path / "gsjax" / path

@@ -1,4 +1,4 @@
-"""The tests that README.md of this folder names exist, and CI, which leaves slow ones out, runs them."""
+"""The tests named in this folder's README.md exist and run in CI, which leaves slow tests out."""
 
 import ast
 import re
@@ -21,7 +21,7 @@ def test_it_is_guarded(promise, guards):
 
 
 def marks_of(tree, test):
-    """The marks of each test of that name: its own, its class's and its file's."""
+    """Returns the marks of each test of that name: its own, its class's and its file's."""
     of_file = [ast.unparse(line) for line in tree.body if isinstance(line, ast.Assign)]
     of_file = [line.removeprefix("pytestmark = ") for line in of_file if line.startswith("pytestmark")]
     marks = []
@@ -34,7 +34,7 @@ def marks_of(tree, test):
 
 
 def is_slow(marks):
-    """Whether all of a test is; a case of its own in `parametrize` may be."""
+    """Whether a whole test is marked slow; marks of single cases in `parametrize` do not count."""
     return any(mark.lstrip("[").startswith("pytest.mark.slow") for mark in marks)
 
 

@@ -1,4 +1,4 @@
-"""What is promised is written down, and what changes in it is in the changelog."""
+"""The page of public names is current, and the changelog mentions every change to them."""
 
 import json
 
