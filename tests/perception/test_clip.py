@@ -15,7 +15,7 @@ from tests.perception.test_foundation import IMAGE, needs_foundation
 
 
 class Tensor(np.ndarray):
-    """Numbers with what CLIP's adapter asks of a tensor."""
+    """An array with the tensor methods that CLIP's adapter calls."""
 
     def to(self, device, dtype):
         return self
@@ -27,7 +27,7 @@ class Tensor(np.ndarray):
 
 
 def test_crops_are_encoded_a_few_at_a_time_in_their_order():
-    """With a stand-in for the model, whose vector of an image is its mean colour."""
+    """With a stand-in for the model that embeds an image as its mean colour."""
     sizes = []
 
     def mean_color(pixel_values):
@@ -109,7 +109,7 @@ def siglip_folder(tmp_path_factory):
     text = {**size, "vocab_size": 26, "max_position_embeddings": 12, "projection_size": 16}
     vision = {**size, "image_size": 32, "patch_size": 8}
     model = SiglipModel(SiglipConfig(text_config=text, vision_config=vision))
-    model.logit_scale.data[:], model.logit_bias.data[:] = np.log(117.0), -12.9  # as those that were trained
+    model.logit_scale.data[:], model.logit_bias.data[:] = np.log(117.0), -12.9  # as in trained models
     model.save_pretrained(folder)
     SiglipTokenizer(str(folder / "spiece.model")).save_pretrained(folder)
     SiglipImageProcessorPil(size={"height": 32, "width": 32}).save_pretrained(folder)
@@ -157,7 +157,7 @@ def test_weights_of_half_precision_are_read_and_on_a_cpu_computed_with_in_single
     np.testing.assert_allclose(read.embed_images([IMAGE]), wanted, atol=2e-3)
     np.testing.assert_allclose(read.embed_text("red can"), single.embed_text("red can"), atol=2e-3)
     assert not np.array_equal(read.embed_images([IMAGE]), wanted)
-    # As on a GPU, where they stay as they are.
+    # As on a GPU, where weights stay in half precision.
     kept = replace(read, model=read.model.half())
     found = kept.embed_images([IMAGE])
     assert found.dtype == np.float32

@@ -1,4 +1,4 @@
-"""Every name has its own vector, and shares it with no other."""
+"""Every class name has a vector of its own, nearly orthogonal to all others."""
 
 import numpy as np
 import pytest

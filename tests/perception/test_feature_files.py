@@ -1,4 +1,4 @@
-"""Features are read in the layouts of other tools; nothing in a file is ever run."""
+"""Features are read in the layouts of other tools; no code in a file is ever executed."""
 
 import importlib.util
 import io
@@ -23,7 +23,7 @@ class _Storage:
 
 
 class _Global:
-    """A name of a module, pickled as that name."""
+    """A module's global, pickled by name."""
 
     def __init__(self, module: str, name: str):
         self.module, self.name = module, name
@@ -228,7 +228,7 @@ def test_the_only_file_of_a_folder_may_hold_all_pictures(tmp_path):
     (tmp_path / "dino.info").write_text("{}")
     found = read_feature_folder(tmp_path, ["0/a.jpg", "1/a.jpg"])
     np.testing.assert_array_equal(found[1].map, 2 * MAP.astype(np.float32))
-    # The two training images of three: LERF stores no others.
+    # Two of the three images are for training: LERF stores features of no others.
     of_two = read_feature_folder(tmp_path, ["a.jpg", "b.jpg", "c.jpg"], which=[0, 2])
     np.testing.assert_array_equal(of_two[1].map, 2 * MAP.astype(np.float32))
     with pytest.raises(ValueError, match=r"of 3 images, or of the 1 that are selected, found 2; .* order"):

@@ -1,4 +1,4 @@
-"""Masks of things, of their parts and of the parts of these, on a level each."""
+"""Nested masks of objects, their parts and the parts of those are assigned to one level each."""
 
 import numpy as np
 from hypothesis import given
@@ -13,8 +13,8 @@ def test_a_thing_its_part_and_the_part_of_that_are_whole_on_their_levels():
     masks = np.zeros((6, 12, 16), bool)
     masks[0, 1:9, 1:11] = True  # a cabinet,
     masks[1, 2:6, 2:8] = True  # its drawer,
-    masks[2, 3:5, 3:6] = True  # the handle of that,
-    masks[3, 3, 3:5] = True  # and a screw of that
+    masks[2, 3:5, 3:6] = True  # its handle,
+    masks[3, 3, 3:5] = True  # and a screw of the handle
     masks[4, 10:12, 12:16] = True  # a cup beside it
     masks[5] = True  # the picture
     small, medium, large = labels_on_levels(masks, max_fraction=0.6)
@@ -23,7 +23,7 @@ def test_a_thing_its_part_and_the_part_of_that_are_whole_on_their_levels():
     np.testing.assert_array_equal(small, np.where(masks[3], 4, 3 * masks[2]))
     np.testing.assert_array_equal(labels_on_levels(masks, 0.6, min_pixels=3)[0], 3 * masks[2])
     assert not labels_on_levels(np.zeros((0, 6, 8), bool)).any()
-    # Alone, a level has the next larger mask where it has none, then the next smaller.
+    # A level shown alone is filled, where it has no mask, from the next larger, else the next smaller.
     filled = {level: labels_on_level(np.stack([small, medium, large]), level) for level in LEVELS}
     for level, labels in filled.items():
         np.testing.assert_array_equal(labels > 0, masks[0] | masks[4], err_msg=level)
@@ -54,7 +54,7 @@ def test_a_pixel_has_its_embedding_on_each_level_or_that_of_the_next(seed):
     rng = np.random.default_rng(seed)
     counts = rng.integers(1, 5, len(LEVELS))
     books = [rng.normal(size=(count, 2)).astype(np.float32) for count in counts]
-    books[0][0] = 0  # one that the encoder does not know
+    books[0][0] = 0  # zeros: unknown to the encoder
     ids = [rng.integers(-1, count, (4, 5)) for count in counts]
     rows, codebook, filled = joined_levels(ids, books)
     assert codebook.shape[1] == 2 * len(LEVELS)

@@ -28,7 +28,7 @@ MEAN, STD = [0.5, 0.4, 0.3], [0.2, 0.3, 0.4]
 
 
 def greedy_suppression(boxes, scores, max_overlap):
-    """The rows left after each, from the best on, removes those that overlap it too much."""
+    """Returns the rows left by non-maximum suppression of boxes, from the highest score on."""
     left, kept = list(np.argsort(-scores, kind="stable")), []
     while left:
         best = left.pop(0)
@@ -71,7 +71,7 @@ def sam_folder(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def sam(sam_folder):
-    """Random weights give low scores, so the thresholds are lower."""
+    """The segmenter, with lower thresholds, because random weights give low scores."""
     limits = {"min_score": 0.8, "min_stability": 0.6, "max_box_overlap": 0.9, "max_fraction": 1.0}
     points = {"points_per_side": 6, "points_per_batch": 10}
     return dataclasses.replace(load_sam(sam_folder), **limits, **points, min_pixels=1)
@@ -198,7 +198,7 @@ def picture_settings():
 
 
 def save_sam2_settings(folder, one_file):
-    """In the hub's layout, or in that of newer releases of transformers."""
+    """Saves them in the hub's layout, or in that of newer releases of transformers (`one_file`)."""
     picture = {**picture_settings(), "image_processor_type": "Sam2ImageProcessor"}
     video = {**picture_settings(), "video_processor_type": "Sam2VideoVideoProcessor"}
     whole = {"processor_class": "Sam2VideoProcessor", "point_pad_value": -10, "target_size": SIDE}

@@ -10,7 +10,7 @@ from gsjax.perception.stereo import StereoConfig, stereo_depth
 
 @pytest.fixture(scope="module")
 def eyes():
-    """The first frame of built-in tissue: images, view matrices, Ks, and the left camera's exact depth."""
+    """Frame 0 of the simulated tissue: images, view matrices, Ks, and the left camera's exact depth."""
     seen = gsjax.open_sequence("simulated:tissue?width=240&height=192&frames=1")
     return seen.image(0, 0), seen.image(0, 1), seen.viewmats[0], seen.Ks[0], seen.depth(0, 0)
 
