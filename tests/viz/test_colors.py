@@ -139,7 +139,7 @@ def test_labels_have_their_numbers_where_there_is_room():
 
 @pytest.mark.parametrize("step", [10, 25, 50, 60, 85, 100])
 def test_grey_values_that_people_paint_have_colours_of_their_own(step):
-    """Labels 100 and 200 had one colour, as 10 divides their distance."""
+    """Labels 100 and 200 once shared a colour, since 10 divides their difference."""
     found = np.array([colors.label_color(label) for label in range(step, 256, step)], float)
     apart = np.linalg.norm(found[:, None] - found, axis=-1) + 1000 * np.eye(len(found))
     assert apart.min() > 25

@@ -178,13 +178,13 @@ def test_another_level_asks_the_latest_query_again(scene, answers):
         until(lambda: answers.asked == ["green", ("green", "large")])
         folder._picked = lambda: 7
         folder._ask_similar()
-        folder._picked = lambda: 8  # the pick that was asked about counts
+        folder._picked = lambda: 8  # not queried: the level applies to the latest query
         folder._level.value = "small"
         until(lambda: answers.asked[2:] == [(7, "large"), (7, "small")])
 
 
 def test_a_moving_scene_can_be_queried(scene, answers):
-    """An answer is shown in all frames and moves along; another frame may have another answer."""
+    """An answer is shown in all frames and follows the motion; another frame may have another answer."""
     moving = replace(rising(scene.gaussians, 4), labels=scene.labels, asking=answers.asking())
     with open_viewer(moving, port=0) as viewer, browser(viewer, moving) as (page, _):
         folder = page._questions

@@ -96,7 +96,7 @@ class Saved:
 
 @contextmanager
 def browser(viewer, scene):
-    """A stand-in for a browser; yields its page on our side once it has drawn, and its socket."""
+    """A stand-in for a browser; yields its page on the server, once that has a picture, and its socket."""
     from websockets.sync.client import connect
 
     pose = first_pose(scene)
@@ -141,7 +141,7 @@ def drawn_after(page, change):
 
 
 def color_share(picture, color):
-    """Share of pixels of about a colour, in each half: left and right, above and below the middle."""
+    """Share of pixels close to a colour, in each half: left and right, above and below the middle."""
     near = np.abs(picture.astype(int) - np.array(color) * 255).max(-1) < 60
     h, w = near.shape[0] // 2, near.shape[1] // 2
     parts = {"left": near[:, :w], "right": near[:, w:], "above": near[:h], "below": near[h:]}
@@ -167,7 +167,7 @@ def test_a_page_from_the_first_picture_to_the_last_screenshot(scene):
         nodes = page._splats._nodes
         assert set(nodes) == {"moving", "still"}
         until(lambda: nodes["moving"].centers[:, 2].mean() * page._splats._scale > 1.1)
-        # Seen from the left, the camera's picture changes and nothing is compiled for it.
+        # Seen from the left, the red ball is still above.
         turned = (0.5, -0.5, 0.5, -0.5)
         picture = drawn_after(page, lambda: socket.send(camera_message((-4, 0, 0), 0.64, turned)))
         assert color_share(picture, RED)["above"] > 0.02
@@ -180,7 +180,7 @@ def test_a_page_from_the_first_picture_to_the_last_screenshot(scene):
         assert picture.shape == (104, 160, 3)
         picture = drawn_after(page, lambda: setattr(page._shown, "value", "depth"))
         assert "bright: " in page._status.content
-        # Splats too have other colorings.
+        # Splats have other colourings, too.
         assert page._coloring.options == ("colour", "depth", "label", "features")
         for coloring, says in (("label", "green ball"), ("depth", "away"), ("features", "principal")):
             page._coloring.value = coloring
@@ -210,7 +210,7 @@ def test_a_page_from_the_first_picture_to_the_last_screenshot(scene):
         assert page._photograph.label == "photograph front"
         np.testing.assert_allclose(page._client.camera.position, (0, -4, 0), atol=1e-6)
         np.testing.assert_allclose(page._client.camera.fov, 2 * np.arctan(1 / 3), atol=1e-6)
-        # An unreadable one is reported, and the page goes on.
+        # The page stays usable after an unreadable photograph.
         page._visited.value = "left"
         until(lambda: not page._photograph.visible)
         np.testing.assert_allclose(page._client.camera.position, (-4, 0, 0), atol=1e-6)
@@ -311,7 +311,7 @@ def seen(page) -> np.ndarray:
 
 
 def middle_of(picture, color):
-    """Mean row and column of the pixels of about a colour; None if there are few."""
+    """Mean row and column of the pixels close to a colour; None if there are few."""
     rows, columns = np.nonzero(np.abs(picture.astype(int) - np.array(color) * 255).max(-1) < 60)
     return None if len(rows) < 150 else (rows.mean(), columns.mean())
 
