@@ -67,7 +67,7 @@ def test_the_rand_index_at_its_ends():
     assert adjusted_rand_index(np.zeros(5, int), np.arange(5)) == 0
     assert adjusted_rand_index(np.array([0, 0, 1, 1]), np.array([0, 1, 0, 1])) == pytest.approx(-0.5)
     assert math.isnan(adjusted_rand_index(np.zeros(3, int), np.array([2, -1, -1])))
-    many = np.repeat(np.arange(4), 500_000)  # its pairs of pairs are beyond 64 bits
+    many = np.repeat(np.arange(4), 500_000)  # products of its pair counts exceed 64 bits
     assert adjusted_rand_index(many, many) == 1
     with pytest.raises(ValueError, match=r"predicted: expected shape \(4,\) to match true, found \(3,\)"):
         adjusted_rand_index(many[:3], many[:4])

@@ -1,4 +1,4 @@
-"""Errors of poses: against their definitions written out, and laws that they keep."""
+"""Pose errors against plain implementations of their definitions, and their invariances."""
 
 import numpy as np
 import pytest
@@ -29,7 +29,7 @@ K = intrinsics(500.0, 640, 480)
 
 
 def motions(rng, count, size=1.0):
-    """Random rigid motions, whose turns and shifts grow with `size`."""
+    """Random rigid motions, whose rotations and translations scale with `size`."""
     poses = np.tile(np.eye(4), (count, 1, 1))
     poses[:, :3, :3] = Rotation.from_rotvec(size * rng.normal(size=(count, 3))).as_matrix()
     poses[:, :3, 3] = size * rng.normal(size=(count, 3))
@@ -37,7 +37,7 @@ def motions(rng, count, size=1.0):
 
 
 def problem(seed, size=0.05):
-    """Estimated poses that are off by a little, true ones, and points of the model."""
+    """Slightly wrong estimated poses, true poses, and points of the model."""
     rng = np.random.default_rng(seed)
     true = motions(rng, FRAMES)
     return true @ motions(rng, FRAMES, size), true, 0.05 * rng.normal(size=(VERTICES, 3))
@@ -54,7 +54,7 @@ def quarter_turns():
 
 
 def in_front(poses):
-    """The poses, nearer to each other and two metres before a camera at the origin."""
+    """The poses, moved closer together and two metres in front of a camera at the origin."""
     moved = poses.copy()
     moved[:, :3, 3] = 0.1 * poses[:, :3, 3] + [0, 0, 2]
     return moved
@@ -151,8 +151,8 @@ def test_the_area_of_no_error_is_one_and_of_large_ones_none():
 @given(st.lists(st.floats(0, 0.2), min_size=1, max_size=40))
 def test_the_area_is_that_of_the_toolbox_and_next_to_the_integral(errors):
     errors = np.array(errors)
-    # As the toolbox has it: the k-th error of n is where an accuracy of k / n begins, and each step up to an
-    # error is as high as the curve there.
+    # As in the toolbox: the accuracy reaches k / n at the k-th of n errors, and each step that ends at an
+    # error is as high as the accuracy there.
     kept, toolbox, last = sorted(error for error in errors if error < 0.1), 0.0, 0.0
     for k, error in enumerate(kept, start=1):
         toolbox += (error - last) / 0.1 * k / len(errors)
@@ -194,7 +194,7 @@ def test_poses_are_those_that_the_points_went_through(seed, size):
     _, true, points = problem(seed, size)
     means = np.stack([placed(pose, points) for pose in true])
     np.testing.assert_allclose(fitted_poses(means, true[0]), true, atol=1e-8)
-    # No other motion is nearer to points that do not move rigidly.
+    # For points that do not move rigidly, no other motion fits better.
     rng = np.random.default_rng(seed)
     means = means + 0.01 * rng.normal(size=means.shape)
     fitted = fitted_poses(means, np.eye(4))
