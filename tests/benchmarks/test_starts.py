@@ -1,4 +1,4 @@
-"""How long commands take to start; that a second start compiles nothing is tested in tests/cli/run."""
+"""The benchmark of start-up times; that a second start compiles nothing is tested in tests/cli/run."""
 
 import json
 

@@ -188,7 +188,7 @@ def test_every_program_is_measured(measured):
     rows = {row.program: row for row in measured.rows}
     forward, backward = (rows[name] for name in ("forward", "forward+backward"))
     ratio = backward.product_floors / forward.product_floors * forward.median_ms / backward.median_ms
-    assert ratio == pytest.approx(1 / 3)  # of the slopes of weights and of features too
+    assert ratio == pytest.approx(1 / 3)  # the backward pass adds the gradients of weights and features
     assert rows["jvp"].product_floors is None
     assert list(rows) == ["forward", "forward+backward", "jvp"]
     for row in rows.values():
@@ -203,7 +203,7 @@ def test_every_program_is_measured(measured):
 
 @pytest.fixture
 def forward_only(monkeypatch):
-    """Only the program that compiles fastest."""
+    """Restricts measurements to the program that compiles fastest."""
 
     def programs(scene, plans):
         return {FORWARD: make_programs(scene, plans)[FORWARD]}
@@ -226,9 +226,9 @@ def absent() -> None:
 
 @pytest.fixture
 def bench(monkeypatch, tmp_path, capfd, measured):
-    """Runs the command on two workloads that are already measured and one without data.
+    """Returns a function that runs the command and returns the exit code and the output.
 
-    It returns the exit code and the output.
+    Two workloads are already measured, and one has no data.
     """
 
     def remembered(workload, repeats, say):

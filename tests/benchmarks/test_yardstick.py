@@ -20,7 +20,7 @@ def gaussians(shift: float) -> Gaussians:
 
 
 def write_run(folder, seconds: float = 1.0, shift: float = 0.0, psnr: float = 20.0):
-    """A folder with a file of each kind."""
+    """Writes a run folder with a file of each kind, and returns it."""
     (folder / "renders").mkdir(parents=True)
     write_ply(folder / "scene.ply", gaussians(shift))
     values = np.linspace(0, 1, 1000, dtype=np.float32) + np.float32(shift)
