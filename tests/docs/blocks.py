@@ -1,4 +1,4 @@
-"""The code blocks of the documentation, and whether gsjax understands what stands in them."""
+"""Finds the code blocks of the documentation, runs those in Python and checks the commands in others."""
 
 import re
 import shlex
@@ -25,10 +25,10 @@ class Block(NamedTuple):
 
     Attributes:
         page: its path below the root.
-        line: at which it begins, from 1.
-        language: behind the fence; empty where there is none.
-        text: what stands in it.
-        not_run: why it cannot be, by a comment `<!-- not run: why -->` before it; None where it can.
+        line: the line on which it begins, counted from 1.
+        language: the language named after the fence, or empty.
+        text: its content.
+        not_run: why it is not run, from a comment `<!-- not run: why -->` before it; None if it is run.
     """
 
     page: str
@@ -62,12 +62,12 @@ def blocks(page: str) -> list[Block]:
 
 
 def programs(page: str) -> list[Block]:
-    """The Python of a page that can be run."""
+    """The Python blocks of a page that are run."""
     return [block for block in blocks(page) if block.language == "python" and block.not_run is None]
 
 
 def run_programs(page: str) -> dict:
-    """Run the Python of a page, one block after the other in one namespace, which it returns."""
+    """Runs the Python blocks of a page in order, in one namespace, and returns that."""
     names: dict = {}
     for block in programs(page):
         padded = "\n" * block.line + block.text  # so that a traceback names the page's own lines
@@ -76,7 +76,7 @@ def run_programs(page: str) -> dict:
 
 
 def commands(block: Block) -> list[list[str]]:
-    """The words of each command of a shell's block, without comments and what it sets for one command."""
+    """The words of each command in a shell block, without comments and leading variable assignments."""
     text = block.text.replace("\\\n", " ")
     lines = [line.removeprefix("$ ") for line in text.splitlines()]
     split = [shlex.split(line, comments=True) for line in lines]
@@ -84,7 +84,7 @@ def commands(block: Block) -> list[list[str]]:
 
 
 def check_command(words: list[str]) -> None:
-    """Raises an error where gsjax, make, pip or Python would not know what is meant. Nothing is run."""
+    """Raises an error if gsjax, make, pip or Python would not understand a command; nothing is run."""
     program, rest = Path(words[0]).name, words[1:]
     if program == "gsjax":
         _check_gsjax(rest)
@@ -102,7 +102,7 @@ def check_command(words: list[str]) -> None:
 
 
 def _settings(words: list[str]) -> int:
-    """How many words in front set variables, as in `MUJOCO_GL=egl gsjax ...`."""
+    """The number of leading words that set variables, as in `MUJOCO_GL=egl gsjax ...`."""
     return next((i for i, word in enumerate(words) if not re.match(r"[A-Z_]+=", word)), len(words))
 
 
@@ -118,7 +118,7 @@ def _check_gsjax(words: list[str]) -> None:
 
 
 def expect_experiment(name: str) -> None:
-    """Raises an error where there is no such experiment; NAME stands for any."""
+    """Raises an error if there is no such experiment; NAME is a placeholder for any."""
     assert name == "NAME" or name in experiment_names(ROOT / "experiments"), f"no experiment {name}"
 
 

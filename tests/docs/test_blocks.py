@@ -31,7 +31,7 @@ NOT_RUN = {
     "docs/track.md": 2,
     "docs/view.md": 3,
 }
-"""How many blocks of a page are not run. A page that gains one says so here, and the block says why."""
+"""The number of blocks of each page that are not run. Each block says why; a new one is counted here."""
 
 
 def test_what_is_not_run_says_why():
@@ -44,13 +44,13 @@ def test_what_is_not_run_says_why():
 
 LONG = ("composition", "howto/loss", "howto/step", "rasterizer", "semantics")
 SLOW = {f"docs/{page}.md" for page in LONG}
-"""Of these pages, tests of methods and commands run the calls as well."""
+"""Pages whose calls are also run by tests of methods and commands."""
 OF_THE_FIVE = (
     "README.md",
     "docs/programs.md",
     *(f"docs/{verb}.md" for verb in ("fit", "track", "parts", "distill", "deform")),
 )
-"""Their programs have tests of their own: test_readme.py, test_programs.py."""
+"""Pages whose programs have tests of their own: test_readme.py, test_programs.py."""
 PROGRAMS = [
     pytest.param(page, marks=pytest.mark.slow) if page in SLOW else page
     for page in PAGES
@@ -80,10 +80,10 @@ def test_what_is_not_python_is_understood(page):
 
 @pytest.fixture(scope="module")
 def flags() -> set[str]:
-    """All options of all commands, as their help has them."""
+    """All options of all commands, as their help lists them."""
     asked = [(name, ["--help"]) for name in COMMANDS if name != "experiment"]
     asked += [("experiment", [what, "--help"]) for what in ("list", "table", "run")]
-    asked += [("track", ["--preset", "paper", "--help"])]  # what is on may be switched off, and else on
+    asked += [("track", ["--preset", "paper", "--help"])]  # help lists only the flag that changes a default
     return {flag for name, arguments in asked for flag in _flags_of(name, arguments)}
 
 
@@ -94,7 +94,7 @@ def _flags_of(command: str, arguments: list[str]) -> set[str]:
 
 
 OTHERS = {"--help", "--stride", "--xla", "--no-deps", "--nthreads"}
-"""Options of scripts, XLA, pip and Dask that pages name."""
+"""Options of scripts, XLA, pip and Dask that pages mention."""
 
 
 @pytest.mark.thorough

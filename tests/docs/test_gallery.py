@@ -1,4 +1,4 @@
-"""The gallery: what it runs is understood, and its page is the one that the script would write."""
+"""The gallery: its commands are valid, and its page is the one that the script would write."""
 
 import importlib.util
 import shlex

@@ -1,4 +1,4 @@
-"""Dotted names of gsjax in the documentation, in docstrings and in comments name what is there."""
+"""Dotted names of gsjax in the documentation, in docstrings and in comments exist."""
 
 import re
 from importlib import import_module

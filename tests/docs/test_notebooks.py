@@ -1,4 +1,4 @@
-"""The notebooks: their code runs, with fewer steps, and they hold what it showed when it was run in full."""
+"""The notebooks: their code runs with fewer steps, and they contain the outputs of a full run."""
 
 import json
 from dataclasses import replace
@@ -14,7 +14,7 @@ from tests.docs.test_programs import PARTS
 from tests.engine.cases import TRACK
 
 NOTEBOOKS = {path.stem: path for path in (ROOT / "docs/notebooks").glob("*.ipynb")}
-MOST_BYTES = 600_000  # of a notebook, so that hosts show it
+MOST_BYTES = 600_000  # of a notebook; hosts do not render larger ones
 SHORTER = {
     "fit": {"steps=800, cap=8000": "steps=4, cap=300, coarse_until=0.0", "(60)": "(2)", ", 60)": ", 2)"},
     "track": {"gsjax.TrackConfig()": "TRACK", "frames=12": "frames=2"},
@@ -26,7 +26,7 @@ SHORTER = {
         "(0, 6, 12, 19)": "(0, 1, 0, 1)",
     },
 }
-"""Less to do for each notebook: text of it, and what stands for it here."""
+"""Replacements in the text of each notebook, so that it takes less time."""
 
 
 def cells(name: str, kind: str) -> list[dict]:
@@ -47,7 +47,7 @@ def test_it_was_run_in_full_and_shows_what_came_out(name):
     assert sum("image/jpeg" in output.get("data", {}) for output in outputs) >= 3
     text = "".join("".join(output.get("text", ())) for output in outputs)
     assert "Gaussians" in text
-    assert "/" + "work/" not in text  # no path of a machine
+    assert "/" + "work/" not in text  # no path of the machine that ran it
 
 
 @pytest.mark.thorough

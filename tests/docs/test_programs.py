@@ -1,5 +1,5 @@
-"""The five programs of a researcher: the same in docs/programs.md and on their pages, in the same words, and
-run with fewer steps."""
+"""The five example programs: the same in docs/programs.md and on their own pages, alike in form, and run with
+fewer steps."""
 
 import re
 from dataclasses import replace
@@ -29,7 +29,7 @@ SHORTER = {
     "distill": {"steps=500, cap=5000": "steps=4, cap=300, coarse_until=0.0"},
     "deform": {"warmup=100, iterations=200": "warmup=2, iterations=3, nodes=64"},
 }
-"""Less to do for each program: text of it, and what stands for it here."""
+"""Replacements in the text of each program, so that it takes less time."""
 
 
 def program(verb: str) -> Block:
@@ -88,13 +88,13 @@ def test_it_runs(verb, tmp_path, monkeypatch):
     exec(compile(text, f"gsjax.{verb}", "exec"), names)
     now = names["now"]
     assert now.step > 0
-    assert now.problem is None  # read from the file
+    assert now.problem is None  # not stored in the file
     assert type(now).__name__ == "Tick"
     assert gsjax.load("run.npz").step == now.step
     given = names.get("photographs", names.get("sequence"))
-    for said in map(repr, (now, now.result, given)):  # what a notebook shows of each
+    for said in map(repr, (now, now.result, given)):  # as a notebook shows them
         assert len(said) < 150, said
     assert repr(now).startswith(f"Tick(step {now.step}: ")
     assert given.name in repr(given)
-    if verb != "distill":  # whose result is no scene
+    if verb != "distill":  # its result is not a scene
         assert "<iframe" in gsjax.show(now.result)._repr_html_()

@@ -1,4 +1,4 @@
-"""The README stays short, and its derivative runs; the five programs are in test_programs.py."""
+"""The README stays short, and its two programs run; the five programs are tested in test_programs.py."""
 
 import re
 

@@ -1,11 +1,11 @@
-"""Papers are named as docs/references.md names them, which a reader of the repository has."""
+"""Papers are cited as in docs/references.md, not by names of files that readers do not have."""
 
 import re
 
 from tests.docs.blocks import ROOT
 
 PRIVATE = re.compile("papers" + r"/00\d|" + "METHODS" + r"\.md")
-"""Names of files that only the first authors had: `SurstSplat, eq. 13` says where to look instead."""
+"""Names of files that only the authors had; `SurstSplat, eq. 13` is how to cite instead."""
 FOLDERS = ("gsjax", "experiments", "benchmarks", "docs", "tests")
 TEXTS = (".py", ".md", ".toml", ".yml", ".yaml", ".json", ".bib", ".txt")
 
