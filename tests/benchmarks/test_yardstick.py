@@ -67,7 +67,7 @@ def test_what_differs_is_named_and_sized(before, tmp_path):
     ]
 
 
-def test_a_bit_in_one_value_is_a_difference(before):
+def test_a_bit_in_one_value_is_a_difference():
     array = np.linspace(0, 1, 100, dtype=np.float32)
     other = array.copy()
     other[7] = np.nextafter(other[7], np.float32(2))

@@ -261,7 +261,8 @@ def bad_files(folder, kind):
         np.savez(folder / "a.npz", features=MAP)
         (folder / "a.npz").rename(folder / "a.npy")
     elif kind == "cut off":
-        (folder / "a.npy").write_bytes(b"PK\x03\x04 not a zip")
+        np.save(folder / "a.npy", MAP)
+        (folder / "a.npy").write_bytes((folder / "a.npy").read_bytes()[:-8])
     elif kind == "huge":
         header = {"descr": "<f4", "fortran_order": False, "shape": (2**70, 4, 5)}
         with (folder / "a.npy").open("wb") as file:
