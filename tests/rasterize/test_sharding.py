@@ -1,4 +1,4 @@
-"""Several devices give the same results as one: four virtual ones, and two real processes over `jax.distributed`.
+"""Several devices give the same as one: four virtual ones, and two real processes over `jax.distributed`.
 
 The number of devices of a process is fixed when JAX starts, so this file is also the program that the tests
 start: it draws and trains with and without a mesh and prints the differences.
