@@ -78,7 +78,7 @@ class TestStrain:
         check_grads(penalty, (rest + 0.1 * points(2), turns), order=1, modes=("fwd", "rev"))
 
     def test_it_pulls_no_rest_apart_where_all_is_stretched_alike(self):
-        """Canonical points move the deformed ones too: under a field that stretches uniformly, the strain does
+        """Canonical points move the deformed ones too: under a field that stretches evenly, the strain does
         not depend on their scale, so its gradient has no component along it."""
         stretch, turns = jnp.array([1.3, 1.0, 1.0]), np.tile(np.eye(3), (4, 1, 1))
 

@@ -81,7 +81,8 @@ def by_loops(grid, position):
 
 class TestConfig:
     def test_resolutions_are_those_of_float64(self):
-        """They double every five levels. Plain rounding gives 31 in float32, and 63 for the finer grid in float64."""
+        """They double every five levels. Rounded down without a margin, the sixth would be 31 in float32,
+        and one of the finer grid 63 in float64."""
         expected = (16, 18, 21, 24, 27, 32, 36, 42, 48, 55, 64, 73, 84, 97, 111, 128)
         assert FeatureGridConfig().resolutions == expected
         finer = FeatureGridConfig(levels=31, least_resolution=16, most_resolution=1024)
