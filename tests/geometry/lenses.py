@@ -69,7 +69,7 @@ def tangents_of(tree, seed=1):
 
 
 def check_derivatives(f, args, step=1e-6, rtol=1e-6):
-    """jvp against central differences, argument by argument, and vjp against jvp."""
+    """Checks jvp against central differences, argument by argument, and vjp against jvp."""
     value = jax.jit(f)
     push = jax.jit(lambda args, v: jax.jvp(f, args, v)[1])
     pull = jax.jit(lambda args, w: jax.vjp(f, *args)[1](w))

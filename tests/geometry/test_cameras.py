@@ -1,4 +1,4 @@
-"""Cameras: projection and back, conventions of axes and pixels."""
+"""Cameras: projection and its inverse, and conventions of axes and pixels."""
 
 import jax
 import jax.numpy as jnp

@@ -101,7 +101,7 @@ def test_sampling_says_what_lies_outside_or_has_no_value():
     expected[:, 5] = expected[1, 1] = expected[1, 2] = False
     np.testing.assert_array_equal(touched, expected)
     centred = sampled(image, centres)
-    assert np.asarray(centred.valid).sum() == 23  # a neighbour of weight 0 spoils nothing
+    assert np.asarray(centred.valid).sum() == 23  # an invalid neighbour of weight 0 does no harm
     gradient = jax.jit(jax.grad(lambda i: sampled(i, centres + 0.25).image.sum()))(image)
     assert np.isfinite(gradient).all()
 
@@ -227,7 +227,7 @@ def test_a_gaussian_is_seen_where_opencv_projects_its_centre(lens):
     assert np.linalg.norm(want.ravel() + 0.5 - np.asarray(plain)) > 0.5  # the lens has a visible effect
     np.testing.assert_allclose(
         found, want.ravel() + 0.5, atol=0.1
-    )  # a blob's centre is not its middle's image
+    )  # a blob's centroid is not the image of its centre
 
 
 def of_lens(params, batch, *, step, key):

@@ -1,4 +1,4 @@
-"""Lens distortion of points: OpenCV agrees, derivatives are exact, and nothing turns NaN."""
+"""Lens distortion of points: it agrees with OpenCV, derivatives are exact, and no NaN spreads."""
 
 from functools import partial
 
@@ -45,7 +45,7 @@ def test_float32_agrees_with_opencv_to_1e_6(lens):
     np.testing.assert_allclose(bent, cv_distorted(points, coeffs, model), atol=1e-6)
     back = jitted_undistort(bent, coeffs, model)
     assert np.asarray(back.valid).all()
-    # How far rounding of the distorted point moves the undistorted one: up to 1 / cos^2, 13 at 74 degrees.
+    # Rounding of the distorted point is amplified by up to 1 / cos^2, which is 13 at 74 degrees.
     np.testing.assert_allclose(back.points, points, atol=1e-5 if model == "opencv_fisheye" else 1e-6)
 
 
@@ -97,7 +97,7 @@ def test_the_derivative_of_the_inverse_is_the_inverse_derivative(lens):
 def test_beyond_the_fold_is_finite_not_valid_and_without_gradient(dtype):
     with jax.enable_x64(dtype is np.float64):
         coeffs = np.array([-0.3, 0.0, 0.0, 0.0], dtype)
-        fold = np.sqrt(1 / 0.9)  # r (1 - 0.3 r^2) is largest there: 2/3 of it
+        fold = np.sqrt(1 / 0.9)  # where r (1 - 0.3 r^2) has its maximum, 2/3 r
         top = 2 / 3 * fold
         radii = np.array([0.5 * top, 0.999 * top, 1.001 * top, 2.0, 1e3, 1e30], dtype)
         direction = np.array([0.6, -0.8], dtype)

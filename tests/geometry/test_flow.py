@@ -47,7 +47,7 @@ def test_what_is_unknown_stays_unknown():
     known = np.isfinite(warp(picture, flow))
     expected = np.ones((8, 8), bool)
     expected[2, 3] = expected[:, 7] = expected[7, :] = False
-    expected[4:6, 3:5] = False  # they end beside it
+    expected[4:6, 3:5] = False  # these end next to the unknown pixel
     np.testing.assert_array_equal(known, expected)
 
 
@@ -61,7 +61,7 @@ def test_there_and_back_again_is_seen_in_both(x, y):
 
 @pytest.mark.parametrize(("off", "believed"), [(0.70, True), (0.71, False)])
 def test_the_way_back_of_what_stands_still_may_miss_by_the_root_of_a_half(off, believed):
-    """|f + b|^2 <= 0.01 |b|^2 + 0.5 turns at 0.7107 pixels for f = 0."""
+    """|f + b|^2 <= 0.01 |b|^2 + 0.5 switches at |b| = 0.7107 pixels for f = 0."""
     forward, backward = constant((8, 8), 0, 0), constant((8, 8), off + 0.005, 0)
     assert seen_in_both(forward, backward)[4, 4] == believed
 

@@ -22,8 +22,8 @@ def made_up(kind, seed, frames=12):
 
 
 def shaken(motions, points, noise, seed):
-    """Each frame perturbed about the part's centroid: `noise` metres and `noise` radians, standard
-    deviation."""
+    """The motions, each perturbed about the part's centroid by Gaussian noise with a standard deviation of
+    `noise` metres and `noise` radians."""
     rng, middle = np.random.default_rng(seed), points.mean(0)
     turns = Rotation.from_rotvec(noise * rng.normal(size=(len(motions), 3))).as_matrix()
     steps = np.broadcast_to(np.eye(4), (len(motions), 4, 4)).copy()
@@ -85,7 +85,7 @@ def test_tracking_noise_costs_as_much_as_it_is(kind, seed):
 
 
 def test_the_path_of_a_short_handle_tells_its_axis():
-    """It is 6 cm long, 6 cm from the axis; its rotations are 3 degrees off, its places 2 mm."""
+    """The handle is 6 cm long and 6 cm from the axis; its noise is 3 degrees and 2 mm."""
     axis_deg, angle_deg, sure = [], [], []
     for seed in range(30):
         rng = np.random.default_rng(seed)
@@ -162,7 +162,7 @@ def test_what_slides_and_turns_is_free(seed):
 
 
 def turning_slide(seed, turn):
-    """A part of 12 cm that goes 25 cm along a line and turns steadily, and its points."""
+    """Motions of a 12 cm part that slides 25 cm along a line while it rotates steadily, and its points."""
     rng = np.random.default_rng(seed)
     share, way = np.linspace(0, 1, 16), np.append(rng.normal(size=2), 0.0)
     motions = np.tile(np.eye(4), (16, 1, 1))
@@ -173,8 +173,8 @@ def turning_slide(seed, turn):
 
 @given(seeds, st.floats(0.5, 1.2))
 def test_a_steady_slide_and_turn_is_no_hinge(seed, turn):
-    """It nearly is one, about a distant axis: a tolerance this large told no difference before a turning
-    slide was tried as well."""
+    """It is nearly a hinge about a distant axis: with the larger tolerance it was taken for one before a
+    turning slide was fitted as well."""
     motions, points = turning_slide(seed, turn)
     for tolerance in (0.03, 0.15):
         found = fit_joint(motions, points, tolerance=tolerance)

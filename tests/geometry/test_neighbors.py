@@ -54,7 +54,7 @@ def slope(height=24, width=32):
 
 @given(st.integers(0, 2**32 - 1), st.sampled_from([0, 0.2, 0.4]))
 def test_depth_that_stands_alone_is_on_no_surface(seed, holes):
-    """5 % of the pixels at a tenth to ten times their depth."""
+    """5 % of the pixels have a tenth to ten times their true depth."""
     random, surface = np.random.default_rng(seed), slope(96, 128)
     off, known = random.uniform(size=surface.shape) < 0.05, random.uniform(size=surface.shape) >= holes
     wrong = surface * 10 ** random.uniform(-1, 1, surface.shape).astype(np.float32)

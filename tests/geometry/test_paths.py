@@ -1,4 +1,4 @@
-"""Camera paths look at the focus of the given cameras, from where these stand."""
+"""Camera paths look at the focus of the given cameras, at their height and distance."""
 
 import numpy as np
 import pytest
@@ -45,7 +45,7 @@ def test_every_view_looks_at_the_focus_and_stands_upright(count):
     local = path[:, :3, :3] @ FOCUS + path[:, :3, 3]
     np.testing.assert_allclose(local[:, :2], 0.0, atol=1e-9)
     assert (local[:, 2] > 0).all()
-    assert (-path[:, 1, 2] > 0.5).all()  # the world's up is up in the picture
+    assert (-path[:, 1, 2] > 0.5).all()  # the world's up is up in the image
 
 
 def test_cameras_that_all_stand_at_one_place_give_a_path_too():

@@ -1,4 +1,4 @@
-"""Quaternions against scipy."""
+"""Quaternions and rotation vectors against scipy."""
 
 import jax
 import jax.numpy as jnp

@@ -1,4 +1,4 @@
-"""Sampled points cover the others and keep apart."""
+"""Farthest-point sampling: the picked points cover the others and are far from each other."""
 
 import hypothesis.strategies as st
 import jax

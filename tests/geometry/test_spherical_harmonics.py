@@ -1,4 +1,4 @@
-"""Real harmonics against scipy's complex ones, and the laws they obey."""
+"""Real spherical harmonics against scipy's complex ones, and their properties."""
 
 import jax
 import jax.numpy as jnp
@@ -17,7 +17,8 @@ def directions(count, seed=0):
 
 
 def real_harmonics(degree, d):
-    """Y_lm of 3DGS: sqrt(2) times the imaginary (m < 0) or real (m > 0) part of Y_l|m|, phase kept."""
+    """Y_lm of 3DGS: sqrt(2) times the imaginary (m < 0) or real (m > 0) part of Y_l|m|, with its
+    Condon-Shortley phase."""
     theta, phi = np.arccos(d[:, 2]), np.arctan2(d[:, 1], d[:, 0])
     columns = []
     for l in range(degree + 1):

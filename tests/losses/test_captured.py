@@ -1,4 +1,4 @@
-"""What custom losses take from outside, which is compiled in."""
+"""The values that custom losses capture: they are compiled in, so a change of one must be noticed."""
 
 from functools import partial
 

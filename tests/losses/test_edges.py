@@ -80,7 +80,7 @@ def test_there_are_fewer_edges_than_requested_if_there_are_fewer_nodes():
     alike = similar_edges(nothing, 2, 1)
     ends = {node for _, i, _, j in listed(alike) for node in (i, j)}
     assert ends <= {*range(N)} - {2, 3}
-    assert alike.valid.sum() == 2 * (T - 1) * (N - 2) * 2  # absent nodes take no one's place
+    assert alike.valid.sum() == 2 * (T - 1) * (N - 2) * 2  # absent nodes displace no others
 
 
 def test_all_edges_are_all_pairs():

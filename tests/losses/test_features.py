@@ -91,7 +91,7 @@ def test_the_contrastive_loss_ignores_single_pixels_and_pixels_without_an_id():
         value, slope = contrast_and_slope(features, np.int32(ids))
         assert value == 0
         np.testing.assert_array_equal(slope, 0)
-    # A single id has no loss, wherever its features lie.
+    # With a single id there is no loss, wherever the features lie.
     np.testing.assert_allclose(contrast(features, np.zeros(4, np.int32)), 0, atol=1e-6)
 
 
@@ -99,7 +99,7 @@ def test_the_contrastive_loss_is_finite_if_its_kernel_underflows_or_features_are
     far = 500 + 30 * np.float32([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [1.0, 1.0]])
     ids = np.int32([0, 1, 0, 1])
     value, slope = contrast_and_slope(far, ids)
-    # Two others are equally near, one with the same id.
+    # The two nearest are equally near, and one of them has the same id.
     np.testing.assert_allclose(value, np.log(2), rtol=1e-3)
     assert np.isfinite(slope).all()
     value, slope = contrast_and_slope(np.ones((4, 2), np.float32), ids)

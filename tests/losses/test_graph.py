@@ -1,4 +1,4 @@
-"""Losses of graphs against their definitions in float64; central differences; extremes."""
+"""Graph losses against their definitions in float64 and central differences, and at extremes."""
 
 import jax
 import jax.numpy as jnp
@@ -137,7 +137,7 @@ def test_twice_the_nodes_change_no_loss():
     twice = {name: np.concatenate([a, a], axis=1) if a.ndim > 1 else a for name, a in inputs.items()}
 
     @jax.jit
-    def across(inputs):  # within a frame each node has a twin, which half of the nodes lack
+    def across(inputs):  # between frames only: within one, doubling gives each node a twin
         edges = all_edges(inputs["valid"], 1)
         wanted = edge_affinities(inputs["teacher"], edges, inputs["valid"])
         between = jnp.broadcast_to(np.array(edges.offsets) != 0, edges.valid.shape) * 1.0

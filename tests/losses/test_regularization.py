@@ -78,8 +78,8 @@ class TestStrain:
         check_grads(penalty, (rest + 0.1 * points(2), turns), order=1, modes=("fwd", "rev"))
 
     def test_it_pulls_no_rest_apart_where_all_is_stretched_alike(self):
-        """Canonical points move what is deformed too: by a field that stretches, the strain is the same
-        wherever they lie, and its gradient by them is 0 along their scale."""
+        """Canonical points move the deformed ones too: under a field that stretches evenly, the strain does
+        not depend on their scale, so its gradient has no component along it."""
         stretch, turns = jnp.array([1.3, 1.0, 1.0]), np.tile(np.eye(3), (4, 1, 1))
 
         def penalty(rest):

@@ -1,4 +1,4 @@
-"""Sinkhorn against its laws, the best assignment, central differences and ott-jax."""
+"""Sinkhorn matching against its invariants, the optimal assignment, central differences and ott-jax."""
 
 from functools import partial
 
@@ -16,7 +16,7 @@ DERIVATIVES = ("unrolled", "implicit")
 STATIC = ("iterations", "derivative")
 matching = jax.jit(sinkhorn, static_argnames=STATIC)
 SEEDS, TEMPERATURES = st.integers(0, 1000), st.floats(0.4, 10)
-N, M, ENOUGH = 5, 7, 400  # iterations until nothing changes, at these temperatures
+N, M, ENOUGH = 5, 7, 400  # enough iterations to converge at these temperatures
 
 
 def match(*arguments, **options) -> np.ndarray:
@@ -28,7 +28,7 @@ def scores_of(seed: int, rows: int = N, columns: int = N) -> np.ndarray:
 
 
 def value(inputs, weights, iterations=20, derivative="unrolled", **there):
-    """A scalar of the matching for scores, a temperature and optionally a slack."""
+    """A weighted sum of the matching of scores at a temperature, optionally with a slack."""
     scores, temperature, *slack = inputs
     options = {"iterations": iterations, "derivative": derivative, **there}
     return jnp.vdot(weights, sinkhorn(scores, temperature, slack=slack[0] if slack else None, **options))
@@ -239,7 +239,7 @@ def test_the_implicit_gradient_is_the_unrolled_one_up_to_the_error_of_row_sums()
         errors.append(np.abs(np.subtract(implicit, unrolled)).max())
         gaps.append(np.abs(match(*inputs, **options).sum(1) - 1).max())
     assert errors[-1] < 1e-12
-    assert errors[0] > errors[1] > 1e-6  # the test covers both cases
+    assert errors[0] > errors[1] > 1e-6  # before convergence the two differ
     assert all(error < 5 * gap for error, gap in zip(errors[:2], gaps[:2], strict=True))
 
 

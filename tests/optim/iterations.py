@@ -27,5 +27,5 @@ def scanned(step, params, batch, num):
 
 
 def falls(losses) -> bool:
-    """Whether losses never rise, except by the rounding of two ways to compute one image."""
+    """Whether losses never rise beyond the rounding error between two ways of computing one image."""
     return bool((np.diff(losses) <= 1e-6 * losses[:-1]).all())

@@ -1,4 +1,4 @@
-"""What makes programs faster on the host does not change their results."""
+"""Options that make programs faster on the host do not change their results."""
 
 import os
 import subprocess
@@ -31,7 +31,7 @@ def test_what_is_written_to_memory_is_the_same_mapped_and_differentiated():
 
 @pytest.mark.skipif(jax.default_backend() != "cpu", reason="does nothing on other platforms")
 def test_the_compiler_keeps_the_branch():
-    """It would drop jax.lax.optimization_barrier. The flag does not depend on the mapped axis."""
+    """It would drop jax.lax.optimization_barrier. The flag is not mapped, so vmap keeps the branch."""
     image, x = jnp.ones((50, 4)), jnp.ones((3, 20))
     mapped = jax.jit(jax.vmap(read, in_axes=(None, 0, None)))
     assert " conditional(" in mapped.lower(image, x, jnp.ones(1)).compile().as_text()

@@ -1,4 +1,4 @@
-"""Conjugate gradients solve any positive definite system, column by column, and stand still once solved."""
+"""Conjugate gradients solve any positive definite system, column by column, and stay there once solved."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -17,7 +17,7 @@ def test_they_reach_the_solution_in_as_many_iterations_as_unknowns(size, columns
     root = random.normal(size=(size, size))
     A = (root @ root.T / size + 2 * np.eye(size)).astype(np.float32)
     b = random.normal(size=(size, columns)).astype(np.float32)
-    b[:, 0] = 0.0  # a column that is solved at once
+    b[:, 0] = 0.0  # a column that is solved from the start
     x, scale = jnp.zeros((size, columns)), jnp.asarray(np.diag(A))
     state = turned(Conjugate(x, x, jnp.zeros(columns)), jnp.asarray(b) - A @ x, scale)
     errors = []

@@ -1,4 +1,4 @@
-"""Relocation keeps the picture and fills only allowed slots, and its noise spares opaque Gaussians."""
+"""Relocation keeps the image and fills only allowed slots; exploration noise spares opaque Gaussians."""
 
 import jax
 import jax.numpy as jnp
@@ -21,7 +21,7 @@ from gsjax.scene.gaussians import Gaussians
 
 
 def some(opacities, seed=0) -> Gaussians:
-    """Gaussians with these opacities at random places."""
+    """Gaussians with these opacities at random positions."""
     random, count = np.random.default_rng(seed), len(opacities)
     opacities = jnp.asarray(opacities, jnp.float32)
     logits = jnp.where(opacities > 0, jnp.log(opacities) - jnp.log1p(-opacities), EMPTY_LOGIT)

@@ -1,4 +1,4 @@
-"""The driver's guard, on descents small enough to see through: it acts where it must, and only there."""
+"""The driver's guard, on descents small enough to follow by hand: it acts where it must, and only there."""
 
 from dataclasses import dataclass
 
@@ -24,17 +24,17 @@ class DescentConfig:
     steps: int = 1000
     seed: int = 0
     noise: float = 0.0  # standard deviation of the losses, relative
-    steep_after: int = 10_000  # the step after which the slope is many times as steep
-    nan_after: int = 10_000  # the step after which nothing is finite, unsaid
+    steep_after: int = 10_000  # the step after which the rate is many times as large
+    nan_after: int = 10_000  # the step after which parameters are NaN, but not skipped
     sick_after: int = 10_000  # the step after which all steps are skipped, as their losses are not finite
     raises_at: int = -1  # the step whose batch cannot be read, once
     anew_at: int = -1  # the step before which all parameters are replaced
-    harder_after: int = 10_000  # the step from which on another loss is added, and the guard dropped
+    harder_after: int = 10_000  # the step from which the loss has another term; the guard is reset there
 
 
 @dataclass(frozen=True)
 class Descent:
-    """Descent on |x|^2 towards 1e-3, with what may go wrong."""
+    """Descent on |x|^2 + 1e-3, with the failures that its configuration asks for."""
 
     config: DescentConfig = DescentConfig()
 
@@ -101,17 +101,17 @@ def test_a_descent_that_goes_well_is_left_alone_to_the_bit():
 
 @pytest.mark.thorough
 def test_what_diverges_goes_back_to_its_best_with_smaller_steps():
-    """Steps beyond the edge of stability; half of them are not."""
+    """The steps are beyond the edge of stability; steps half as long are not."""
     ticks, infos = descended(steep_after=430)
-    assert max(float(info["loss"]) for info in infos[430:]) > 1  # it was lost
+    assert max(float(info["loss"]) for info in infos[430:]) > 1  # it had diverged
     assert loss_of(ticks) < 1.001e-3
     assert ticks.run.guard.returns >= 1
     assert float(ticks.run.guard.share) <= 0.5
 
 
 def test_a_run_ends_with_its_best_not_its_last():
-    """It diverges in its last thirty steps, which are no window: both for those who ask the loop for its
-    result, and those who keep the last tick."""
+    """It diverges in its last thirty steps, too few for a window. The loop's result and the last tick both
+    hold the best parameters."""
     method = Descent(DescentConfig(steps=650, steep_after=620))
     ticks = drive(method, *method.start())
     *_, last = ticks
@@ -137,7 +137,7 @@ def test_one_that_is_ended_early_is_settled_by_whoever_ends_it():
 
 @pytest.mark.thorough
 def test_what_leaves_the_finite_unsaid_comes_back():
-    """By a step that does not check itself."""
+    """With a step that does not check its own results."""
     ticks, infos = descended(nan_after=777, steps=850)
     assert np.isnan(float(infos[-1]["loss"]))
     assert loss_of(ticks) < 1.001e-3
@@ -145,7 +145,7 @@ def test_what_leaves_the_finite_unsaid_comes_back():
 
 @pytest.mark.thorough
 def test_where_no_step_can_be_taken_any_more_it_comes_back():
-    """Each is skipped, from parameters where no loss is finite."""
+    """Each is skipped, because the loss of its parameters is not finite."""
     ticks, _ = descended(sick_after=777, steps=950)
     assert loss_of(ticks) < 1.001e-3
     assert ticks.run.guard.returns >= 1
@@ -153,23 +153,23 @@ def test_where_no_step_can_be_taken_any_more_it_comes_back():
 
 @pytest.mark.parametrize("after", ["steep_after", "nan_after", "sick_after"])
 def test_what_diverges_from_its_first_steps_goes_back_to_the_beginning(after):
-    """Before there was a window to return to: of 800 steps at 100 times the rates, 690 were skipped."""
+    """There is no window to return to yet. In a run of 800 steps at 100 times the rates, 690 were skipped."""
     ticks, infos = descended(**{after: 10}, steps=430)
     assert not float(infos[99]["loss"]) < 4
     assert loss_of(ticks) <= SIZE + 1e-3
     assert ticks.run.guard.returns >= 1
-    if after == "steep_after":  # half of its steps are not too large
+    if after == "steep_after":  # steps half as long are not too large
         assert loss_of(ticks) < 1.001e-3
 
 
 def test_steps_that_are_skipped_at_the_end_of_a_short_run_lose_nothing():
-    """79 good ones, and 11 that changed nothing, before there was a window."""
+    """79 good steps and 11 skipped ones, before there was a window."""
     first, good = jnp.ones(SIZE), jnp.zeros(SIZE)
     guard = new_guard(first)
     for loss in [*np.linspace(4, 0.01, 79), *[np.nan] * 11]:
         guard, _ = guard.after_step(float(loss), good, LEAST_WINDOW)
     assert guard.at_end(good)[1] is good
-    back = guard.at_end(jnp.full(SIZE, jnp.nan))[1]  # unless they have left the finite, unsaid
+    back = guard.at_end(jnp.full(SIZE, jnp.nan))[1]  # unless the parameters themselves are not finite
     np.testing.assert_array_equal(back, first)
 
 
@@ -184,7 +184,7 @@ def test_steps_do_not_vanish_where_nothing_helps():
 
 
 def test_after_an_error_in_a_new_stretch_the_old_best_does_not_return():
-    """As the new parameters may have other shapes."""
+    """The new parameters may have other shapes."""
     method = Descent(DescentConfig(steps=900, anew_at=500, raises_at=500))
     RAISED.clear()
     ticks = drive(method, *method.start())
@@ -198,7 +198,7 @@ def test_after_an_error_in_a_new_stretch_the_old_best_does_not_return():
 
 
 def test_thrown_by_the_last_step_of_a_window_it_is_not_thrown_again():
-    """Losses are of the parameters before a step, so none of a window has seen those after its last."""
+    """A loss is that of the parameters before its step, so no loss of a window is of those after its last."""
     good, bad = jnp.zeros(SIZE), jnp.ones(SIZE)
     guard = new_guard(good)
     now = good
@@ -241,7 +241,7 @@ def test_a_loss_that_becomes_another_begins_anew_and_returns_are_counted_on():
 
 
 def test_new_parameters_begin_anew():
-    """A loss that rises because parameters were replaced is not lost."""
+    """A loss that rises because parameters were replaced has not diverged."""
     ticks, infos = descended(anew_at=500, steps=800)
     assert float(infos[500]["loss"]) > 30
     assert ticks.run.guard.returns == 0
@@ -262,7 +262,8 @@ STRETCHES = {
 
 @pytest.mark.parametrize("name", STRETCHES)
 def test_long_stretches_of_usual_runs_are_guarded(name):
-    """(steps, views, steps of the last stretch): one that ends far above its least loss ends at its best."""
+    """For (steps, views, steps of the last stretch): a stretch that ends far above its lowest loss returns to
+    its best parameters."""
     total, views, stretch = STRETCHES[name]
     window, good, bad = window_of(total, views), jnp.zeros(SIZE), jnp.ones(SIZE)
     guard = new_guard(good)
@@ -278,7 +279,7 @@ def test_long_stretches_of_usual_runs_are_guarded(name):
 @settings(max_examples=10)
 @given(seed=st.integers(0, 2**31 - 1), noise=st.sampled_from([0.03, 0.3]))
 def test_noise_alone_is_no_loss(seed, noise):
-    """Twenty windows without a trend: the least of twenty means is below the others by chance alone."""
+    """Twenty windows without a trend: the lowest of twenty means is below the others by chance alone."""
     losses = 1 + noise * np.random.default_rng(seed).normal(size=20 * LEAST_WINDOW)
     params = jnp.zeros(SIZE)
     guard = new_guard(params)
@@ -292,7 +293,7 @@ def test_noise_alone_is_no_loss(seed, noise):
 @settings(max_examples=8)
 @given(seed=st.integers(0, 2**31 - 1), views=st.sampled_from([7, 150, 300, 500]))
 def test_one_bad_photograph_is_no_loss(seed, views):
-    """One that is 35 times as far off as the others, in passes over all, while the others improve."""
+    """In passes over all photographs, one has 35 times the loss of the others, while the others improve."""
     random = np.random.default_rng(seed)
     params, window = jnp.zeros(SIZE), window_of(5000, views)
     guard = new_guard(params)

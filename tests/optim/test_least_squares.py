@@ -1,4 +1,4 @@
-"""Least squares: agrees with scipy, stays on manifolds, and rejects what overflowed or is not a number."""
+"""Least squares agree with scipy, stay on manifolds, and reject moves that overflow or are not finite."""
 
 from functools import partial
 
@@ -43,7 +43,7 @@ def start(dtype=np.float32):
 
 
 def updated(step, params, batch):
-    """The first update."""
+    """Returns the result of the first update."""
     state = jax.jit(step.init)(params)
     return jax.jit(step.update)(params, state, batch, step=0, key=None)
 
@@ -114,7 +114,7 @@ def test_one_step_after_another_is_what_optimistix_does():
     batch = points()
     stepped, infos = scanned(least_squares_step(curve, SOLVERS["LM"]), start(), batch, 3)
     assert infos["accepted"].all()
-    # Its first iteration only evaluates, so four of its iterations are three of ours.
+    # Optimistix's first iteration only evaluates, so four of its iterations are three of ours.
     solved, info = solve(curve, start(), batch, solver=SOLVERS["LM"], max_steps=4)
     jax.tree.map(partial(np.testing.assert_allclose, rtol=1e-6), stepped, solved)
     assert not info["converged"]
@@ -122,7 +122,7 @@ def test_one_step_after_another_is_what_optimistix_does():
 
 
 def test_the_default_solver_ends_where_rounding_rejects_moves():
-    def rounded(params, batch, *, step, key):  # as images are, by their thresholds
+    def rounded(params, batch, *, step, key):  # as images are by their thresholds
         values = curve(params, batch, step=step, key=key)[0]["curve"]
         return values + jax.lax.stop_gradient(jnp.round(values * 1e3) / 1e3 - values), {}
 
@@ -282,7 +282,7 @@ def test_a_search_that_the_plan_ended_has_not_converged(damping):
 
 
 def test_a_start_that_is_not_a_number_is_reported_even_if_residuals_are_finite():
-    """For example a camera that is not finite sees nothing, so its image is finite."""
+    """For example, a camera that is not finite sees nothing, so its image is finite."""
 
     def residual(x, batch, *, step, key):
         return jnp.where(jnp.isfinite(x), x, 1.0), {}

@@ -51,7 +51,7 @@ def test_a_small_one_is_cloned_and_a_large_one_split():
     before = scene([0.05, 0.5, 0.05], slots=6)
     after, touched = densify(before, pulled(2.0, 3.0, 0.5, slots=6), jax.random.key(0), 6, **OPTIONS)
     np.testing.assert_array_equal(is_alive(after), [True] * 5 + [False])
-    # The hardest pulled, 1, takes the first vacant slot, 3; 0 takes slot 4.
+    # Gaussian 1 has the largest gradient and takes the first vacant slot, 3; Gaussian 0 takes slot 4.
     np.testing.assert_array_equal(touched, [False, True, False, True, True, False])
     for a, b in zip(jax.tree.leaves(after), jax.tree.leaves(before), strict=True):
         np.testing.assert_array_equal(a[jnp.array([0, 2, 4])], b[jnp.array([0, 2, 0])])

@@ -1,4 +1,4 @@
-"""Steps: they descend, they refuse what is not finite or overflowed, and they go through scan and vmap."""
+"""Steps descend, skip what is not finite or overflows, and work under scan and vmap."""
 
 import subprocess
 import sys
@@ -85,7 +85,7 @@ def test_a_gradient_that_is_not_finite_is_refused_though_its_loss_is(params):
 
 
 def test_a_gradient_too_large_to_be_squared_freezes_nothing(params):
-    """Its second moment would be infinite, and every later move 0, though each number is finite."""
+    """Its second moment would be infinite and every later update 0, though the gradient itself is finite."""
     step = gradient_step(
         lambda p, batch, *, step, key: (jnp.sum(p.a * batch), {}), per_field_adam({"a": 0.1})
     )
@@ -175,7 +175,7 @@ def test_a_rate_for_a_field_that_is_not_there_is_refused(params):
 
 
 def moved_by(optimizer, gradients):
-    """How far a sequence of gradients moves a parameter in all, and the state after it."""
+    """The updates of a parameter for a sequence of gradients, and the optimizer state after them."""
 
     def body(state, gradient):
         move, state = optimizer.update(gradient, state, jnp.zeros(()))
@@ -219,7 +219,7 @@ def test_all_finite_looks_into_every_leaf_and_keep_if_chooses_whole_trees():
 
 
 def test_memory_is_kept_between_calls():
-    """In a process of its own: the thresholds of malloc stay as they are until it ends."""
+    """In a process of its own, because the thresholds of malloc stay set until it ends."""
     program = (
         "import resource, numpy as np\n"
         "from gsjax import keep_freed_memory\n"

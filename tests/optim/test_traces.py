@@ -1,4 +1,4 @@
-"""Traces on disk: read back as they were, told apart, and done without where they cannot be kept."""
+"""Traces on disk: they are read back unchanged, told apart, and not used where they cannot be kept."""
 
 from dataclasses import dataclass, field
 from typing import NamedTuple
@@ -30,7 +30,7 @@ class Found(NamedTuple):
 
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
-    """Where traces are kept during this test, also those with this module's types."""
+    """The folder of traces during a test, in which functions and types of this module are kept too."""
     monkeypatch.setattr(traces, "_PACKAGE", __name__.split(".")[0])
     libraries = (*checkpoints._LIBRARIES, __name__.split(".")[0])
     monkeypatch.setattr(checkpoints, "_LIBRARIES", libraries)
@@ -42,7 +42,7 @@ def folder(tmp_path, monkeypatch):
 
 
 class Counted:
-    """Makes a function anew, as another process would, and counts how often it is traced."""
+    """Defines a function anew, as another process would, and counts how often it is traced."""
 
     def __init__(self):
         self.traced = 0

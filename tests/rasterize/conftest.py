@@ -1,4 +1,4 @@
-"""Small scenes, and annotations switched off where the package's own errors are tested."""
+"""Fixtures: small scenes, and the arguments of `gsjax.plan` taken from them."""
 
 import dataclasses
 

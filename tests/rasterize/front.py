@@ -18,7 +18,7 @@ TRAINED = (*GAUSSIANS, "viewmats", "Ks", "backgrounds")
 
 @partial(jax.jit, static_argnames="plan")
 def drawn(scene, weights, plan):
-    """Image with expected depth, its gradient against `weights`, and meta."""
+    """Returns the image with expected depth and alpha, the gradient for cotangent `weights`, and meta."""
 
     def objective(scene):
         image, alphas, meta = rasterization(**scene, width=plan.width, height=plan.height, plan=plan)
@@ -31,7 +31,7 @@ def drawn(scene, weights, plan):
 
 @partial(jax.jit, static_argnames="plan")
 def reference(scene, weights, plan):
-    """The same by the float64 reference, and the pixels that depend on rounding."""
+    """The same from the float64 reference, with a mask of pixels that depend on rounding instead of meta."""
 
     def objective(scene):
         result = rasterization_reference(
@@ -51,7 +51,7 @@ def reference(scene, weights, plan):
 
 
 def scene_before(width=33, height=17, num=12, focal=30.0, depth=2.0, seed=0):
-    """A camera at the origin looking along z, and Gaussians of a few pixels in front of it; float32."""
+    """A camera at the origin looking along z, and Gaussians a few pixels wide in front of it; float32."""
     rng = np.random.default_rng(seed)
     depths = depth * (1 + 0.5 * (rng.permutation(num) + 0.5) / num)
     pixels = rng.uniform([0, 0], [width, height], (num, 2)) - [width / 2, height / 2]

@@ -1,4 +1,4 @@
-"""Tile lists against brute force: no pair that a pixel sees is missing, and all are ordered by depth."""
+"""Tile lists against brute force: every pair that some pixel sees is listed, in order of depth."""
 
 import jax
 import jax.numpy as jnp
@@ -23,7 +23,7 @@ def binned(means, quats, scales, opacities):
 
 
 def seen_pairs(projected) -> set[tuple[int, int]]:
-    """(tile, Gaussian) with a pixel at which alpha reaches 1/255 by more than rounding."""
+    """The pairs (tile, Gaussian) for which alpha exceeds 1/255 by more than rounding at some pixel."""
     means, conics, opacities = (np.float64(a) for a in (*projected[:2], projected.opacities))
     x, y = np.meshgrid(np.arange(PLAN.width) + 0.5, np.arange(PLAN.height) + 0.5)
     tile = (y // PLAN.tile_size * PLAN.tiles_x + x // PLAN.tile_size).astype(int)
@@ -85,7 +85,7 @@ def test_a_count_beyond_int32_saturates_instead_of_wrapping():
 @pytest.mark.thorough
 def test_the_needed_capacity_is_counted_in_parts_whatever_the_plan_holds():
     rng = np.random.default_rng(0)
-    n, plan = 3000, Plan(70, 1600, capacity=0)  # 100 rows of tiles, and 240,000 rows of Gaussians
+    n, plan = 3000, Plan(70, 1600, capacity=0)  # 200 rows of tiles
     means = np.c_[rng.uniform(-0.5, 0.5, (n, 2)), rng.uniform(1, 2, n)]
     arrays = (means, rng.normal(size=(n, 4)), rng.uniform(5, 10, (n, 3)), rng.uniform(0.1, 1, n))
     K = jnp.array([[50.0, 0.0, 35.0], [0.0, 50.0, 800.0], [0.0, 0.0, 1.0]])

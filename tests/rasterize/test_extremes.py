@@ -1,4 +1,5 @@
-"""The limits of floats: finite images and gradients, equal to float64 where defined, or an error.
+"""Inputs at the limits of floats: images and gradients are finite and equal to float64 where that is
+defined, or there is an error.
 
 Poison in every input: test_poison.py and `python -m benchmarks.fuzz`. Figures: docs/numerics.md.
 """
@@ -29,9 +30,10 @@ from tests.rasterize.front import (
 
 
 def errors(scene, weights=None, plan=None, certain=None):
-    """(image, worst gradient) in float32 against float64, and meta; infinity where anything is not finite.
+    """Returns the errors of float32 against float64 (image, worst gradient), and meta.
 
-    Both relative to the array's largest value; a gradient below 1e-17 everywhere counts as equal.
+    Errors are relative to the array's largest value, and infinite where anything is not finite; a gradient
+    below 1e-17 everywhere counts as equal.
     """
     plan = plan_for() if plan is None else plan
     weights = cotangent(plan.width, plan.height) if weights is None else weights
@@ -46,7 +48,7 @@ def errors(scene, weights=None, plan=None, certain=None):
 
 
 def changed(**changes):
-    """A function that sets rows of a scene, given as name=(index, value)."""
+    """Returns a function that sets entries of a scene, given as name=(index, value)."""
 
     def change(scene):
         scene = {k: v.copy() for k, v in scene.items()}
@@ -66,7 +68,7 @@ def with_focal(focal, scene):
 
 
 FULL = {"means": (0, (0, 0, 1.5)), "scales": (0, 1e3)}
-# Cases that are drawn, with limits of the errors of image and gradients, relative to their maximum.
+# Cases that can be drawn, with the largest allowed errors of image and gradients, relative to their maximum.
 DRAWN = {
     "one that fills the frame": (changed(**FULL), 1e-5, 3e-4),
     "a hair in front of the near plane": (changed(means=(0, (0, 0, 0.0100001))), 1e-4, 1e-3),
@@ -126,7 +128,7 @@ def test_what_cannot_be_drawn_leaves_the_scene_without_it(name):
 
 @pytest.mark.thorough
 def test_a_needle_longer_than_float64_can_square_equals_itself_in_float64():
-    # The reference multiplies out the covariance, and 1e24 beside 1e-3 exceeds its precision too.
+    # Not against the reference, which multiplies out the covariance: 1e24 beside 1e-3 exceeds float64 too.
     scene = changed(scales=((0, 0), 1e12))(scene_before())
     got, gradient, meta = drawn(scene, cotangent(), plan_for())
     with jax.enable_x64(True):
@@ -168,7 +170,7 @@ def test_images_of_any_shape(width, height):
     scene = scene_before(width, height)
     image, gradient, meta = errors(scene, plan=plan_for(width, height))
     assert not bool(meta.overflow[0])
-    # At the ends of the tall one y is 68 times z.
+    # At the ends of the tall image y is 68 times z.
     assert image <= 1e-4
     assert gradient <= 1e-3
 
@@ -226,7 +228,7 @@ def test_logits_of_100_and_opacities_of_0_and_1_through_gaussians():
 
 @pytest.mark.thorough
 def test_more_than_2_to_the_31_pairs_saturate_and_are_an_error_for_a_plan():
-    num = 70_000  # by 32,400 tiles: 2.27e9
+    num = 70_000  # times 32,400 tiles: 2.27e9 pairs
     arrays = {
         "means": np.tile(np.float32([0, 0, 2]), (num, 1)),
         "quats": np.tile(np.float32([1, 0, 0, 0]), (num, 1)),
@@ -249,7 +251,7 @@ def test_more_than_2_to_the_31_pairs_saturate_and_are_an_error_for_a_plan():
 
 @pytest.mark.slow
 def test_889536_zero_quaternions_in_one_file(tmp_path):
-    # splat-transform #288: one real file contained this many. The reader counts them, and so does a call.
+    # splat-transform #288: one real file contained this many. Both the reader and the rasterizer count them.
     zeros, scene = 889_536, scene_before()
     few = gaussians_from_activated(*(scene[name] for name in GAUSSIANS))
     many = jax.tree.map(lambda a: np.concatenate([a, np.repeat(np.asarray(a)[:1], zeros, axis=0)]), few)

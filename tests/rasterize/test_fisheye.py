@@ -22,7 +22,7 @@ PLAN = Plan(WIDTH, HEIGHT, 4096, render_mode="RGB+ED", rasterize_mode="antialias
 
 
 def scene_around(dtype, num=24, widest=1.9, seed=0):
-    """Gaussians of a few degrees around a camera, from its axis to beyond a right angle."""
+    """Gaussians a few degrees wide around a camera, from its optical axis to more than 90 degrees off it."""
     rng = np.random.default_rng(seed)
     angle, turn = np.linspace(1e-3, widest, num), rng.uniform(0, 2 * np.pi, num)
     distance = rng.permutation(num) * 0.1 + 1.0
@@ -101,7 +101,7 @@ def test_image_and_gradients_are_those_of_the_reference(weights):
     assert (np.asarray(want[..., 4]) > 0.05).mean() > 0.3
     assert relative_error(np.asarray(got), want, certain[None, ..., None]) < 2e-5
     for name, slope in exact.items():
-        # Of the lens, sums over powers of up to 1.9^9 that cancel.
+        # The gradient of the lens sums terms of up to 1.9^9 that cancel.
         assert relative_error(np.asarray(slopes[name]), slope) < (1e-3 if name == "fisheye" else 2e-4), name
 
 
@@ -132,7 +132,7 @@ def test_each_argument_by_central_differences_and_jvp_against_vjp(name, weights)
 @pytest.mark.thorough
 @pytest.mark.parametrize("direction", [(0, 0, 1), (1e-30, 0, 1), (3e-4, -2e-4, 1), (0.09, 0.05, 1)])
 def test_gradients_near_the_axis_are_those_of_the_reference(direction, weights):
-    """Where the angle's own quotients are 0/0, and on both sides of the change from series to quotients."""
+    """On the axis, where the angle's quotients are 0/0, and on both sides of the switch from their series."""
     scene = scene_around(np.float32, 1) | {"means": 2 * np.float32(direction)[None]}
     slopes = drawn(scene, np.float32(weights))[1]
     with jax.enable_x64(True):
@@ -140,8 +140,8 @@ def test_gradients_near_the_axis_are_those_of_the_reference(direction, weights):
         near["means"][:, 0] += 1e-9  # the reference is not defined on the axis
         exact = expected(near, weights)[1]
     for name, slope in exact.items():
-        if np.abs(slope).max() > 1e-12:  # on the axis the lens has none
-            # Of K, sums of terms fifty times as large: 1.5e-4 to 2.5e-4 as processors order them.
+        if np.abs(slope).max() > 1e-12:  # on the axis the lens has no gradient
+            # The gradient of K sums terms fifty times as large: 1.5e-4 to 2.5e-4, as processors order them.
             assert relative_error(np.asarray(slopes[name]), slope) < (5e-4 if name == "Ks" else 2e-4), name
         else:
             assert np.abs(slopes[name]).max() <= 1e-12, name
@@ -150,7 +150,7 @@ def test_gradients_near_the_axis_are_those_of_the_reference(direction, weights):
 @pytest.mark.thorough
 @pytest.mark.parametrize("widest", [2.5, 3.1])
 def test_what_lies_behind_or_beyond_the_fold_is_not_seen(widest, weights):
-    """A lens whose polynomial turns back at 1 radian shows nothing from beyond it, and no NaN from behind."""
+    """A lens whose polynomial folds back at 1 radian shows nothing beyond it, and no NaN from behind."""
     scene = scene_around(np.float32, widest=widest)
     scene["fisheye"] = np.float32([[-1 / 3, 0, 0, 0]])
     (_, (_, meta)), slopes = drawn(scene, np.float32(weights))
@@ -174,7 +174,7 @@ def test_each_camera_has_its_own_lens(weights):
     together = image(scene | pair | {"fisheye": lenses})[0]
     for i in range(2):
         alone = image(scene | {"fisheye": lenses[i : i + 1]})[0]
-        # Two programs: XLA may round in another order (3e-6 of the depth with its default optimisation).
+        # Two programs: XLA may sum in another order (3e-6 of the depth with its default optimisation).
         np.testing.assert_allclose(together[i], alone[0], rtol=1e-5, atol=1e-6)
     assert np.abs(together[0] - together[1]).max() > 0.05
 

@@ -1,4 +1,4 @@
-"""Views that are listed once and painted: the rasterizer's own images, whole and in strips."""
+"""Frozen views: painting their stored lists gives the rasterizer's images, whole and in strips."""
 
 import dataclasses
 
@@ -23,7 +23,7 @@ def view_of(views, i):
 
 
 def drawn(scene, values, **options):
-    """Image and alphas of the rasterizer."""
+    """The rasterizer's images and alphas."""
     shapes = {k: scene[k] for k in ("means", "quats", "scales", "opacities", "viewmats", "Ks")}
     colors, alphas, _ = rasterization(**shapes, colors=values, width=33, height=17, **options)
     return np.asarray(colors), np.asarray(alphas)[..., 0]
@@ -107,7 +107,7 @@ def test_slopes_by_the_values_are_those_of_the_whole_rasterizer_and_nothing_else
             of_plan = dataclasses.replace(plan, capacity=4096)
             return (rasterization(**shapes, colors=values, width=33, height=17, plan=of_plan)[0][0] * w).sum()
 
-        # Gradients by everything, which use another backward pass, and by the values alone.
+        # Gradients with respect to everything, which use another backward pass, and to the values alone.
         both = jax.jit(jax.grad(whole, argnums=(0, 1), allow_int=True))(scene, values)[1]
         np.testing.assert_allclose(slope, both, atol=2e-4)
         np.testing.assert_allclose(jax.jit(jax.grad(whole, argnums=1))(scene, values), both, atol=2e-4)

@@ -1,4 +1,4 @@
-"""The kernels that draw on a GPU, run here on a CPU with one thread per tile, against XLA's loops."""
+"""The GPU kernels, run here on a CPU with one thread per tile, against XLA's loops."""
 
 from functools import partial
 

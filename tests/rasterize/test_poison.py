@@ -43,7 +43,7 @@ def weights():
 
 
 def busiest(scene, weights) -> int:
-    """The Gaussian whose removal changes the image most: a visible one."""
+    """The Gaussian whose opacity has the largest gradient, and which is therefore visible."""
     return int(jnp.abs(run(scene, weights)[1]["opacities"]).argmax())
 
 
@@ -58,7 +58,7 @@ def assert_finite(tree):
     [(name, value, 1) for name in PER_GAUSSIAN for value in (np.nan, np.inf, -np.inf)]
     + [(name, 1e38, 1) for name in ("quats", "scales", "colors", "features")]
     + [("quats", 0.0, 1), ("quats", TINY, 1), ("quats", 1e-7, 1), ("scales", 1e12, 1)]
-    # Not drawn because of their position or faintness: not counted.
+    # Not drawn because of their position or low opacity, and so not counted as culled.
     + [
         ("means", 1e38, 0),
         ("means", -1e38, 0),

@@ -26,7 +26,7 @@ def far_away(distance: float):
     got, gradient, meta = drawn(rounded, cotangent(), plan_for())
     assert all(np.isfinite(gradient[key]).all() for key in TRAINED)
     assert np.isfinite(got).all()
-    # Only the colours: an expected depth jumps from nothing to metres where a footprint ends.
+    # Only the colours: the expected depth jumps from 0 to metres at the edge of a footprint.
     return float(np.abs(meta.means2d - exact.means2d).max()), relative_error(got[..., :3], want[..., :3])
 
 

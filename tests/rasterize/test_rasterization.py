@@ -1,4 +1,4 @@
-"""What the public function draws: conventions, modes, backgrounds, roi, the smallest and emptiest scenes."""
+"""Images of the public function: conventions, modes, backgrounds, roi, and tiny or empty scenes."""
 
 from functools import partial
 
@@ -13,7 +13,7 @@ from gsjax.rasterize.reference import rasterization_reference
 
 IDENTITY = jnp.asarray(np.eye(4, dtype=np.float32)[None])
 K = jnp.array([[[10.0, 0.0, 8.0], [0.0, 10.0, 8.0], [0.0, 0.0, 1.0]]])
-PLAN = Plan(33, 17, 4096)  # of small scenes
+PLAN = Plan(33, 17, 4096)  # for the small scenes
 draw16 = jax.jit(
     partial(rasterization, viewmats=IDENTITY, Ks=K, width=16, height=16, plan=Plan(16, 16, 4096))
 )
@@ -36,7 +36,7 @@ def drawn(scene, **options):
 @partial(jax.jit, static_argnums=1)
 @partial(jax.grad, has_aux=True)
 def slopes(scene, plan):
-    """(gradient of a loss by everything, what was drawn)."""
+    """Returns the gradient of a loss with respect to everything, and (image, alphas, meta)."""
     image, alphas, meta = rasterization(**scene, width=33, height=17, plan=plan)
     return jnp.sum(image**2) + jnp.sum(alphas), (image, alphas, meta)
 
@@ -54,7 +54,7 @@ def test_pixel_centres_stand_at_half_x_right_y_down():
 
 
 def test_quaternions_are_wxyz():
-    # A needle along x, turned by 90 degrees about the viewing axis, stands upright.
+    # A needle along x, rotated by 90 degrees about the viewing axis, stands upright.
     half = np.sqrt(0.5)
     needle = one((0.0, 0.0, 1.0), (0.4, 0.02, 0.02), (half, 0.0, 0.0, half))
     alpha = np.asarray(draw16(**needle)[1])[0, ..., 0]
@@ -85,7 +85,7 @@ def test_opacity_0_and_1_at_their_ends_have_their_gradients():
         return draw16(**one((0, 0, 1)) | {"opacities": opacity[None]})[1].sum()
 
     at_end, inside, beyond = (brightness(np.float32(o)) for o in (1.0, 1.0 - 1e-3, 1.5))
-    np.testing.assert_allclose(at_end[1], inside[1], rtol=0.01)  # not halved, as with clip at its bound
+    np.testing.assert_allclose(at_end[1], inside[1], rtol=0.01)  # not halved, as by jnp.clip at its bound
     assert float(beyond[1]) == 0.0
     assert float(beyond[0]) == float(at_end[0])
 

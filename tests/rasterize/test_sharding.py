@@ -1,4 +1,4 @@
-"""Many devices give the same as one: four virtual ones, and two real processes over `jax.distributed`.
+"""Several devices give the same as one: four virtual ones, and two real processes over `jax.distributed`.
 
 The number of devices of a process is fixed when JAX starts, so this file is also the program that the tests
 start: it draws and trains with and without a mesh and prints the differences.
@@ -75,7 +75,7 @@ def place(scene: dict, mesh, **axes) -> dict:
 
 
 def train(draw, scene: dict, plan):
-    """One step of Adam: (parameters, their gradients, images, alphas, meta), and what was compiled."""
+    """One step of Adam: (parameters, their gradients, images, alphas, meta), and the compiled program."""
     constants = {name: a for name, a in scene.items() if a.dtype == bool}
     params = {name: a for name, a in scene.items() if name not in constants}
     adam = optax.adam(1e-2, eps=1e-3)

@@ -69,7 +69,7 @@ def entries(seed, length, num_lists):
 
 @given(st.integers(0, 2**32), st.sampled_from([0, 1, 17, 300]), st.sampled_from([0, 2**30]))
 def test_both_ways_list_what_a_loop_lists(seed, length, more_items):
-    """Also where an item and a list do not fit into 32 bits together."""
+    """Also where the indices of an item and a list do not fit into 32 bits together."""
     items, firsts, counts = entries(seed, length, 7)
     which = np.concatenate([np.arange(f, f + c) for f, c in zip(firsts, counts, strict=True)] or [[]])
     want = np.repeat(items, counts)[np.argsort(which, kind="stable")]
@@ -111,7 +111,7 @@ def test_vmap_repeats_every_row():
 
 @pytest.mark.parametrize("error", [MemoryError("no room"), KeyboardInterrupt("no room")])
 def test_a_failure_on_the_host_is_an_error_with_its_message(error):
-    """Ctrl-C too: an exception in a C callback is printed and lost, and the result would be garbage."""
+    """Also Ctrl-C: an exception in a C callback is printed and lost, so the result would be garbage."""
 
     def fail(keys, out):
         raise error
@@ -137,7 +137,7 @@ def test_without_the_interface_xla_sorts(monkeypatch):
 @pytest.mark.thorough
 @pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="cores cannot be chosen on this system")
 def test_one_core_does_not_hang():
-    # jax.pure_callback does: its only worker waits for a copy that the same worker would have to make.
+    # jax.pure_callback would: its only worker waits for a copy that the same worker would have to make.
     program = (
         "import os; os.sched_setaffinity(0, list(os.sched_getaffinity(0))[:1])\n"
         "import jax, jax.numpy as jnp\n"
@@ -152,7 +152,7 @@ def test_one_core_does_not_hang():
 
 @pytest.mark.thorough
 def test_a_program_may_end_while_a_call_is_under_way():
-    # The host's work needs the interpreter, which is gone by then unless the exit waits for it.
+    # The work on the host needs the interpreter, which is gone by then unless the exit waits for it.
     program = (
         "import jax, jax.numpy as jnp\n"
         "from gsjax.rasterize.sorting import argsort_keys\n"

@@ -1,4 +1,4 @@
-"""Tiles and the image that they make, for few and for many channels."""
+"""Tiles and the image they make up, for few and for many channels."""
 
 import dataclasses
 
@@ -51,7 +51,7 @@ def test_tiles_are_written_where_they_belong_and_none_where_there_is_none():
 
 @pytest.mark.thorough
 def test_many_channels_are_those_of_images_of_few(small, geometry):
-    """Values, and gradients by every argument. Nine tiles a camera, in batches of eight."""
+    """Values, and gradients with respect to every argument. Nine tiles per camera, in batches of eight."""
     size = 24, 17
     random, channels = np.random.default_rng(1), 2 * FEW_CHANNELS
     _, scene = small(3, width=size[0], height=size[1])

@@ -47,7 +47,7 @@ def initial(config, bounds=BOX, features=0):
 
 
 def moving(field, seed=1):
-    """The field with a random last layer, so that its gradients reach everything."""
+    """The field with a random last layer, so that gradients reach all its parameters."""
     rng = np.random.default_rng(seed)
     last = jax.tree.map(
         lambda leaf: jnp.asarray((0.3 * rng.normal(size=leaf.shape)).astype(leaf.dtype)), field.layers[-1]

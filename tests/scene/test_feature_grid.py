@@ -1,4 +1,5 @@
-"""The grid against its formula in loops; dense levels have no collisions, cells join, and NaN stays local."""
+"""The feature grid against its formula in plain loops; dense levels have no collisions, outputs are
+continuous across cells, and NaN stays local."""
 
 import itertools
 import re
@@ -17,7 +18,7 @@ from jax.test_util import check_grads
 from gsjax.scene.feature_grid import FeatureGridConfig, init_feature_grid, locate
 
 BOUNDS = np.array([[-1.0, 0.5, 2.0], [2.0, 1.5, 6.0]])
-# Of its levels 4, 6, 10 and 18, the last two do not fit 2^9 entries.
+# Its levels have resolutions 4, 6, 10 and 18; the last two do not fit into 2^9 entries.
 SMALL = FeatureGridConfig(
     levels=4, least_resolution=4, most_resolution=18, log2_entries=9, features=2, hidden=5, depth=1
 )
@@ -42,7 +43,7 @@ def some_grid(config=SMALL, outputs=3, seed=0):
 
 
 def some_positions(num, seed=0, beyond=0.0):
-    """Random positions in the box, extended by this share of its edges."""
+    """Random positions in the box, extended by the fraction `beyond` of its edges."""
     low, high = BOUNDS
     share = np.random.default_rng(seed).uniform(-beyond, 1 + beyond, (num, 3))
     return low + share * (high - low)
@@ -80,7 +81,8 @@ def by_loops(grid, position):
 
 class TestConfig:
     def test_resolutions_are_those_of_float64(self):
-        """Twice as fine every fifth level. In float32 the sixth is 31; of the finer ones float64 makes 63."""
+        """They double every five levels. Rounded down without a margin, the sixth would be 31 in float32,
+        and one of the finer grid 63 in float64."""
         expected = (16, 18, 21, 24, 27, 32, 36, 42, 48, 55, 64, 73, 84, 97, 111, 128)
         assert FeatureGridConfig().resolutions == expected
         finer = FeatureGridConfig(levels=31, least_resolution=16, most_resolution=1024)
@@ -240,7 +242,7 @@ class TestFormula:
 
 
 class TestEntries:
-    """Indices in 32 bits, as they are used: the hash overflows them."""
+    """Without x64, as in use: the hash overflows 32 bits."""
 
     def test_dense_levels_have_no_collisions(self):
         config = FeatureGridConfig(levels=3, least_resolution=3, most_resolution=7, log2_entries=9)
@@ -266,7 +268,7 @@ class TestEntries:
             rows = indices[:, level] - level * 2**log2
             assert rows.min() >= 0
             assert rows.max() < 2**log2
-            # The number of m entries that a uniform hash uses for n vertices.
+            # The number of entries that a uniform hash of as many vertices is expected to use.
             fair = 2**log2 * -np.expm1(-len(np.unique(rows, axis=0)) * 8 / 2**log2)
             assert len(np.unique(rows)) > 0.95 * fair
 
@@ -281,7 +283,7 @@ class TestEntries:
 
 @jax.jit
 def forward_and_back(arguments, tangents, cotangent):
-    """What a JVP and a VJP of a grid give."""
+    """Returns a JVP and a VJP of a grid."""
     _, pull = jax.vjp(values_at, *arguments)
     return jax.jvp(values_at, arguments, tangents)[1], pull(cotangent)
 
@@ -290,7 +292,7 @@ class TestDerivatives:
     @pytest.mark.thorough
     @pytest.mark.usefixtures("x64")
     def test_by_everything_against_finite_differences(self):
-        """Away from faces of cells and from ReLU's kink, which have only one-sided derivatives."""
+        """Away from the faces of cells and the kink of ReLU, which have only one-sided derivatives."""
         config = FeatureGridConfig(2, 4, 10, 9, features=2, hidden=3)
         grid = some_grid(config, outputs=2)
         positions = some_positions(4, seed=3)

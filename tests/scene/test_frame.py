@@ -1,4 +1,4 @@
-"""Frames of bytes and of floats are the same to all that takes a frame."""
+"""Frames of 8-bit images give the same results as frames of floats."""
 
 import jax.numpy as jnp
 import numpy as np

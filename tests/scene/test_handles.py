@@ -29,7 +29,7 @@ def means_and_turns(gaussians, weights, quats, translations, centers, blend):
 
 
 def made_up(seed, num=7, parts=3, most=2.0):
-    """Random Gaussians, weights, centres and a pose; handles turn by at most `most` radians."""
+    """Random Gaussians, weights, centres and a pose; handles rotate by at most `most` radians."""
     rng = np.random.default_rng(seed)
     shapes = ((num, 3), (num, 4), (num, 3), (num,), (num, 1, 3))
     gaussians = Gaussians(*(jnp.asarray(rng.normal(size=shape)) for shape in shapes))
@@ -51,7 +51,7 @@ def rotated(gaussians):
 
 
 def by_handle(p, means, centers, pose):
-    """The formula of the paper for one handle, in numpy."""
+    """The paper's formula for one handle, in numpy."""
     R = Rotation.from_quat(np.asarray(pose.quats[p]), scalar_first=True).as_matrix()
     return (means - centers[p]) @ R.T + centers[p] + pose.translations[p], R
 
@@ -70,7 +70,7 @@ class TestLaws:
 
     @given(seed=seeds)
     def test_handles_that_move_as_one_need_no_weights(self, blend, seed):
-        """The same motion of the world, expressed about three centres."""
+        """The same rigid motion, expressed about three centres."""
         gaussians, weights, centers, pose = made_up(seed, most=3.1)
         quats, translations = np.asarray(pose.quats), np.asarray(pose.translations)
         R = Rotation.from_quat(quats[0], scalar_first=True).as_matrix()
@@ -115,7 +115,7 @@ class TestLaws:
 
     @pytest.mark.thorough
     def test_handles_that_look_opposite_ways_give_numbers(self, blend):
-        """Half a turn apart and with equal weights, no rotation between them is preferred."""
+        """180 degrees apart and with equal weights, no rotation between them is preferred."""
         gaussians, _, centers, pose = made_up(1)
         opposite = np.eye(4)[[0, 1, 3]]
         weights = np.tile([0.5, 0.5, 0.0], (7, 1))

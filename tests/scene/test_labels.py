@@ -14,7 +14,7 @@ K = intrinsics(40.0, WIDTH, HEIGHT)
 
 
 def box_before_wall():
-    """A view in which label 1, at 1 m, stands before a wall at 2 m."""
+    """Depth and mask of a view: a box with label 1, at 1 m, in front of a wall at 2 m."""
     depth, mask = np.full((HEIGHT, WIDTH), 2.0), np.zeros((HEIGHT, WIDTH), np.int32)
     depth[8:16, 10:20], mask[8:16, 10:20] = 1.0, 1
     return depth, mask
@@ -43,7 +43,7 @@ def test_labels_do_not_bleed_across_an_occlusion_edge():
     depth, mask = box_before_wall()
     points, _ = points_from_rgbd(np.zeros((HEIGHT, WIDTH, 3)), depth, np.eye(4), K)
     np.testing.assert_array_equal(lift_labels(points, mask, depth, np.eye(4), K), mask.ravel())
-    # The same surfaces as another camera would have sampled them: the wall takes nothing from the box.
+    # The same surfaces as another camera would have sampled them: no label of the box reaches the wall.
     shifted = points + np.array([0.013, 0.017, 0.0])
     labels = lift_labels(shifted, mask, depth, np.eye(4), K)
     assert not (labels[points[:, 2] > 1.5] == 1).any()
@@ -78,7 +78,8 @@ def sheet(origin, one, other, spacing=0.005):
 
 
 def box_on_table():
-    """A box of 10 cm: its top and one side, and the table in front of that side; sheets by name."""
+    """Points and normals of the top (0) and one side (1) of a 10 cm box and of the table (2) in front of that
+    side, and the number of each point's sheet."""
     top = sheet([0, 0, 0.1], [0.1, 0, 0], [0, 0.1, 0])
     side = sheet([0, 0, 0.005], [0.1, 0, 0], [0, 0, 0.09])  # its normal is -y: outward
     table = sheet([0, -0.3, 0], [0.1, 0, 0], [0, 0.295, 0])
@@ -93,7 +94,7 @@ def test_a_hidden_side_takes_the_label_of_its_box_and_not_of_the_table():
     hidden = (names == 1) | ((names == 2) & (points[:, 1] > -0.02))
     labels = inherit_labels(points, np.where(hidden, -1, truth), normals)
     np.testing.assert_array_equal(labels, truth)
-    # By straight distance alone the side's lower half would be the table's.
+    # By Euclidean distance alone the lower half of the side would take the table's label.
     flat = inherit_labels(points, np.where(hidden, -1, truth), 0 * normals + [0, 0, 1.0])
     assert (flat[names == 1] == 0).mean() > 0.3
 
@@ -124,7 +125,7 @@ def test_there_must_be_one_label_and_one_normal_per_point():
 def test_known_labels_are_kept_and_no_label_is_invented(seed):
     rng = np.random.default_rng(seed)
     points = 0.05 * rng.normal(size=(40, 3))
-    points[rng.random(40) < 0.1] = points[0]  # coinciding points are no distance apart
+    points[rng.random(40) < 0.1] = points[0]  # coinciding points
     normals = rng.normal(size=(40, 3))
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     labels = rng.integers(-1, 4, 40)

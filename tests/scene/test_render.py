@@ -1,4 +1,4 @@
-"""Rendering a scene in cameras: the same as calling the public rasterizer by hand."""
+"""Rendering a scene in cameras: equal to calling the public rasterizer directly."""
 
 from dataclasses import replace
 
@@ -108,7 +108,7 @@ def test_visibility_gives_each_camera_its_own_opacities(scene, cameras):
         np.testing.assert_allclose(together.colors[c], alone.colors[0], atol=2e-6)
         expected = (
             alone.depths[0] * alone.alphas[0]
-        )  # not divided by alpha: rounding grows where that is small
+        )  # not divided by alpha, since rounding errors grow where alpha is small
         np.testing.assert_allclose(together.depths[c] * together.alphas[c], expected, atol=3e-6)
         np.testing.assert_allclose(together.alphas[c], alone.alphas[0], atol=2e-6)
 

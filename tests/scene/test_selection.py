@@ -1,4 +1,4 @@
-"""Parts of a scene taken out, tinted, shifted: what is selected changes, and nothing else."""
+"""Parts of a scene removed, hidden, tinted or shifted: the selected Gaussians change, and no others."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -67,7 +67,7 @@ def test_tinted_has_the_colour_on_average_and_keeps_shades(scene):
 
 @pytest.mark.parametrize("dark", [0.0, 0.004])
 def test_black_objects_are_tinted_too(scene, dark):
-    """Shades of almost black are noise."""
+    """The shades of an almost black object are noise and are not kept."""
     random = np.random.default_rng(1)
     black = rgb_to_sh0(jnp.asarray(random.uniform(0, 1, (20, 3)) * dark))[:, None]
     found = tinted(eqx.tree_at(lambda g: g.sh0, scene, black), SELECTED, jnp.array([0.1, 0.9, 0.2]))

@@ -1,4 +1,4 @@
-"""Planes, sinusoids and voxels of position and time: their values and gradients."""
+"""Encodings of position and time by planes, sinusoids and voxels: values and gradients."""
 
 import jax
 import jax.numpy as jnp
