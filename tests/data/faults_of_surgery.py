@@ -34,7 +34,7 @@ TOOL = np.where(np.arange(WIDTH) < WIDTH // 4, 255, 0).astype(np.uint8) * np.one
 
 
 def every(folder: str, edit: Callable[[np.ndarray], np.ndarray]) -> Damage:
-    """Edits each picture of a folder."""
+    """Damage that edits each picture in a folder."""
 
     def damage(root: Path) -> None:
         for path in (root / folder).iterdir():
