@@ -12,7 +12,7 @@ from tests.data import dots
 
 
 def write_exr(path: Path, **channels: np.ndarray) -> None:
-    """A compressed OpenEXR picture with channels of these names."""
+    """Writes a compressed OpenEXR picture with the named channels."""
     import OpenEXR
 
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -21,12 +21,12 @@ def write_exr(path: Path, **channels: np.ndarray) -> None:
 
 
 def write_record3d(root: Path, sequence: Sequence, depth_size: tuple[int, int], fps: float = 10.0) -> None:
-    """What the cameras of a sequence see in its first frame, as the frames of one camera that moves.
+    """Writes what all cameras of a sequence see in its first frame, as the frames of one moving camera.
 
     Args:
         root: the folder.
         sequence: a recording by many cameras, with depth.
-        depth_size: width and height of the depth, pixels, of which the pictures' are multiples.
+        depth_size: width and height of the depth in pixels; the pictures' size must be a multiple of it.
         fps: frames per second.
     """
     across, down = sequence.width // depth_size[0], sequence.height // depth_size[1]

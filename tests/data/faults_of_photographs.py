@@ -57,8 +57,8 @@ TRANSFORMS = (
     Fault("cut off", cut("transforms.json"), ("transforms.json",)),
     Fault("no frames", change("transforms.json", lambda m: m.update(frames=[])), ("transforms.json",)),
     Fault("NaN in a pose", frame("transforms.json", 1, transform_matrix=NAN), ("images/1.png",)),
-    Fault("pose is no rotation", frame("transforms.json", 1, transform_matrix=SKEW), ("frame 1", "1.png")),
-    Fault("wrong shape of a pose", frame("transforms.json", 1, transform_matrix=[1, 2]), ("frame 1",)),
+    Fault("pose is not a rotation", frame("transforms.json", 1, transform_matrix=SKEW), ("frame 1", "1.png")),
+    Fault("pose of the wrong shape", frame("transforms.json", 1, transform_matrix=[1, 2]), ("frame 1",)),
     Fault("NaN as focal length", frame("transforms.json", 2, fl_x=float("nan")), ("frame 2",)),
     Fault("no focal length", change("transforms.json", lambda m: m.pop("fl_x")), ("transforms.json",)),
     Fault("unknown camera model", frame("transforms.json", 0, camera_model="X"), ("frame 0",)),
@@ -68,9 +68,9 @@ TRANSFORMS = (
         ("transforms.json",),
     ),
     Fault("photograph listed twice", frame("transforms.json", 1, file_path="./images/0.png"), ("images/0",)),
-    Fault("key that is not read", frame("transforms.json", 1, normal_path="n.png"), ("normal_path",)),
+    Fault("unknown key", frame("transforms.json", 1, normal_path="n.png"), ("normal_path",)),
     Fault(
-        "depth_path without its unit",
+        "depth_path without a unit",
         frame("transforms.json", 1, depth_path="depth/1.png"),
         ("transforms.json", "integer_depth_scale"),
     ),
@@ -79,7 +79,7 @@ TRANSFORMS = (
     Fault("image cut off", cut("images/1.png"), ("images/1.png",)),
     Fault("HEIC", holds("images/1.png", HEIC), ("images/1.png",)),
     Fault("not an image", holds("images/1.png", "text"), ("images/1.png",)),
-    Fault("wrong shape of a photograph", drawn("images/1.png", picture(1, 24, 32)), ("frame 1",)),
+    Fault("photograph of the wrong size", drawn("images/1.png", picture(1, 24, 32)), ("frame 1",)),
     Fault("depth image missing", gone("depth/1.png"), ("depth/1.png",)),
     Fault("8-bit depth", drawn("depth/1.png", picture(0)[..., 0]), ("depth/1.png",)),
     Fault("mask cut off", cut("masks/2.png"), ("masks/2.png",)),
@@ -104,7 +104,7 @@ def build_blender(root: Path) -> None:
 BLENDER = (
     Fault("not JSON", holds("transforms_test.json", b"\x93NUMPY"), ("transforms_test.json",)),
     Fault("no frames", change("transforms_train.json", lambda m: m.update(frames=[])), ("_train.json",)),
-    Fault("angle not a number", frame("transforms_train.json", 0, camera_angle_x="0.8"), ("frame 0",)),
+    Fault("angle is not a number", frame("transforms_train.json", 0, camera_angle_x="0.8"), ("frame 0",)),
     Fault("angle of 0", frame("transforms_test.json", 1, camera_angle_x=0), ("_test.json, frame 1",)),
     Fault("NaN in a pose", frame("transforms_train.json", 1, transform_matrix=NAN), ("train/r_1",)),
     Fault("photograph missing", gone("train/r_1.png"), ("train/r_1",)),
@@ -149,13 +149,17 @@ TEXT = {name: f"sparse/0/{name}.txt" for name in ("cameras", "images", "points3D
 BINARY = {name: f"sparse/0/{name}.bin" for name in ("cameras", "images", "points3D")}
 COLMAP_TEXT = (
     Fault("list missing", gone(TEXT["images"]), ("sparse/0/images.txt",)),
-    Fault("no camera", holds(TEXT["cameras"], "# none\n"), ("cameras.txt",)),
-    Fault("no photograph", holds(TEXT["images"], "# none\n"), ("images.txt",)),
+    Fault("no cameras", holds(TEXT["cameras"], "# none\n"), ("cameras.txt",)),
+    Fault("no photographs", holds(TEXT["images"], "# none\n"), ("images.txt",)),
     Fault("line cut off", cut(TEXT["cameras"], 0.2), ("cameras.txt, line 1",)),
     Fault("number missing", swap(TEXT["cameras"], " 12.0", ""), ("cameras.txt, line 1",)),
-    Fault("words for numbers", swap(TEXT["images"], "1 1 0 0 0", "1 1 0 zero 0"), ("images.txt, line 3",)),
     Fault(
-        "model unknown to OpenCV",
+        "words instead of numbers",
+        swap(TEXT["images"], "1 1 0 0 0", "1 1 0 zero 0"),
+        ("images.txt, line 3",),
+    ),
+    Fault(
+        "camera model unknown to OpenCV",
         swap(TEXT["cameras"], "PINHOLE 32 24", "FOV 32 24 30.0"),
         ("cameras.txt",),
     ),
@@ -174,15 +178,15 @@ COLMAP_TEXT = (
     Fault("photograph missing", gone("images/b.png"), ("DATA/images", "b.png")),
     Fault("all photographs missing", gone(*(f"images/{n}" for n in NAMES)), ("DATA/images",)),
     Fault("image cut off", cut("images/b.png"), ("images/b.png",)),
-    Fault("wrong shape of a photograph", drawn("images/b.png", picture(1, 24, 32)), ("images/b.png",)),
+    Fault("photograph of the wrong size", drawn("images/b.png", picture(1, 24, 32)), ("images/b.png",)),
 )
 COLMAP_BINARY = (
     Fault("list missing", gone(BINARY["images"]), ("sparse/0/images.bin",)),
     *(Fault(f"{name}.bin is cut off", cut(BINARY[name], 0.9), (f"{name}.bin",)) for name in BINARY),
     Fault("another format", holds(BINARY["images"], b"SQLite format 3\0" + bytes(99)), ("images.bin",)),
-    Fault("no camera", holds(BINARY["cameras"], bytes(8)), ("cameras.bin",)),
-    Fault("no photograph", holds(BINARY["images"], bytes(8)), ("images.bin",)),
-    Fault("model unknown to OpenCV", patch(BINARY["cameras"], 12, b"\x63"), ("cameras.bin",)),
+    Fault("no cameras", holds(BINARY["cameras"], bytes(8)), ("cameras.bin",)),
+    Fault("no photographs", holds(BINARY["images"], bytes(8)), ("images.bin",)),
+    Fault("camera model unknown to OpenCV", patch(BINARY["cameras"], 12, b"\x63"), ("cameras.bin",)),
     Fault("NaN in a pose", patch(BINARY["images"], 12, struct.pack("<d", np.nan)), ("images.bin", "a.png")),
     Fault(
         "quaternion not normalised",
@@ -230,7 +234,7 @@ ROWS = (
     Fault("not an array", holds("poses_bounds.npy", "1 2 3\n"), ("poses_bounds.npy",)),
     Fault("pickled objects", array("poses_bounds.npy", lambda a: a.astype(object)), ("poses_bounds.npy",)),
     Fault("wrong shape", array("poses_bounds.npy", lambda a: a[:, :16]), ("poses_bounds.npy",)),
-    Fault("no row", array("poses_bounds.npy", lambda a: a[:0]), ("poses_bounds.npy",)),
+    Fault("no rows", array("poses_bounds.npy", lambda a: a[:0]), ("poses_bounds.npy",)),
     Fault(
         "NaN", array("poses_bounds.npy", lambda a: a * [1, np.nan, *[1] * 15]), ("poses_bounds.npy", "row 0")
     ),
@@ -241,8 +245,8 @@ LLFF = (
     *ROWS,
     Fault("photograph missing", gone("images/b.png"), ("poses_bounds.npy", "DATA/images")),
     Fault("image cut off", cut("images/b.png"), ("images/b.png",)),
-    Fault("another one in HEIC", holds("images/d.HEIC", HEIC), ("images", "d.HEIC")),
-    Fault("all in HEIC", all_in_heic, ("images", "a.HEIC")),
+    Fault("another photograph in HEIC", holds("images/d.HEIC", HEIC), ("images", "d.HEIC")),
+    Fault("all photographs in HEIC", all_in_heic, ("images", "a.HEIC")),
 )
 DYNERF = (
     Fault("cut off", cut("poses_bounds.npy"), ("poses_bounds.npy",)),

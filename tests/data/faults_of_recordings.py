@@ -51,10 +51,10 @@ def build_open3d(root: Path) -> None:
 OPEN3D = (
     Fault("trajectory cut off", cut("trajectory.log", 0.5), ("trajectory.log",)),
     Fault("no numbers", holds("trajectory.log", "none\n"), ("trajectory.log",)),
-    Fault("no pose", holds("trajectory.log", ""), ("trajectory.log",)),
+    Fault("no poses", holds("trajectory.log", ""), ("trajectory.log",)),
     Fault("NaN in a pose", swap("trajectory.log", "1.0", "nan"), ("00000.png",)),
-    Fault("pose is no rotation", swap("trajectory.log", "1.0", "3.0"), ("frame 0", "trajectory.log")),
-    Fault("no image", gone(*(f"image/{i:05d}.png" for i in range(3))), ("DATA",)),
+    Fault("pose is not a rotation", swap("trajectory.log", "1.0", "3.0"), ("frame 0", "trajectory.log")),
+    Fault("no images", gone(*(f"image/{i:05d}.png" for i in range(3))), ("DATA",)),
     Fault("depth image missing", gone("depth/00001.png"), ("00001.png",)),
     Fault("depth image cut off", cut("depth/00001.png"), ("depth/00001.png",)),
     Fault("8-bit depth", drawn("depth/00001.png", picture(0)[..., 0]), ("depth/00001.png",)),
@@ -74,11 +74,11 @@ def build_tum(root: Path) -> None:
 TUM = (
     Fault("list missing", gone("depth.txt"), ("depth.txt",)),
     Fault("line cut off", cut("rgb.txt", 0.65), ("rgb.txt", "line 2")),
-    Fault("no text", holds("groundtruth.txt", b"\xff\xfe\x80"), ("groundtruth.txt",)),
-    Fault("no pose", holds("groundtruth.txt", "# none\n"), ("groundtruth.txt",)),
+    Fault("not text", holds("groundtruth.txt", b"\xff\xfe\x80"), ("groundtruth.txt",)),
+    Fault("no poses", holds("groundtruth.txt", "# none\n"), ("groundtruth.txt",)),
     Fault("NaN in a pose", swap("groundtruth.txt", "1.0 1", "1.0 nan"), ("groundtruth.txt",)),
     Fault("quaternion not normalised", swap("groundtruth.txt", " 1\n", " 2\n"), ("groundtruth.txt",)),
-    Fault("isolated stamp", swap("depth.txt", "0.0 ", "50.0 "), ("DATA",)),
+    Fault("isolated timestamp", swap("depth.txt", "0.0 ", "50.0 "), ("DATA",)),
     Fault("clocks without overlap", holds("depth.txt", "50.0 depth/0.png\n51.0 depth/1.png\n"), ("DATA",)),
     Fault("image missing", gone("rgb/1.png"), ("rgb.txt",)),
     Fault("all images missing", gone("rgb/0.png", "rgb/1.png"), ("rgb.txt",)),
@@ -99,11 +99,11 @@ def build_seven_scenes(root: Path) -> None:
 POSE = "frame-000001.pose.txt"
 SEVEN_SCENES = (
     Fault("pose cut off", cut(POSE), (POSE,)),
-    Fault("pose of words", holds(POSE, "one two\n"), (POSE,)),
+    Fault("words in a pose", holds(POSE, "one two\n"), (POSE,)),
     Fault("NaN in a pose", lambda root: np.savetxt(root / POSE, NAN), ("frame-000001",)),
-    Fault("pose is no rotation", lambda root: np.savetxt(root / POSE, SKEW), (POSE,)),
+    Fault("pose is not a rotation", lambda root: np.savetxt(root / POSE, SKEW), (POSE,)),
     Fault("image missing", gone("frame-000001.color.png"), ("frame-000001",)),
-    Fault("no pose", gone("frame-000000.pose.txt", POSE), ("DATA",)),
+    Fault("no poses", gone("frame-000000.pose.txt", POSE), ("DATA",)),
     Fault("depth image cut off", cut("frame-000001.depth.png"), ("frame-000001.depth.png",)),
     Fault(
         "wrong intrinsics",
@@ -121,29 +121,31 @@ CAMERA, GT = "scene_camera.json", "scene_gt.json"
 BOP = (
     Fault("not JSON", holds(CAMERA, b"\x80\x04"), (CAMERA,)),
     Fault("cut off", cut(GT), (GT,)),
-    Fault("no frame", holds(CAMERA, "{}"), ("DATA",)),
-    Fault("frame that is no number", change(CAMERA, lambda c: c.update(first=c.pop("0"))), (CAMERA, "first")),
+    Fault("no frames", holds(CAMERA, "{}"), ("DATA",)),
+    Fault(
+        "frame that is not a number",
+        change(CAMERA, lambda c: c.update(first=c.pop("0"))),
+        (CAMERA, "first"),
+    ),
     Fault("K of 8 numbers", change(CAMERA, lambda c: c["1"]["cam_K"].pop()), (CAMERA, "'1'")),
     Fault("focal length of 0", change(CAMERA, lambda c: c["1"].update(cam_K=[0] * 9)), (CAMERA, "frame 1")),
     Fault("depth_scale of 0", change(CAMERA, lambda c: c["0"].update(depth_scale=0)), (CAMERA, "'0'")),
     Fault(
-        "NaN in a pose of the camera",
+        "NaN in a camera pose",
         change(CAMERA, lambda c: c["1"].update(cam_t_w2c=[NAN[0][0]] * 3)),
         (CAMERA,),
     ),
     Fault(
-        "pose of an object is no rotation",
+        "object pose is not a rotation",
         change(GT, lambda g: g["1"][0].update(cam_R_m2c=[1] * 9)),
         (GT, "frame 1"),
     ),
     Fault(
-        "no poses of the camera",
+        "no camera poses",
         change(CAMERA, lambda c: [v.pop("cam_R_w2c") for v in c.values()]),
         (CAMERA,),
     ),
-    Fault(
-        "frame without a pose of the camera", change(CAMERA, lambda c: c["1"].pop("cam_R_w2c")), ("000001",)
-    ),
+    Fault("frame without a camera pose", change(CAMERA, lambda c: c["1"].pop("cam_R_w2c")), ("000001",)),
     Fault("several scenes", lambda root: build_bop(root / "000002") or (root / CAMERA).unlink(), ("000002",)),
     Fault(
         "several cameras", lambda root: (root / CAMERA).rename(root / "scene_camera_rgb.json"), ("_rgb.json",)
@@ -168,19 +170,19 @@ def build_paris(root: Path) -> None:
 
 END = "end/camera_train.json"
 PARIS = (
-    Fault("no other state", gone(END), (END,)),
+    Fault("no second state", gone(END), (END,)),
     Fault("not JSON", holds(END, b"\x80\x04"), (END,)),
     Fault("cut off", cut(END), (END,)),
     Fault("no K", change(END, lambda c: c.pop("K")), (END, "'K'")),
     Fault("NaN as focal length", change(END, lambda c: c["K"][0].__setitem__(0, NAN[0][0])), (END,)),
-    Fault("wrong shape of a pose", change(END, lambda c: c["0001"].pop()), (END, "'0001'")),
+    Fault("pose of the wrong shape", change(END, lambda c: c["0001"].pop()), (END, "'0001'")),
     Fault("NaN in a pose", change(END, lambda c: c.update({"0001": NAN})), ("0001",)),
-    Fault("pose is no rotation", change(END, lambda c: c.update({"0001": SKEW})), (END, "0001")),
+    Fault("pose is not a rotation", change(END, lambda c: c.update({"0001": SKEW})), (END, "0001")),
     Fault("all images missing", gone("end/train/0000.png", "end/train/0001.png"), ("end/train",)),
     Fault("image missing", gone("end/train/0001.png"), ("0001",)),
     Fault("image cut off", cut("end/train/0001.png"), ("end/train/0001.png",)),
     Fault("wrong size", drawn("end/train/0001.png", picture(0, 16, 12)), ("end/train/0001.png",)),
-    Fault("no name in common", change(END, lambda c: [c.pop(k) for k in ("0000", "0001")]), ("DATA",)),
+    Fault("no names in common", change(END, lambda c: [c.pop(k) for k in ("0000", "0001")]), ("DATA",)),
     Fault("depth image missing", gone("end/train/depth/0001.png"), ("depth/0001.png",)),
     Fault(
         "joint without an axis", change("trans.json", lambda t: t["trans_info"].pop("axis")), ("trans.json",)
@@ -211,9 +213,9 @@ def entry(key: str, value: object) -> Damage:
 
 PANOPTIC = (
     Fault("not JSON", holds("train_meta.json", b"\x80\x04"), ("train_meta.json",)),
-    Fault("no camera", change("train_meta.json", lambda m: m.update(cam_id=[[], []])), ("train_meta.json",)),
+    Fault("no cameras", change("train_meta.json", lambda m: m.update(cam_id=[[], []])), ("train_meta.json",)),
     Fault("NaN in a pose", entry("w2c", NAN), ("train_meta.json", "frame 1")),
-    Fault("wrong shape of a pose", entry("w2c", [1, 2]), ("train_meta.json",)),
+    Fault("pose of the wrong shape", entry("w2c", [1, 2]), ("train_meta.json",)),
     Fault("focal length of 0", entry("k", np.diag([0, 1, 1]).tolist()), ("train_meta.json", "frame 1")),
     Fault("image missing", gone("ims/1/000001.png"), ("ims/1/000001.png",)),
     Fault("image cut off", cut("ims/1/000001.png"), ("ims/1/000001.png",)),
@@ -252,25 +254,25 @@ EXR, META = "depth/1.exr", "metadata.json"
 RECORD3D = (
     Fault("metadata missing", gone(META), (META,)),
     Fault("metadata cut off", cut(META), (META,)),
-    Fault("metadata are a list", holds(META, "[]"), (META,)),
+    Fault("metadata is a list", holds(META, "[]"), (META,)),
     Fault("no poses", change(META, lambda m: m.pop("poses")), (META, "poses")),
-    Fault("poses of another form", meta("poses", [[1, 2], [3]]), (META, "poses")),
+    Fault("malformed poses", meta("poses", [[1, 2], [3]]), (META, "poses")),
     Fault("quaternion not normalised", in_frame("poses", [0, 0, 0, 2, 0, 0, 0]), (META, "frame 1")),
     Fault("NaN in a pose", in_frame("poses", [np.nan] * 7), ("DATA",)),
-    Fault("poses all zero, as by the front camera", meta("poses", [[0] * 7] * 3), ("DATA",)),
+    Fault("all poses zero, as with the front camera", meta("poses", [[0] * 7] * 3), ("DATA",)),
     Fault("more pictures than poses", change(META, lambda m: m["poses"].pop()), ("DATA",)),
-    Fault("no size", change(META, lambda m: m.pop("w")), (META, "w")),
+    Fault("no image size", change(META, lambda m: m.pop("w")), (META, "w")),
     Fault("times that do not increase", in_frame("frameTimestamps", 0.0), ("DATA",)),
     Fault("depth missing", gone(EXR), ("DATA",)),
     Fault("depth cut off", cut(EXR), (EXR,)),
     Fault("depth in another format", holds(EXR, b"PK\3\4"), (EXR,)),
     Fault("depth that claims a huge size", claims_size(100_000), (EXR,)),
-    Fault("depth of integers", lambda root: write_exr(root / EXR, R=np.ones((12, 16), np.uint32)), (EXR,)),
-    Fault("depth of another shape", lambda r: write_exr(r / EXR, R=np.ones((16, 12), np.float32)), (EXR,)),
+    Fault("integer depth", lambda root: write_exr(root / EXR, R=np.ones((12, 16), np.uint32)), (EXR,)),
+    Fault("depth of the wrong shape", lambda r: write_exr(r / EXR, R=np.ones((16, 12), np.float32)), (EXR,)),
     Fault("image missing", gone("rgb/1.png"), ("DATA",)),
     Fault("image cut off", cut("rgb/1.png"), ("rgb/1.png",)),
     Fault("wrong size", drawn("rgb/1.png", picture(0, 16, 12)), ("rgb/1.png",)),
-    Fault("pictures turned by 90 degrees", turned, ("rgb/0.png",)),
+    Fault("pictures rotated by 90 degrees", turned, ("rgb/0.png",)),
 )
 
 
@@ -309,11 +311,11 @@ REALSENSE = (
     Fault("cut off", cut(BAG), (BAG,)),
     Fault("no depth", without(f"{DEPTH}/image/data"), (BAG, "Depth_0")),
     Fault("no intrinsics", without(f"{COLOR}/info/camera_info"), (BAG, "Color_0")),
-    Fault("no places of the cameras", without(f"{COLOR}/tf/0", f"{DEPTH}/tf/0"), (BAG, "tf/0")),
+    Fault("no camera poses", without(f"{COLOR}/tf/0", f"{DEPTH}/tf/0"), (BAG, "tf/0")),
     Fault("compressed colour", colored("MJPEG", 3), (BAG,)),
-    Fault("lines that are too short", colored("rgb8", 2), (BAG,)),
+    Fault("rows that are too short", colored("rgb8", 2), (BAG,)),
     Fault(
-        "size that the images do not have",
+        "image size that does not match",
         recorded(lambda messages: messages.info(COLOR, np.eye(3), size=(64, 48))),
         (BAG,),
     ),
@@ -322,7 +324,7 @@ REALSENSE = (
         recorded(lambda messages: messages.place(COLOR, quat=(0.0, 0.0, 0.0, 2.0))),
         (BAG,),
     ),
-    Fault("depth that is late", recorded(late), (BAG,)),
+    Fault("late depth", recorded(late), (BAG,)),
 )
 
 

@@ -34,7 +34,7 @@ TOOL = np.where(np.arange(WIDTH) < WIDTH // 4, 255, 0).astype(np.uint8) * np.one
 
 
 def every(folder: str, edit: Callable[[np.ndarray], np.ndarray]) -> Damage:
-    """Edits each picture of a folder."""
+    """Damage that edits each picture in a folder."""
 
     def damage(root: Path) -> None:
         for path in (root / folder).iterdir():
@@ -76,7 +76,7 @@ ENDONERF = (
     Fault("mask missing", gone("masks/001.png"), ("DATA/masks",)),
     Fault("mask in colour", drawn("masks/001.png", picture(0)), ("masks/001.png",)),
     Fault("inverted masks", every("masks", lambda mask: 255 - mask), ("DATA/masks", "--read.tool black")),
-    Fault("all masks nothing but tool", every("masks", lambda mask: mask | 255), ("DATA/masks",)),
+    Fault("all masks show only the tool", every("masks", lambda mask: mask | 255), ("DATA/masks",)),
     Fault("depth image missing", gone("depth/001.png"), ("DATA/depth",)),
     Fault("depth all 0", every("depth", lambda depth: 0 * depth), ("DATA/depth",)),
     Fault("8-bit depth", drawn("depth/000.png", TOOL), ("depth/000.png",)),
@@ -89,10 +89,10 @@ ENDONERF = (
     Fault(
         "no baseline", change("meta.json", lambda m: m.pop("baseline_m")), ("DATA/right", "--read.baseline-m")
     ),
-    Fault("rate of 0", change("meta.json", lambda m: m.update(fps=0)), ("meta.json", "fps")),
-    Fault("list as meta.json", holds("meta.json", "[]"), ("meta.json",)),
+    Fault("frame rate of 0", change("meta.json", lambda m: m.update(fps=0)), ("meta.json", "fps")),
+    Fault("meta.json is a list", holds("meta.json", "[]"), ("meta.json",)),
     Fault(
-        "truth too short",
+        "ground truth too short",
         lambda r: np.savez(r / "truth.npz", verts=np.zeros((2, 5, 3))),
         ("truth.npz",),
     ),
@@ -119,7 +119,7 @@ ENDOVIS_17 = (
         ("camera_calibration.txt", "Camera-0-F"),
     ),
     Fault(
-        "right eye not placed",
+        "right eye without a pose",
         holds(
             "camera_calibration.txt",
             "Width: 32\nHeight: 24\nCamera-0-F: 9 9\nCamera-0-C: 1 1\nCamera-0-K: 0 0 0 0 0\n",
@@ -127,7 +127,7 @@ ENDOVIS_17 = (
         ("DATA/right_frames", "camera_calibration.txt"),
     ),
     Fault(
-        "distorting lens",
+        "lens distortion",
         swap("camera_calibration.txt", "Camera-0-K: 0", "Camera-0-K: -0.9"),
         ("camera_calibration.txt", "Camera-0-K"),
     ),
@@ -189,7 +189,7 @@ FRAMES_WITH_MASKS = (
     Fault("single frame", lambda r: [p.unlink() for p in r.glob("*/00[12].png")], ("images/000.png",)),
     Fault("mask missing", gone("masks/001.png"), ("DATA/masks",)),
     Fault("inverted masks", every("masks", lambda mask: 255 - mask), ("DATA/masks", "--read.tool black")),
-    Fault("all masks nothing but tool", every("masks", lambda mask: mask | 255), ("DATA/masks",)),
+    Fault("all masks show only the tool", every("masks", lambda mask: mask | 255), ("DATA/masks",)),
     Fault("depth, but no poses", lambda root: (root / "depth").mkdir(), ("DATA", "poses_bounds.npy")),
 )
 

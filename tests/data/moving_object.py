@@ -1,5 +1,5 @@
-"""A recording in D-NeRF's layout, drawn from solids: a bar that bends and twists, a sliding block and a
-bouncing ball before nothing, seen by one camera that jumps around them.
+"""A recording in D-NeRF's layout, ray-cast from solids: a bar that bends and twists, a sliding block and a
+bouncing ball on an empty background, seen by one camera that jumps around them.
 
     python -m tests.data.moving_object FOLDER --size 200
 """
@@ -36,7 +36,7 @@ _SOLIDS = (
 
 
 def write_dnerf(root: Path, size: int = 100, counts: dict[str, int] = COUNTS) -> None:
-    """Write train, val and test, each over all times 0 to 1, as RGBA pictures of size x size pixels."""
+    """Write the splits, each spanning the times 0 to 1, as RGBA pictures of size x size pixels."""
     random = np.random.default_rng(0)
     for split, count in counts.items():
         frames = []
@@ -56,7 +56,7 @@ def write_dnerf(root: Path, size: int = 100, counts: dict[str, int] = COUNTS) ->
 
 
 def _picture(time: float, viewmat: np.ndarray, size: int) -> np.ndarray:
-    """RGBA, [size,size,4] uint8."""
+    """The picture at a time, RGBA, [size,size,4] uint8."""
     fine = _FINER * size
     wave = np.sin(np.pi * time)
     poses = rigid(

@@ -16,7 +16,7 @@ START_NS = 1_700_000_000_000_000_000
 
 
 class Messages:
-    """What librealsense writes, by topic: the type, and (seconds from the start, bytes) of each message.
+    """Messages as librealsense writes them, by topic: the type, and (seconds from the start, bytes) of each.
 
     Args:
         K: intrinsics of both cameras, pixel centres at +0.5.
@@ -41,7 +41,7 @@ class Messages:
         return bytes(self.store.serialize_ros1(self.make(kind, *values), kind))
 
     def add(self, topic, kind, *values):
-        """The one message of a topic."""
+        """Sets the only message of a topic."""
         self.topics[topic] = kind, [(0.0, self.raw(kind, *values))]
 
     def header(self, seconds, frame_id=""):
@@ -63,7 +63,7 @@ class Messages:
         self.add(f"{name}/tf/0", "geometry_msgs/msg/Transform", vector, turn)
 
     def images(self, name, encoding, stamped, unit=None, big_endian=False):
-        """The images of a camera: seconds from the start and pixels of each; `unit` stands behind each."""
+        """Sets a camera's images, (seconds from the start, pixels) each; `unit`, if any, follows each one."""
         kind, found = "sensor_msgs/msg/Image", []
         for seconds, pixels in stamped:
             rows = np.ascontiguousarray(pixels).view(np.uint8).reshape(len(pixels), -1)
@@ -93,7 +93,7 @@ class Messages:
 
 
 def realsense(width=32, height=24, frames=3, unit=0.001, marked=True):
-    """A recording of the tabletop whose colour and depth cameras stand at one place."""
+    """A recording of the tabletop whose colour and depth cameras coincide."""
     sequence = scene(width, height, frames)
     messages, behind = Messages(sequence.Ks[0, 0], width, height, unit), unit if marked else None
     steps = (np.round(sequence.depth(t, 0) / unit).astype(np.uint16) for t in range(frames))

@@ -18,7 +18,7 @@ def simulated():
 
 
 class Folder:
-    """A scene on disk; tests change what its files say."""
+    """A scene on disk, whose files the tests edit."""
 
     def __init__(self, root, **options):
         self.root = root
@@ -89,7 +89,7 @@ def test_an_object_that_is_to_be_the_world_must_be_one_and_in_the_frame(folder):
 
 
 def test_equal_objects_keep_their_labels_though_their_order_changes(folder):
-    """Carton and can are two of one kind; in the second frame the list has them the other way round."""
+    """Carton and can become instances of one object; the second frame lists them in the opposite order."""
 
     def edit(gt):
         for entries in gt.values():
@@ -198,7 +198,7 @@ HALF_TURN = [-1, 0, 0, 0, 0, -1, 0, 0, 0, 0, 1, 4, 0, 0, 0, 1]
 
 
 def write_models(dataset, numbers, entry):
-    """models_eval of objects that have the same four vertices and the same entry."""
+    """Writes models_eval with the same four vertices for all `numbers` and one entry for 12, 13 and 99."""
     folder = dataset / "models_eval"
     folder.mkdir()
     (folder / "models_info.json").write_text(json.dumps({str(number): entry for number in (12, 13, 99)}))
@@ -215,7 +215,7 @@ def test_models_of_objects_are_read_in_metres(folder, tmp_path):
     continuous = {"axis": [0, 0, 2], "offset": [10, 0, 0]}
     write_models(tmp_path, (12, 14), {"diameter": 80.0, "symmetries_discrete": [HALF_TURN], "min_x": -30})
     model, *others = open_sequence(folder.root).truth.models
-    assert others == [None, None, None]  # no vertices, no entry, neither
+    assert others == [None, None, None]  # 13 has no vertices, 14 no entry, 15 neither
     assert (model.source, model.diameter) == ("models_eval/obj_000012.ply", pytest.approx(0.08))
     np.testing.assert_allclose(model.points, CORNERS_MM / 1000, atol=1e-9)
     np.testing.assert_array_equal(model.symmetries[0], np.eye(4))
@@ -223,7 +223,7 @@ def test_models_of_objects_are_read_in_metres(folder, tmp_path):
     described = {"diameter": 80, "symmetries_discrete": [HALF_TURN], "symmetries_continuous": [continuous]}
     (tmp_path / "models_eval/models_info.json").write_text(json.dumps({"12": described}))
     symmetries = open_sequence(folder.root).truth.models[0].symmetries
-    assert len(symmetries) == 2 * 315  # every turn, alone and after the discrete one
+    assert len(symmetries) == 2 * 315  # every rotation, alone and after the discrete symmetry
     np.testing.assert_allclose(symmetries[0], np.eye(4), atol=1e-12)
     on_the_axis = np.array([0.01, 0, 0.5, 1])
     alone, after = symmetries[::2], symmetries[1::2]

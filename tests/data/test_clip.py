@@ -92,7 +92,7 @@ def test_frames_in_the_folder_itself(folder):
         path.rename(folder / path.name)
     (folder / "gt_masks").rename(folder / "tools")
     with pytest.raises(DataError, match="found 5 photographs without poses"):
-        open_sequence(folder)  # they cannot be told from photographs
+        open_sequence(folder)  # they cannot be distinguished from photographs
     sequence = open_sequence(folder, ReadOptions(K=K, masks="tools"))
     np.testing.assert_array_equal(sequence.image(4, 0), grey(4))
     assert sequence.mask(4, 0).any()

@@ -57,7 +57,7 @@ def test_names_of_windows(tmp_path):
 
 
 def with_photographs(root, count):
-    """Leaves as many photographs in a reconstruction that was written as text."""
+    """Keeps only the first `count` photographs of a reconstruction written as text."""
     images = root / "images.txt"
     images.write_text("\n\n".join(header_lines(images.read_text())[:count]) + "\n")
 

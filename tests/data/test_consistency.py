@@ -29,7 +29,7 @@ def table():
 
 @pytest.fixture(scope="module")
 def moving():
-    """One camera around furniture."""
+    """One camera that moves around furniture."""
     around = open_sequence("simulated:articulated?frames=1&width=96&height=72")
     count = around.num_cameras
     return replace(
@@ -49,7 +49,7 @@ def moving():
 
 
 def cloud_of(scene):
-    """Points of the depth of all photographs."""
+    """Every seventh point of the depth of all photographs."""
     points = []
     for i in range(scene.num):
         rows, columns = np.nonzero(scene.depth(i))
@@ -81,7 +81,7 @@ def test_depth_in_another_unit_than_the_points(moving, factor, says):
 
 
 def test_depth_that_cannot_be_judged(table):
-    """Noise, one camera at rest, and depth that cannot be read, which is said when it is used."""
+    """Noise, a single static camera, and unreadable depth, which is reported only when it is used."""
     noise = np.random.default_rng(0)
 
     def fail(t, c):
@@ -143,7 +143,7 @@ def test_points_that_no_camera_sees(moving):
 
 
 def test_inverted_masks(moving):
-    """What counts is where the points are, or, without points, more than next to nothing."""
+    """Masks must leave some of the points in view or, without points, more than a few of the pixels."""
     scene = replace(photographs_of(moving), load_depth=None)
     for cloud in (cloud_of(photographs_of(moving)), None):
         row = np.arange(72)[:, None] < (2 if cloud is None else 71)

@@ -72,7 +72,7 @@ def test_splits_in_files_of_their_own(folder):
 
 
 def test_equal_pictures_from_other_places_or_times_are_kept(folder):
-    """A scene of one colour, or at rest, looks alike."""
+    """A scene of one colour looks the same from everywhere, and a static scene at all times."""
     for i in range(COUNT):
         dots.save(folder / NAMES[i], picture(0))
     write(folder, NAMES, PLACES)
@@ -87,7 +87,7 @@ def test_equal_pictures_from_other_places_or_times_are_kept(folder):
 
 
 def test_memory_grows_with_the_number_of_photographs(tmp_path):
-    """Files of one size, as cameras without compression write them."""
+    """All files have one size, as from cameras without compression, so all could be duplicates."""
     num = 1500
     for i in range(num):
         (tmp_path / f"{i}").write_bytes(i.to_bytes(4, "little"))

@@ -1,4 +1,4 @@
-"""EndoNeRF's layout: a moving stereo endoscope and three dots, drawn by the definition of the format."""
+"""EndoNeRF's layout: a moving stereo endoscope and three dots, drawn as the format defines them."""
 
 import json
 import warnings

@@ -1,4 +1,4 @@
-"""EndoVis 2017 and 2018: a stereo pair and three dots, drawn by the definition of the calibration."""
+"""EndoVis 2017 and 2018: a stereo pair and three dots, drawn as the calibration defines them."""
 
 import json
 import warnings

@@ -110,14 +110,14 @@ def jpeg(**options) -> bytes:
 
 
 def with_thumbnail(content: bytes) -> bytes:
-    """EXIF with a JPEG of its own, whose end mark is not that of the photograph."""
+    """The JPEG with an EXIF thumbnail, itself a JPEG, whose end marker is not that of the photograph."""
     thumbnail = jpeg(quality=20)
     segment = b"Exif\0\0" + thumbnail
     return content[:2] + b"\xff\xe1" + (len(segment) + 2).to_bytes(2, "big") + segment + content[2:]
 
 
 def large(ending: str) -> bytes:
-    """A picture of more bytes than are looked at first."""
+    """A picture with more bytes than the check reads first."""
     noise = np.random.default_rng(0).integers(0, 256, (1000, 1000, 3), np.uint8)
     return cv2.imencode(ending, noise)[1].tobytes()
 
@@ -146,7 +146,7 @@ def test_bytes_behind_the_end_of_a_picture_do_not_matter(tmp_path, form, tail):
 @pytest.mark.parametrize("form", WHOLE)
 @pytest.mark.parametrize("tail", ["nothing", "zeros", "0xff"])
 def test_wherever_a_picture_is_cut_off_it_is_refused(tmp_path, form, tail):
-    """Also where a download had reserved the file's whole length."""
+    """Also where a download had allocated the whole file in advance."""
     path, content = tmp_path / "a.jpg", WHOLE[form]
     for length in range(30, len(content) - 13, 7):
         path.write_bytes(content[:length] + TAILS.get(tail, b""))
@@ -156,7 +156,7 @@ def test_wherever_a_picture_is_cut_off_it_is_refused(tmp_path, form, tail):
 
 @pytest.mark.parametrize("mode", ["RGBA", "LA", "P", "L"])
 def test_what_is_transparent_shows_the_background(tmp_path, mode):
-    """Whatever way a picture has of saying so; and the readers know that there is such a picture."""
+    """However the file encodes transparency; `find_background` finds out whether any picture has it."""
     grey = np.full((HEIGHT, WIDTH, 4), 200, np.uint8)
     grey[..., 3], grey[:4] = 255, (90, 90, 90, 0)
     picture = Image.fromarray(grey)
@@ -208,7 +208,7 @@ def test_formats_that_are_not_read_are_named(tmp_path, name, content, says):
 
 @pytest.mark.parametrize("name", ["a.NEF", "a.dng"])
 def test_the_thumbnail_of_raw_data_is_not_taken_for_the_photograph(tmp_path, name):
-    """Such files are TIFF, whose first picture decoders read."""
+    """Raw files are TIFF files, of which decoders read the first picture: the thumbnail."""
     Image.fromarray(RAMP.astype(np.uint8)).save(tmp_path / name, "TIFF")
     for read in (picture_size, lambda path: read_image(path, WIDTH, HEIGHT)):
         with pytest.raises(DataError, match="found camera raw, a format that is not read"):
@@ -275,7 +275,7 @@ def test_numbers_of_another_shape(tmp_path, value):
     ("name", "options"), [("a.png", {}), ("grey.png", {"transparency": 3}), ("a.gif", {})]
 )
 def test_pictures_are_decoded_without_touching_filters_of_warnings(tmp_path, monkeypatch, name, options):
-    """Threads share the filters: one that restores another's silences every later warning."""
+    """Threads share the filters: one that restores filters saved by another silences all later warnings."""
     changes, catch = [], warnings.catch_warnings
     path = tmp_path / name
     shape = (4, 5) if options else (4, 5, 3)

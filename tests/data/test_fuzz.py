@@ -1,5 +1,5 @@
-"""Damaged files of every reader are read or refused in a sentence, in bounds; benchmarks/fuzz_files.py tries
-more of them."""
+"""Every reader reads a damaged file or refuses it with a short message, within limits of time and memory;
+benchmarks/fuzz_files.py tries more files."""
 
 import numpy as np
 import pytest
@@ -8,7 +8,7 @@ from benchmarks.fuzz_files import try_reader
 from benchmarks.mutations import mutated
 from benchmarks.readers import READERS
 
-CASES = 100  # of a reader; of slow ones, a share
+CASES = 100  # per reader; slow readers get a share of them
 SEED = 7
 
 

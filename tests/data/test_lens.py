@@ -23,7 +23,7 @@ each_lens = pytest.mark.parametrize("lens", LENSES.values(), ids=LENSES)
 
 
 def photographed(lens, rays):
-    """Pixels of points (x, y, 1) in the distorted photograph, by OpenCV, with its centres at integers."""
+    """Pixels of points (x, y, 1) in the distorted photograph, by OpenCV, whose pixel centres are integers."""
     own, coeffs = lens.K - np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]), np.array(lens.coeffs)
     rays, still = np.array(rays, float).reshape(-1, 1, 3), np.zeros(3)
     if lens.fisheye:

@@ -1,4 +1,4 @@
-"""Files by the names that data give them."""
+"""Files found by the names that datasets give them."""
 
 import os
 
@@ -39,7 +39,7 @@ def folder(tmp_path):
         (f"images/{COMPOSED}", f"images/{DECOMPOSED}"),
         ("b/../images/FRAME 2.jpg", "b/../images/frame 2.jpg"),
         ("A.png", "A.png"),
-        ("a.PNG", None),  # either of two
+        ("a.PNG", None),  # ambiguous: a.png or A.png
         ("images/gone.png", None),
         ("images", None),
         ("elsewhere/Frame_1.PNG", None),

@@ -29,7 +29,7 @@ def log(poses):
 
 
 class Folder:
-    """A recording with only some of the frames in its trajectory."""
+    """A recording with images of only some of the frames in its trajectory."""
 
     def __init__(self, root):
         self.root, self.poses = root, {n: pose(n) for n in range(15)}

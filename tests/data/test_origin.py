@@ -1,4 +1,4 @@
-"""Data far from 0 are relative to an origin, with a warning; near 0 nothing changes."""
+"""Data far from 0 are made relative to an origin, with a warning; near 0 nothing changes."""
 
 from dataclasses import replace
 
@@ -141,7 +141,7 @@ def test_all_that_is_known_of_a_recording_moves_with_it():
 
 
 def test_a_recording_of_another_layout_is_moved_too(tmp_path):
-    """TUM RGB-D with a trajectory of a satellite receiver."""
+    """TUM RGB-D with a trajectory from a satellite receiver."""
     tmp_path = tmp_path / "freiburg1"
     for kind, mode, value in (("rgb", "RGB", (90, 80, 70)), ("depth", "I;16", 5000)):
         (tmp_path / kind).mkdir(parents=True)

@@ -1,4 +1,4 @@
-"""What other systems and programs write: every reader takes it as if it had been written here."""
+"""Files as other systems and programs write them, which every reader accepts without a warning."""
 
 import shutil
 import warnings
@@ -86,7 +86,7 @@ def test_decimal_commas_between_semicolons(tmp_path):
 
 
 def test_a_copy_does_not_change_what_is_read(tmp_path):
-    """An absolute path of the computer on which a file was written."""
+    """File names may be absolute paths on the computer that wrote them."""
     root = tmp_path / "a"
     root.mkdir()
     LAYOUTS["nerfstudio"].build(root)

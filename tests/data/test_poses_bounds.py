@@ -14,7 +14,7 @@ K = np.array([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]])
 
 
 def row(viewmat, axes, hwf=(HEIGHT, WIDTH, FOCAL)):
-    """By definition: the columns of R are the camera's axes in the world, t is its position."""
+    """A row by definition: the columns of R are the camera's axes in the world, t is its position."""
     right, down, forward = viewmat[:3, :3]
     columns = {"llff": (down, right, -forward), "endonerf": (right, -down, -forward)}[axes]
     eye = -viewmat[:3, :3].T @ viewmat[:3, 3]

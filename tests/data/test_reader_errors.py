@@ -94,7 +94,7 @@ class Case(NamedTuple):
 
 
 def found_in(scratch: Path) -> list[tuple[str, Case]]:
-    """Each fault with what came of it: "" where the data were refused, else how much of them is used."""
+    """Each fault with its outcome: "" where the data are refused, else how much of them is used."""
     found = []
     for number, (layout, fault) in enumerate(CASES):
         refused, text = outcome_of(layout, fault, scratch / str(number))
@@ -118,7 +118,7 @@ def page(found: list[tuple[str, Case]]) -> str:
 
 
 def messages(found: list[tuple[str, Case]]) -> str:
-    """reader_errors.md: a table of the messages of several layouts, then one of each layout's own."""
+    """reader_errors.md: a table of the messages that several layouts share, then one for each layout."""
     alike: dict[tuple[str, str], list[Case]] = {}
     for used, case in found:
         alike.setdefault((used, _pattern(case.text)), []).append(case)
@@ -137,13 +137,13 @@ _LEADING_PATH = re.compile(r"^DATA[\w./*-]*")
 
 
 def _pattern(text: str) -> str:
-    """A message without its files' names and its numbers."""
+    """A message with placeholders for file names and numbers."""
     named = re.sub(r"\([\w./]+\)|[\w./]+\.(png|txt|bin)", "NAME", _LEADING_PATH.sub("FILE", text))
     return re.sub(r"\d+", "N", named)
 
 
 def _problem(cases: list[Case], name_layouts: bool) -> str:
-    """The faults that have one message, with the layouts in which each occurs if there are several."""
+    """The faults that share a message, each with the layouts in which it occurs if `name_layouts`."""
     layouts: dict[str, list[str]] = {}
     for case in cases:
         layouts.setdefault(case.what, []).append(case.layout)

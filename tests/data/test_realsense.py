@@ -43,8 +43,8 @@ def test_a_recording_is_read_as_it_was(tmp_path, marked, compressed):
 
 
 def test_depth_moves_to_the_colour_camera(messages, write):
-    """A box 1 m away before a wall at 2 m; colour stands 0.0625 m beside, sees twice as finely, and all moves
-    to the left in it: by 4 of its pixels on the box and by 2 on the wall."""
+    """A box 1 m away in front of a wall at 2 m. The colour camera is 0.0625 m to the side and has twice the
+    resolution: in it, the box shifts to the left by 4 of its pixels and the wall by 2."""
     depth = np.full((24, 32), 2000, np.uint16)
     depth[8:16, 8:16] = 1000
     depth[0, 0], depth[0, 31] = 0, 65535
@@ -55,14 +55,14 @@ def test_depth_moves_to_the_colour_camera(messages, write):
     messages.place(COLOR, (-0.0625, 0.0, 0.0))
     expected = np.zeros((48, 64), np.float32)
     expected[:, :62] = 2.0
-    expected[:2, 60:] = 0  # the last pixel of the first row, and what came in beside it
+    expected[:2, 60:] = 0  # the invalid last pixel of the first row, and the strip newly in view beside it
     expected[16:32, 28:30] = 0  # hidden from the depth camera
     expected[16:32, 12:28] = 1.0
     np.testing.assert_array_equal(read_realsense(write(messages)).depth(0, 0), expected)
 
 
 def test_a_turned_colour_camera(messages, write):
-    """Turned by 90 degrees about the direction of view, it sees what was on the right on top."""
+    """Rotated by 90 degrees about its viewing direction, it sees at the top what was on the right."""
     depth = np.full((24, 24), 1000, np.uint16)
     depth[:, 20:] = 500
     messages.images(DEPTH, "mono16", [(0.03, depth)], unit=0.001)

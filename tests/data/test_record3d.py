@@ -64,7 +64,7 @@ def test_frames_and_cameras_are_those_that_were_written(sound, seen):
 
 
 def test_depth_is_that_of_the_pixel_it_was_measured_in(sound, seen):
-    """Three pixels a side share the depth of the middle one."""
+    """Each block of 3x3 pixels shares the depth measured at its middle one."""
     depth, exact = open_sequence(sound).depth(1, 0), seen.depth(0, 1)
     np.testing.assert_array_equal(depth[1::3, 1::3], exact[1::3, 1::3])
     np.testing.assert_array_equal(depth, np.repeat(np.repeat(exact[1::3, 1::3], 3, 0), 3, 1))
@@ -125,7 +125,7 @@ def test_intrinsics_follow_pictures_that_were_downscaled(folder, seen):
 
 
 def test_counts_that_differ(folder):
-    """Of six frames, three have all."""
+    """Three of the six frames are complete."""
     (folder / "depth/1.exr").unlink()
     change("metadata.json", lambda meta: meta["poses"].extend([meta["poses"][0]] * 2))(folder)
     edit(folder, perFrameIntrinsicCoeffs=[], frameTimestamps=[])
@@ -220,7 +220,7 @@ def test_every_compression_is_read_and_its_end_is_found(tmp_path, compression):
 
 
 def test_damage_is_told_in_the_message_alone(tmp_path, capfd):
-    """Programs read what is on stdout."""
+    """Nothing is printed to stdout, which other programs may parse."""
     write_exr(tmp_path / "0.exr", R=np.ones((300, 300), np.float32))
     content = bytearray((tmp_path / "0.exr").read_bytes())
     content[-20:-10] = b"x" * 10
@@ -270,7 +270,7 @@ def test_a_file_without_channels(tmp_path):
 
 
 def test_damage_anywhere_in_a_header_is_told_in_one_message(sound, tmp_path):
-    """Every byte of the header, changed, gives depth or a DataError."""
+    """A change of any byte of the header gives depth or a DataError."""
     content, file = (sound / "depth/0.exr").read_bytes(), tmp_path / "0.exr"
     refused = 0
     for at in range(330):

@@ -24,7 +24,7 @@ def test_bands_of_rows_change_nothing(monkeypatch):
 
 @pytest.mark.thorough
 def test_memory_is_bounded_whatever_the_ratio_of_focal_lengths():
-    """256 points of each pixel are 31 million points."""
+    """256 points per pixel make 31 million points."""
     depth = np.ones((300, 400), np.float32)
     tracemalloc.start()
     register_depth(depth, intrinsics(10.0, 400, 300), intrinsics(1e6, 400, 300), np.eye(4), 400, 300)

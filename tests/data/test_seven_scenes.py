@@ -22,7 +22,7 @@ def pose_at(x):
 
 
 def write_frame(root, number, x=0.0, ending="png"):
-    """A blue wall and a red box in front of it, as seen by the colour and the depth camera."""
+    """Writes a blue wall and a red box in front of it, as the colour and the depth camera see them."""
     root.mkdir(exist_ok=True)
     v, u = np.mgrid[:480, :640] + 0.5
 
@@ -205,7 +205,7 @@ def test_a_folder_name_changes_nothing(folder, tmp_path):
 
 
 def test_a_recording_by_ones_own_camera(folder):
-    """Its depth is registered to colour, in its own size and unit."""
+    """Its depth is already registered to colour, and it has its own size and unit."""
     for file in folder.glob("frame-*.png"):
         image = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
         assert cv2.imwrite(str(file), image[:240, :320])

@@ -1,4 +1,4 @@
-"""Photographs by fisheyes, kept as they were taken or undistorted."""
+"""Fisheye photographs, kept as they were taken or undistorted."""
 
 import json
 
@@ -23,7 +23,7 @@ KEPT = ReadOptions(fisheye="keep")
 
 @pytest.fixture
 def folder(tmp_path):
-    """Two photographs with depth and a mask by a fisheye that sees 90 degrees and more to its sides."""
+    """Writes two photographs, with depth and masks, from a fisheye that sees 90 degrees off axis and more."""
 
     def write(**changes):
         frames = []
@@ -72,7 +72,7 @@ def test_depth_along_the_axis_becomes_distance(folder):
 
 @pytest.mark.thorough
 def test_points_appear_where_they_were_seen_and_where_the_rasterizer_draws_them(folder):
-    """Points from depth return to their pixels, by the host's camera and by the rasterizer's."""
+    """Points from depth project back to their pixels, on the host and in the rasterizer."""
     photographs = open_photographs(folder(), KEPT)
     points, colors, source = start_points([photographs.frame(0)], None, StartConfig(count=60), 0)
     assert source == "depth"
@@ -95,7 +95,7 @@ def test_points_appear_where_they_were_seen_and_where_the_rasterizer_draws_them(
 
 
 def test_a_recording_of_kept_fisheyes_is_refused(folder):
-    """Whose cameras would otherwise be taken for pinholes."""
+    """Its cameras would otherwise be taken for pinhole cameras."""
     with pytest.raises(DataError, match=r"expected photographs of pinholes.*Leave out --read.fisheye"):
         sequence_of(open_photographs(folder(), KEPT))
 
@@ -107,7 +107,7 @@ def test_undistorting_says_how_much_it_loses(folder):
 
 
 def test_pixels_beyond_the_lens_do_not_count(folder):
-    """A lens that folds back within the photograph shows nothing beyond."""
+    """A lens whose projection folds back within the photograph shows nothing beyond that radius."""
     photographs = open_photographs(folder(k1=-0.2), KEPT)
     mask = photographs.mask(1)
     assert not mask[0, -1]

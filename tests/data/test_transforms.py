@@ -20,7 +20,7 @@ def pose(x=0.0, y=0.0, z=4.0):
 
 
 def pixel(point, eye, width=WIDTH, height=HEIGHT, focal=FOCAL):
-    """By hand: right of the axis is right in the photograph, above it is above."""
+    """The projection by hand: right of the axis is right in the photograph, above it is above."""
     right, up, back = point - eye
     return np.array([width / 2 + focal * right / -back, height / 2 - focal * up / -back])
 

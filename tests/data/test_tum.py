@@ -30,7 +30,7 @@ class Folder:
 
     @staticmethod
     def pose(seconds):
-        """At 0.4 m/s along x, turning at 1 rad/s about y."""
+        """At 0.4 m/s along x, rotating at 1 rad/s about y."""
         turn = Rotation.from_rotvec([0, seconds, 0])
         return [0.4 * seconds, 1.0, 2.0, *turn.as_quat()]
 

@@ -25,7 +25,7 @@ def write(path, frames, fps=12.5):
 
 
 def converted(path, name, *options):
-    """The video by ffmpeg with these options; name "-.mkv" is a stream, whose header has no length."""
+    """The video converted by ffmpeg; a name such as "-.mkv" makes it a stream, whose header has no length."""
     target = path.with_name(name)
     before = [option for option in options if option.startswith("-display") or option == "90"]
     after = [option for option in options if option not in before]
@@ -49,7 +49,7 @@ def level(image):
 
 
 def frames_of(path, order=None):
-    """The numbers that the frames show, read in an order."""
+    """The numbers encoded in the frames, which are read in the given order."""
     file = describe_video(path)
     video = Video(path, file.width, file.height, file.frames, file)
     return [level(video.frame(t)) for t in (range(file.frames) if order is None else order)]
@@ -88,7 +88,7 @@ def test_each_frame_has_its_own_time(tmp_path, name, codec):
 
 
 def test_frames_that_cannot_be_decoded_are_counted(tmp_path):
-    """Without the first key frame, those before the second lack what they refer to."""
+    """Without the first key frame, the frames before the second lack their reference."""
     path = converted(
         write(tmp_path / "a.mp4", levels(30)), "b.mp4", "-c:v", "libx264", "-g", "10", "-bf", "0"
     )

@@ -9,7 +9,7 @@ from tests.data import dots
 
 
 def write_bop(sequence, root, *, posed=True):
-    """A scene of BOP of the first camera, with the objects of the truth: depth in tenths of millimetres."""
+    """Writes the first camera's view as a BOP scene with the true object poses; depth is in 0.1 mm."""
     cameras, annotations = {}, {}
     for t, number in enumerate(sequence.frame_ids):
         name, viewmat, mask = f"{number:06d}", sequence.viewmats[t, 0], sequence.mask(t, 0)
@@ -38,7 +38,7 @@ def _moved(what, pose):
 
 
 def write_paris(sequence, root, *, split="train"):
-    """The first and last frame as two states, all but labelled pixels transparent, with depth."""
+    """Writes the first and last frames as two states, with depth; unlabelled pixels are transparent."""
     for state, t in (("start", 0), ("end", sequence.num_frames - 1)):
         cameras = {"K": sequence.Ks[t, 0].tolist()}
         for c in range(sequence.num_cameras):

@@ -1,4 +1,4 @@
-"""Other programs that convert files of Gaussians, told by their endings: judges of what we write and read.
+"""Other programs that convert files of Gaussians between formats, to test our own against.
 
 - splat-transform of PlayCanvas: `npm install -g @playcanvas/splat-transform`, or
   GSJAX_SPLAT_TRANSFORM=FOLDER/bin/cli.mjs.
@@ -38,8 +38,8 @@ scene = {".spz": gsply.read_spz, ".sog": sogread}.get(Path(source).suffix, gsply
 
 @dataclass(frozen=True)
 class Converter:
-    """A program, the endings that it reads and writes, and whether it gives an SPZ its own axes, as Niantic's
-    programs do, or leaves those of the PLY (no header tells which)."""
+    """A program, the file endings that it reads and writes, and whether it rotates a PLY to SPZ's axes, as
+    Niantic's programs do, or keeps the PLY's axes in an SPZ (no header states which)."""
 
     name: str
     reads: tuple[str, ...]
@@ -55,24 +55,24 @@ class Converter:
             source, target: the files.
 
         Raises:
-            RuntimeError: it refuses; what it said.
+            RuntimeError: the program fails; the message is its output.
         """
         done = subprocess.run(self.command(source, target), capture_output=True, text=True, timeout=600)
         if done.returncode or not target.is_file():
             raise RuntimeError(done.stdout + done.stderr)
 
     def axes(self, scene: Gaussians, ending: str) -> Gaussians:
-        """A scene as it stands in the program's files of an ending.
+        """A scene in the axes of the program's files with an ending.
 
         Args:
             scene: the scene.
-            ending: that of the file.
+            ending: file ending.
         """
         return scene if ending != ".spz" or self.turns_spz() else half_turned(scene)
 
 
 def half_turned(scene: Gaussians) -> Gaussians:
-    """A scene turned half around X, by the harmonics themselves.
+    """A scene rotated by 180 degrees about X, with signs of harmonics from the basis functions themselves.
 
     Args:
         scene: the scene.
@@ -103,7 +103,7 @@ def _splat_transform(source: Path, target: Path) -> list:
 
 
 def _is_splat_transform_2() -> bool:
-    """Since version 3, it leaves the axes of an SPZ as they come from a PLY."""
+    """Whether it is older than version 3, which keeps the axes of a PLY in an SPZ."""
     said = subprocess.run(["node", _SPLAT_TRANSFORM, "--version"], capture_output=True, text=True, timeout=60)
     return int(re.search(r"v(\d+)\.", said.stdout + said.stderr)[1]) < 3
 

@@ -1,4 +1,4 @@
-"""Scenes in the ranges that every format has room for, how far each may round them, files made by hand."""
+"""Scenes within the ranges of every format, the rounding of each format, and files made by hand."""
 
 import gzip
 import io
@@ -23,7 +23,7 @@ from gsjax.scene.gaussians import SH_SIZES, Gaussians
 
 
 def make_scene(count: int = 300, degree: int = 0, seed: int = 0) -> Gaussians:
-    """Random Gaussians within 4 units of a place beside the origin."""
+    """Random Gaussians in a cube whose centre is not the origin."""
     rng = np.random.default_rng(seed)
 
     def values(low, high, *shape):
@@ -42,8 +42,8 @@ def make_scene(count: int = 300, degree: int = 0, seed: int = 0) -> Gaussians:
 
 @dataclass(frozen=True)
 class Rounding:
-    """The largest differences that a format may make: centres in units, rotations as 1 - |q1 . q2|, the
-    others as they are; colours and opacities of 0 to 1."""
+    """The largest rounding errors of a format: centres in scene units, rotations as 1 - |q1 . q2|, the others
+    in the units of their values; colours and opacities are from 0 to 1."""
 
     means: float = 1e-6
     turn: float = 1e-6
@@ -67,7 +67,7 @@ ROUNDING = {
 
 
 def differences(a: Gaussians, b: Gaussians) -> dict[str, float]:
-    """The largest differences of two scenes whose Gaussians come in any order."""
+    """The largest differences between two scenes, whose Gaussians may be in any order."""
     left, right = columns_of(a), columns_of(b)
     assert len(left.means) == len(right.means)
     rows = cKDTree(right.means).query(left.means)[1]
@@ -81,7 +81,7 @@ def differences(a: Gaussians, b: Gaussians) -> dict[str, float]:
 
 
 def assert_alike(a: Gaussians, b: Gaussians, rounding: Rounding, times: float = 1.0) -> None:
-    """The scenes differ by no more than a format's rounding, `times` over."""
+    """Asserts that the scenes differ by at most `times` a format's rounding."""
     for name, found in differences(a, b).items():
         assert found <= times * getattr(rounding, name), f"{name}: {found} > {getattr(rounding, name)}"
 
@@ -96,7 +96,7 @@ def spz(version, count, degree=0, flags=0, arrays=b"", bits=12):
 
 
 def spz4(scene, path, change=None):
-    """An SPZ of version 4: the arrays of version 3, each in a frame of its own."""
+    """Writes an SPZ of version 4: the arrays of version 3, each in its own Zstandard frame."""
     write_gaussians(path, scene)
     body = gzip.decompress(path.read_bytes())
     degree, bits = body[12], body[13]
@@ -113,7 +113,7 @@ def spz4(scene, path, change=None):
 
 
 def ksplat(level, scene, degree, bucket=7):
-    """A .ksplat of two sections, the first empty; full buckets of 7 and a rest."""
+    """The bytes of a .ksplat of two sections, the first empty, with full buckets and a partial one."""
     columns = columns_of(scene)
     types = (("<f4", "<f4", "<f4"), ("<u2", "<f2", "<f2"), ("<u2", "<f2", "u1"))[level]
     bands, count, block = degree * (degree + 2), scene.num, 5.0
@@ -148,7 +148,7 @@ def ksplat(level, scene, degree, bucket=7):
 
 
 def sog(change_meta=None, pictures=(), extra=()):
-    """The bytes of a SOG of 100 Gaussians, changed."""
+    """The bytes of a SOG of 100 Gaussians, with changed metadata and added or replaced files."""
     stream = io.BytesIO()
     with TemporaryDirectory() as folder:
         write_gaussians(Path(folder) / "a.sog", make_scene(100, 1))

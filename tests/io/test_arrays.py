@@ -1,4 +1,4 @@
-"""Arrays, JSON and YAML that are damaged or made to harm: a short reason, and no memory for mere claims."""
+"""Damaged or malicious arrays, JSON and YAML: a short message, and no memory for sizes merely claimed."""
 
 import tracemalloc
 import zipfile
@@ -24,7 +24,7 @@ def head(shape: str, kind: str = "<f4") -> str:
     [
         b"",
         b"\x93NUMPY",
-        npy("{'descr': '<f4', 'shape': (("),  # a TokenError of numpy's
+        npy("{'descr': '<f4', 'shape': (("),  # numpy raises a TokenError
         npy(head("(1099511627776,)")),
         npy(head("(1099511627776, 1099511627776)")),
         npy(head("(4611686018427387904, 0)")),
@@ -76,7 +76,7 @@ def test_what_is_whole_is_read(tmp_path):
 @pytest.mark.parametrize("parse", [parse_json, parse_yaml])
 @pytest.mark.parametrize("text", ["[" * 100_000, "9" * 5000, '{"a": ', '"' + "x" * 100_000])
 def test_text_that_is_too_deep_or_too_long(parse, text):
-    with pytest.raises(ValueError) as refused:  # noqa: PT011 (the message is of its length alone)
+    with pytest.raises(ValueError) as refused:  # noqa: PT011 (only the length of the message counts)
         parse(text)
     assert 0 < len(str(refused.value)) < 500
 

@@ -1,4 +1,4 @@
-"""What messages list."""
+"""Lists of names in messages."""
 
 from gsjax.io.brief import shortened
 

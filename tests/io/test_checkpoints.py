@@ -1,4 +1,4 @@
-"""Checkpoints: what is stored comes back without a template; a damaged or foreign file says what is wrong."""
+"""Checkpoints are loaded without a template; errors of damaged or foreign files say what is wrong."""
 
 import json
 import pickle
@@ -71,7 +71,7 @@ def test_what_cannot_be_made_again_is_refused_when_it_is_saved(tmp_path, leaf):
 
 
 def with_header(path, change):
-    """The same file whose header was changed."""
+    """Rewrites a file with a changed header."""
     with np.load(path) as archive:
         arrays = {name: archive[name] for name in archive.files}
     header = json.loads(str(arrays.pop("__header__")))

@@ -1,4 +1,4 @@
-"""Codebooks and palettes: exact of few values, near to many."""
+"""Codebooks and palettes represent few values exactly and many closely."""
 
 import numpy as np
 

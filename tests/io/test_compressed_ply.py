@@ -1,4 +1,4 @@
-"""PlayCanvas's compressed PLY: another encoder's values are read within quantisation; faults are named."""
+"""PlayCanvas's compressed PLY: values are read to within another encoder's quantisation; faults are named."""
 
 import math
 import runpy
@@ -90,7 +90,7 @@ def header_lines(name, count, kind, properties):
 
 
 def write(path, scene, chunk_colors=True):
-    """The bytes of a compressed PLY, as splat-transform lays them out."""
+    """Writes a compressed PLY with the layout of splat-transform."""
     chunks, vertices, rest = pack(scene, chunk_colors)
     rest_names = [f"f_rest_{i}" for i in range(scene["rest"].shape[1])]
     header = ["ply", "format binary_little_endian 1.0", "comment made by a test"]

@@ -1,5 +1,5 @@
-"""Every format as other programs have it: they read what we write, and we read what they write. Skipped
-without them (tests/io/converters.py)."""
+"""Other programs read every format as we write it, and we read it as they write it. Skipped where they are
+not installed (tests/io/converters.py)."""
 
 import json
 import struct
@@ -47,7 +47,7 @@ def test_we_read_what_they_write(tmp_path, program, ending, degree):
     program(tmp_path / f"theirs{ending}", tmp_path / "again.ply")
     again, _ = read_ply(tmp_path / "again.ply")
     assert_alike(program.axes(again, ending), back, ROUNDING[".ply"], times=20)
-    # They round down where we round to the nearest, have 12 bits of fractions in an SPZ where we have 16, and
+    # They round down where we round to nearest, and have 12 fractional bits in an SPZ where we have 16;
     # splat-transform lets 300 Gaussians share 256 sets of coefficients in a SOG.
     rounding = replace(ROUNDING[ending], rest=2.0) if ending == ".sog" else ROUNDING[ending]
     assert_alike(program.axes(scene, ending), back, rounding, times=16 if ending == ".spz" else 3)
@@ -64,7 +64,7 @@ def test_both_read_the_same_ksplat(tmp_path, program, level):
 
 @pytest.mark.parametrize("name", ["splat-transform"])
 def test_glb_is_written_alike(tmp_path, program):
-    """Up to the axes, which we turn by the node: what does not depend on them."""
+    """Compares what does not depend on the axes, which we rotate by a glTF node."""
     write_gaussians(tmp_path / "ours.ply", make_scene(50, 2))
     write_gaussians(tmp_path / "ours.glb", make_scene(50, 2))
     program(tmp_path / "ours.ply", tmp_path / "theirs.glb")
@@ -81,7 +81,7 @@ def test_glb_is_written_alike(tmp_path, program):
 
 
 def glb_of(path):
-    """The arrays of a .glb's one primitive, each packed, and what it says of its extension."""
+    """The arrays of a .glb's only primitive, each contiguous, and its extension's properties."""
     data = path.read_bytes()
     (size,) = struct.unpack_from("<I", data, 12)
     tree, binary = json.loads(data[20 : 20 + size]), data[28 + size :]

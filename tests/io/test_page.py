@@ -1,5 +1,5 @@
-"""The page of a scene, opened from disk by a browser: it shows what the rasterizer does. Skipped without
-Chromium (`apt install chromium`)."""
+"""The HTML page of a scene: what it holds, and that a browser shows what the rasterizer renders. Tests in a
+browser are skipped without Chromium (`apt install chromium`)."""
 
 import base64
 import html
@@ -58,7 +58,7 @@ def camera_at(yaw, pitch, distance, center) -> Camera:
 
 
 def film_of(scene, *, scales: bool) -> Film:
-    """Three frames in which all but the last 20 Gaussians shift, turn and fade, and perhaps grow."""
+    """Three frames in which all but the last 20 Gaussians move, rotate and fade, and grow if `scales`."""
 
     def at(frame):
         some = (jnp.arange(scene.num) < scene.num - 20)[:, None] * frame * 1.0
@@ -74,7 +74,7 @@ def film_of(scene, *, scales: bool) -> Film:
 
 
 def motion_in(page):
-    """What a page is told of its motion, and its steps, [T,M,values]."""
+    """A page's description of its motion, and the quantised motion, [T,M,values]."""
     text = page.read_text()
     motion = json.loads(re.search(r"const about = (\{.*\});", text)[1])["motion"]
     packed = zlib.decompress(base64.b64decode(re.search(r'id="motion" type="text/plain">([^<]*)<', text)[1]))
@@ -109,7 +109,7 @@ def test_it_holds_what_moves_to_16_bits(tmp_path, scales):
 
 @pytest.mark.parametrize("size", [1e-3, 1.0, 1e3])
 def test_one_gaussian_far_away_does_not_coarsen_the_others(tmp_path, size):
-    """Steps of places are small beside Gaussians of 0.7 % of the scene, whatever its unit."""
+    """Quantisation of positions is fine relative to Gaussians of 0.7 % of the scene, whatever its unit."""
     scene = flat(make_scene(50))
     scene = eqx.tree_at(lambda g: g.means, scene, size * scene.means.at[0].set(jnp.array([2000.0, 0, 0])))
     shift = size * jnp.array([0.01, 0, 0])
@@ -158,14 +158,14 @@ def test_what_cannot_be_played_is_refused(tmp_path, monkeypatch):
 
 
 def browse(*arguments) -> str:
-    """What Chromium prints."""
+    """The output of Chromium."""
     command = [BROWSER, *OPTIONS, f"--window-size={WIDTH},{HEIGHT}", "--hide-scrollbars", *arguments]
     return subprocess.run(command, capture_output=True, timeout=120, text=True).stdout
 
 
 @pytest.mark.skipif(BROWSER is None, reason="there is no Chromium")
 def test_a_browser_plays_it(tmp_path):
-    """It starts by itself, and keeps the times of the frames: the second is shown from 0.5 s on."""
+    """It starts by itself and keeps the times of the frames: the second is shown from 0.5 s on."""
     scene = flat(make_scene(50))
     write_gaussians(tmp_path / "scene.html", scene, film=film_of(scene, scales=False))
     page = browse("--virtual-time-budget=4000", "--dump-dom", (tmp_path / "scene.html").as_uri())

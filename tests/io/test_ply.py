@@ -135,7 +135,7 @@ def test_rows_that_cannot_be_drawn_are_culled_and_counted(tmp_path):
 
 
 def changed(path, gaussians, **columns):
-    """A PLY of these Gaussians with some properties replaced, by name, in their own types."""
+    """Writes a PLY of these Gaussians with the named properties replaced, in the types of `columns`."""
     write_ply(path, gaussians)
     old = PlyData.read(str(path), mmap=False)["vertex"].data
     types = {name: old.dtype[name] for name in old.dtype.names}
@@ -214,8 +214,8 @@ def of_size(size, count):
 
 @pytest.mark.parametrize("distance", [5, 20, 2000])
 def test_only_what_float32_has_lost_is_said_to_be_lost(tmp_path, distance):
-    """A scene of some millimetres, of Gaussians of 0.3 mm: steps of 2e-6 m are nothing to them, those of
-    1e-4 m are."""
+    """For a scene of some millimetres with Gaussians of 0.3 mm, float32 steps of 2e-6 m do not matter, but
+    those of 1e-4 m do."""
     path, gaussians = tmp_path / "scene.ply", random_gaussians(50)
     places = (0.003 * np.asarray(gaussians.means) + [distance, 0, 0]).astype(np.float32)
     changed(path, gaussians, **dict(zip("xyz", places.T, strict=True)), **of_size(3e-4, 50))
@@ -294,7 +294,7 @@ def test_labels_of_an_earlier_scene_go_with_it(tmp_path):
 
 
 def test_labels_beside_no_ply_are_kept(tmp_path):
-    """They belong to nobody whose PLY is replaced."""
+    """They do not belong to a PLY that is being replaced."""
     (tmp_path / "scene_labels.npz").write_bytes(b"mine")
     write_ply(tmp_path / "scene.ply", random_gaussians(3))
     assert (tmp_path / "scene_labels.npz").read_bytes() == b"mine"

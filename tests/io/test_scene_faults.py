@@ -1,4 +1,4 @@
-"""Files of Gaussians that are cut off, mislabelled or made to harm: refused in a sentence, in bounds."""
+"""Truncated, mislabelled or malicious files of Gaussians are refused with a message, in bounded memory."""
 
 import gzip
 import io
@@ -39,7 +39,7 @@ def test_an_spz_of_version_4_whose_table_lies(tmp_path, change, says):
 
 
 def refusal(path, data=None) -> str:
-    """What is said of a file that must be refused, within 100 MB of new memory."""
+    """The message with which a file is refused; asserts that this needs less than 100 MB of new memory."""
     if data is not None:
         path.write_bytes(data)
     tracemalloc.start()
@@ -54,7 +54,7 @@ def refusal(path, data=None) -> str:
 
 
 def test_sizes_of_an_spz_of_version_4_are_compared_as_a_whole(tmp_path, monkeypatch):
-    """Harmonics that are all 0 take no room in the file, whose other arrays do."""
+    """Harmonics that are all 0 take next to no room in a file; its other arrays do."""
     path, scene = tmp_path / "scene.spz", make_scene(20_000, 3)
     scene = eqx.tree_at(lambda g: g.shN, scene, 0 * scene.shN)
     monkeypatch.setattr("gsjax.io.scene_file._SMALL", 1 << 19)
@@ -108,7 +108,7 @@ def test_files_that_are_cut_off(tmp_path, ending, share):
         ("a.ksplat", b"\0\1\0\0" + struct.pack("<IIII", 1, 1, 1, 1) + bytes(4076)
          + struct.pack("<II", 1, 1 << 31) + bytes(1016), "section 0 with all its data"),
     ],
-    ids=map(str, range(99)),  # not the bytes, of which some hold the time
+    ids=map(str, range(99)),  # not the bytes, some of which contain the time
 )  # fmt: skip
 def test_files_of_another_kind(tmp_path, name, data, says):
     assert says in refusal(tmp_path / name, data)

@@ -1,5 +1,4 @@
-"""Files of Gaussians of every format: what is written is read back within the format's rounding, whatever its
-name."""
+"""Files of Gaussians in every format are read back within the format's rounding, whatever their names."""
 
 import gzip
 import json
@@ -154,7 +153,7 @@ def test_an_spz_holds_what_is_far_away_and_refuses_what_is_beyond(tmp_path):
 
 
 def test_spz_of_version_2(tmp_path):
-    """x y z of quaternions as bytes; positions of 12 fractional bits; by hand."""
+    """A file made by hand: x y z of quaternions as bytes, positions with 12 fractional bits."""
     positions = bytes([0, 16, 0, 0, 240, 255, 0, 8, 0])  # 1, -1, 0.5
     body = positions + bytes([51]) + bytes([128, 255, 0]) + bytes([160, 0, 255]) + bytes([255, 127, 128])
     (tmp_path / "scene.spz").write_bytes(gzip.compress(spz(2, 1, arrays=body)))

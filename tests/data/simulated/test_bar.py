@@ -42,7 +42,7 @@ def test_it_is_as_documented(scene):
 
 @pytest.mark.parametrize("t", [0, 29])
 def test_depth_agrees_with_tracks(scene, t):
-    """No depth of the bar lies behind one of its tracked points, and some camera sees almost all of them."""
+    """The bar's depth never lies behind its tracked points, almost all of which are seen by some camera."""
     seen = np.zeros(scene.truth.tracks.shape[1], bool)
     for c in range(8):
         pixels, depths = project_points(scene, t, c, scene.truth.tracks[t])

@@ -205,7 +205,7 @@ def test_a_ray_from_inside_meets_nothing():
 
 
 def beside(solid, sizes=None, ball=0.06):
-    """Two frames in which `solid` on a floor casts a shadow on it and on a ball of radius `ball`."""
+    """Two frames of `solid` on a floor beside a ball of radius `ball`; it can cast shadows on both."""
     things = Primitive("plane", (), CHECKED), solid, Primitive("sphere", (ball,), CHECKED, 2)
     poses = np.tile(rigid(None, np.array([[0.0, 0, 0], [0, 0, 0.25], [-0.2, 0.1, 0.06]])), (2, 1, 1, 1))
     scene = Scene(
@@ -250,7 +250,7 @@ def test_a_bent_box_casts_its_shadow():
     y, x = np.nonzero(~binary_dilation((sequence.mask(0, 0) > 0) | (empty.mask(0, 0) > 0)))
     camera = np.linalg.inv(empty.viewmats[0, 0])
     rays = camera[:3, :3] @ np.linalg.inv(empty.Ks[0, 0]) @ np.stack([x + 0.5, y + 0.5, np.ones(len(x))])
-    middle = np.array([[0.0], [0.0], [box.half_z]])  # of the body's frame
+    middle = np.array([[0.0], [0.0], [box.half_z]])  # origin of the body's frame
     points = camera[:3, 3:] + rays * empty.depth(0, 0)[y, x] - middle
     to_lamp = np.array(LAMP)[:, None] - middle - points
     nearest = np.min([beyond(box, points + share * to_lamp) for share in np.linspace(0, 1, 400)], axis=0)

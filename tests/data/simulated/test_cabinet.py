@@ -1,4 +1,4 @@
-"""The built-in cabinet: two states, each by cameras of its own, and what is true of them."""
+"""The built-in cabinet: two states, each seen by its own cameras, and their ground truth."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Flaws of masks have the requested kind and frequency, and are the same for the same seed."""
+"""Flaws added to masks have the requested kind and frequency, and are reproducible from the seed."""
 
 import numpy as np
 import pytest

@@ -42,7 +42,7 @@ def single(primitive, pose, light=LIGHT, extra=(), size=(WIDTH, HEIGHT)):
 
 
 def pixel_rays(width=WIDTH, height=HEIGHT):
-    """Directions [H,W,3] with z = 1 of the camera of `single`."""
+    """Ray directions [H,W,3] of the camera of `single`, with z = 1."""
     x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
     return np.stack([(x - width / 2) / width, (y - height / 2) / width, np.ones_like(x)], -1)
 

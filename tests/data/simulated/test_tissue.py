@@ -220,7 +220,7 @@ def test_it_is_opened_by_name():
 
 
 def test_a_stronger_pull_moves_it_as_much_farther(scene):
-    """Beside the breath, which stays."""
+    """Displacements scale with the pull, apart from those of breathing, which do not depend on it."""
     far = tissue(pull=2.0, frames=15, width=40, height=32).truth.tracks[14]
     none = tissue(pull=0.0, frames=15, width=40, height=32).truth.tracks[14]
     np.testing.assert_allclose(far - none, 2 * (scene.truth.tracks[14] - none), atol=1e-9)
