@@ -1,4 +1,4 @@
-"""Simulated tables, small enough for two busy cores, and a quick tracker."""
+"""Fixtures: simulated tables, small enough for two busy cores, and a quick tracker."""
 
 from dataclasses import replace
 from functools import cache
@@ -49,15 +49,15 @@ def table():
 
 @pytest.fixture(scope="session")
 def started(table):
-    """The started scene of the table of 2 cameras."""
+    """The initial scene of the table seen by 2 cameras."""
     _, frames, mask = table()
     return start_scene(frames[0], mask, 0, QUICK)
 
 
 @pytest.fixture(scope="session")
 def moved(table):
-    """(points of the carton in frame 6, its centre, frame 7, where the points are then,
-    the carton in the masks of frame 6)."""
+    """(points of the carton in frame 6, their centre, frame 7, the points' true positions in frame 7,
+    labels that are 1 on the carton in the masks of frame 6)."""
     sequence, frames, _ = table(8, 2, **SIZE)
     labels = np.stack([sequence.mask(6, c) for c in range(2)])
     labels = jax.device_put(np.where(labels == CARTON, 1, 0).astype(np.int32))
@@ -72,12 +72,13 @@ def moved(table):
 
 @pytest.fixture(scope="session")
 def centroid_errors():
-    """Metres between where each simulated object has gone and where the Gaussians of its label have."""
+    """errors(sequence, scene, pose, t) -> distance of the mean of each object's Gaussians from its true
+    position, metres."""
 
     def errors(sequence, scene, pose, t: int) -> dict[str, float]:
         labels = np.asarray(scene.labels[: scene.num_moving])
         start = np.asarray(scene.gaussians.means[: scene.num_moving])
-        now = np.asarray(pose.means[: scene.num_moving])  # without what has joined since
+        now = np.asarray(pose.means[: scene.num_moving])  # without Gaussians that have joined since
         result = {}
         for k, (name, value) in enumerate(zip(sequence.truth.names, sequence.truth.label_ids, strict=True)):
             member = labels == scene.label_ids.index(int(value))

@@ -1,5 +1,5 @@
-"""Methods in one jitted step, as docs/composition.md has them: tracker, feature distillation and graph; and a
-fit with a scene that deforms."""
+"""Methods composed in one jitted step, as in docs/composition.md: tracker, feature distillation and graph;
+and a fit together with a deforming scene."""
 
 import re
 from dataclasses import replace
@@ -43,7 +43,7 @@ RADIUS = 0.5
 
 @cache
 def page_names(function: str = "composed") -> dict:
-    """What the program of the page that defines a function defines."""
+    """The names defined by the page's program that contains a function."""
     (block,) = (one for one in programs("docs/composition.md") if f"\ndef {function}(" in one.text)
     names: dict = {}
     exec(compile(block.text, block.place, "exec"), names)
@@ -61,7 +61,7 @@ class Small(NamedTuple):
 
 @pytest.fixture(scope="module")
 def small(table, started):
-    """Three frames of a table, a tracker that looks nowhere but where things were, and nodes."""
+    """Three frames of a table, a tracker that searches only at the last known poses, and nodes."""
     sequence, frames, _ = table()
     align = AlignConfig(iterations=2, reach=0.0, turns=(), pixels=32, centers=32)
     config = replace(PRESETS["fast"], align=align, grow=GrowConfig(slots=0))
@@ -74,7 +74,7 @@ def small(table, started):
 
 @pytest.fixture(scope="module")
 def composed(small):
-    """composed(kind of graph) -> loss, init, step of the page, and the tracker in it."""
+    """composed(kind of graph) -> the page's loss, init and step, and the tracker that they use."""
     page = page_names()
     scene, cameras = small.run.params.scene, small.batches[0].frame.cameras
     plan = plan_render(scene.gaussians, cameras, headroom=2.0)
@@ -126,7 +126,7 @@ class TestOneStep:
             np.testing.assert_allclose(state[0].pose.means, tracked.pose.means, atol=1e-5)
             np.testing.assert_allclose(info["tracker"], followed["residual"], rtol=1e-3, atol=1e-5)
         assert step._cache_size() == 1
-        # The last step of the features by hand: of the graph of what its memory holds.
+        # The last step of the features by hand, on the graph of what its memory holds.
         memory, config = state[4], graph_config(kind)
         np.testing.assert_array_equal(memory.ids[:2], before[4].ids[1:])
         taught = CODES[jnp.maximum(memory.ids, 0)]
@@ -146,13 +146,13 @@ class TestSeenIds:
         sequence, _, _ = table()
         batch = small.batches[0]
         frame, ids = jax.device_get((batch.frame, small.ids[0]))
-        # Points of camera 1's own depth: it sees all of them, and has its mask's ids for them.
+        # Points from camera 1's own depth: it sees them all, so their ids are those of its mask.
         rows, columns = np.nonzero(frame.depths[1] > 0)
         places = _unprojected(frame, 1, rows, columns)
         alone = jax.tree.map(lambda a: a[1:], frame.cameras)
         found = ids_seen(places, alone, ids[1:], frame.depths[1:])
         np.testing.assert_array_equal(found, sequence.mask(0, 1)[rows, columns])
-        # A teacher's grid of half the size has that of the pixel at the same share of the picture.
+        # On a teacher's grid of half the size, the id is that of the cell at the same relative position.
         half = ids_seen(places, alone, ids[1:, ::2, ::2], frame.depths[1:])
         np.testing.assert_array_equal(half, ids[1, ::2, ::2][rows // 2, columns // 2])
 
@@ -185,7 +185,7 @@ def test_nodes_of_groups_are_blended_within_their_groups(small, started):
     np.testing.assert_allclose(weights.sum(axis=1), 1.0, atol=1e-5)
     assert (of_nodes[indices] == groups[:, None])[weights > 0].all()
     assert (np.bincount(of_nodes) <= 8).all()
-    # One group is as no groups.
+    # A single group gives the same nodes as no groups.
     alone = nodes_of(started.gaussians, 8, np.zeros_like(groups))
     plain = nodes_of(started.gaussians, 8)
     np.testing.assert_array_equal(alone.rows, plain.rows)
@@ -193,7 +193,7 @@ def test_nodes_of_groups_are_blended_within_their_groups(small, started):
 
 
 def test_the_page_has_what_the_experiment_runs():
-    """`composed` stands in both, letter for letter."""
+    """`composed` is the same in both, letter for letter, but for docstrings."""
     page, experiment = (
         (ROOT / path)
         .read_text(encoding="utf-8")
@@ -205,7 +205,7 @@ def test_the_page_has_what_the_experiment_runs():
 
 
 class Joined(NamedTuple):
-    """The page's step of a fit and a deforming scene, its params, and `batch(i)` of frame i."""
+    """The page's step for a fit and a deforming scene, its params, and `batch(i)` for step i."""
 
     step: Any
     configs: tuple[Any, Any]
@@ -215,7 +215,7 @@ class Joined(NamedTuple):
 
 @pytest.fixture(scope="module")
 def joined():
-    """Tissue that breathes, and the tools before it, which stand still as far as the fit is concerned."""
+    """Breathing tissue for the deforming scene, and the tools in front of it, static to the fit."""
     page, (frames, _) = page_names("together"), tissue()
     still = Fit(replace(FIT, steps=20, coarse_until=0.0, sh_degree=0))
     moving = Deform(replace(CONFIG, warmup=0, iterations=20, graph=GraphConfig(kind="none")))

@@ -1,5 +1,5 @@
-"""A custom loss beside a method's: it pulls where it should, by the right gradient, and costs nothing where
-there is none."""
+"""Custom losses beside those of a method: their gradients are right and take effect, and without any, nothing
+changes."""
 
 from dataclasses import replace
 from functools import cache, partial
@@ -37,13 +37,13 @@ CALLS = []
 
 
 def upwards(scene, rendered, frame):
-    """The first group is to rise, before anything else."""
+    """Raises the first group, with a weight that outweighs all other losses."""
     CALLS.append(1)
     return -1e3 * jnp.mean(scene.gaussians.means[:, 2], where=scene.labels == 1)
 
 
 def brighter(scene, rendered, frame):
-    """What is drawn is to be brighter than what was seen."""
+    """Makes the rendered images brighter than the frame."""
     return jnp.mean((rendered.colors - frame.images - 1.0) ** 2)
 
 
@@ -65,12 +65,12 @@ def mean_height(canonical):
 
 
 def uphill(means):
-    """The slope of `height`."""
+    """The gradient of `height`."""
     return np.broadcast_to([0.0, 0.0, HEIGHT_WEIGHT / len(means)], means.shape)
 
 
 def slope_added(loss_with, params, batch):
-    """By how much the slope of a method's loss differs with `height` from that without."""
+    """The gradient of a method's loss with `height` minus that without."""
 
     @partial(jax.jit, static_argnums=0)
     def slope(extra, params):
@@ -92,7 +92,7 @@ def pictures():
 
 @pytest.fixture(scope="module")
 def refined():
-    """What refinement makes of a ball that has sunk, with the losses given, computed once for each."""
+    """refined(*losses) -> the refinement of a ball that has sunk, with these custom losses; cached."""
     batch = batch_after([0.02, -0.01, -0.015, 0.0, 0.1, 0.05])
     batch = batch._replace(plan=replace(batch.plan, derivative="reverse"))
     still = Motion(jnp.zeros((1, 6)), jnp.zeros_like(batch.pose.means))
@@ -111,20 +111,20 @@ class TestInRefinement:
     @pytest.mark.parametrize("loss", [upwards, brighter])
     def test_its_derivative_is_that_of_differences(self, loss):
         batch = batch_after([0.01, 0.0, 0.0, 0.0, 0.05, 0.0])
-        # Nothing is left out of a picture, however faint: differences would jump where derivatives do not.
+        # No Gaussian is left out, however faint: finite differences would jump there, derivatives not.
         room = replace(batch.plan, capacity=200_000)
         batch = batch._replace(plan=replace(room, alpha_min=1e-9, min_transmittance=1e-12))
         direction = jnp.asarray([[0.3, -0.2, 0.5, 1.0, -1.0, 0.5]])
 
         @jax.jit
         def both(along):
-            """Of the motion along a line: the loss with it, and without."""
+            """What the custom loss adds to the loss at a motion along a line, and its reported value."""
             motion = Motion(along * direction, jnp.zeros_like(batch.pose.means))
             of = {"step": 0, "key": None, "config": RefineConfig()}
             value, info = refine_loss(motion, batch, extra_losses=(loss,), **of)
             return value - refine_loss(motion, batch, **of)[0], info["extra"]
 
-        # Forward mode, for which this batch's plan is made; `refine` takes the other one, below.
+        # Forward mode, for which this batch's plan is made; `refine` below uses reverse mode.
         (value, told), (found, _) = jax.jvp(both, (1e-3,), (1.0,))
         step = 1e-6
         expected = (both(1e-3 + step)[0] - both(1e-3 - step)[0]) / (2 * step)
@@ -168,7 +168,8 @@ def config(quick):
 @pytest.mark.slow
 def test_the_tracker_is_pulled_and_compiles_once(table, started, config):
     _, frames, _ = table()
-    # Beside custom losses a refinement is always kept: without any, other groups would differ by that.
+    # With custom losses a refinement is always kept. Without any, the other groups would differ for that
+    # reason alone.
     *_, plain = track(started, frames[0], frames[1:], config, extra_losses=(nothing,))
     calls, heights = [], []
     CALLS.clear()
@@ -196,7 +197,7 @@ def over_time(photographs):
 
 
 class TestOtherMethods:
-    """The same function of three arguments beside the losses of a fit, of parts and of a deforming scene."""
+    """The same custom loss added to those of a fit, of parts and of a deforming scene."""
 
     @pytest.mark.thorough
     def test_of_a_fit(self, photographs):

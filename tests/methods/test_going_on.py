@@ -1,4 +1,4 @@
-"""Runs that go on from a tick with other settings than it was made with."""
+"""Runs that are resumed from a tick with other settings than it was made with."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""Antipodal grasps: known shapes, the laws, and what must not be grasped."""
+"""Antipodal grasps: known shapes, invariances, and what must not be grasped."""
 
 import jax
 import jax.numpy as jnp
@@ -59,7 +59,7 @@ def test_a_box_is_grasped_across_its_only_narrow_side():
     assert found.score > 0.98
     np.testing.assert_allclose(found.width, 0.05, atol=0.004)
     pose = np.asarray(found.pose)
-    assert abs(pose[1, 1]) > 0.98  # it closes along y
+    assert abs(pose[1, 1]) > 0.98  # the fingers close along y
     assert abs(pose[1, 3]) < 0.003  # midway
 
 
@@ -114,12 +114,12 @@ def test_a_table_below_is_not_hit_and_a_wall_forbids_the_side_grasp():
     assert found.feasible
     inside = swept(found, table)
     assert not inside.any()
-    tube = cylinder(0.045, 0.5, 4000)[0]  # all around it, nearer than a finger is thick
+    tube = cylinder(0.045, 0.5, 4000)[0]  # all around, with less clearance than the thickness of a finger
     assert not grasp(cloud, (tube, np.ones(len(tube), bool))).feasible
 
 
 def swept(found, points):
-    """Which points are in one of the boxes that the fingers fill on their way to the contacts; in NumPy."""
+    """Whether each point is in the boxes that the fingers sweep on their way to the contacts; in NumPy."""
     pose = np.asarray(found.pose)
     local = (points - pose[:3, 3]) @ pose[:3, :3]
     x, y, z = np.abs(local[:, 0]), np.abs(local[:, 1]), local[:, 2]
@@ -187,7 +187,7 @@ def test_rows_that_are_not_finite_or_not_valid_change_nothing():
 
 def test_a_normal_that_is_not_finite_leaves_the_point_its_extent():
     points, normals = box((0.12, 0.05, 0.12))
-    unknown = np.where((np.abs(points[:, 1:2]) < 0.024), np.nan, normals)  # only the two sides have one
+    unknown = np.where((np.abs(points[:, 1:2]) < 0.024), np.nan, normals)  # only the two sides have normals
     found = grasp((points, unknown))
     assert found.feasible
     assert abs(np.asarray(found.pose)[1, 1]) > 0.98
@@ -198,7 +198,7 @@ def test_a_far_side_that_nobody_saw_counts_half_and_loses_to_one_that_was_seen()
     found = grasp(shell)
     assert abs(np.asarray(found.pose)[0, 1]) > 0.95  # along x, where both sides are seen
     assert found.score > 0.95
-    thin = box((0.12, 0.05, 0.12), faces=(0, 2, 5, 3, 1))  # along x it does not fit
+    thin = box((0.12, 0.05, 0.12), faces=(0, 2, 5, 3, 1))  # too wide along x
     found = grasp(thin, unseen=0.5)
     assert found.feasible
     assert 0.45 < found.score <= 0.5

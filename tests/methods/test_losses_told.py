@@ -1,4 +1,4 @@
-"""Custom losses that ask where in a run they are: which photograph or frame, and how far it has got."""
+"""Custom losses that ask for the index of the photograph or frame, and for the progress of the run."""
 
 from dataclasses import replace
 from functools import partial
@@ -24,7 +24,8 @@ def photographs():
 
 
 def losses_of(photographs):
-    """By how much a photograph differs from that of the index told; the index; the progress."""
+    """Losses that return how far the frame differs from the photograph with the given index; the index; and
+    the progress."""
     images = jnp.stack([jnp.asarray(frame.colors[0], jnp.float32) for frame in photographs])
 
     def elsewhere(scene, rendered, frame, *, index):

@@ -1,4 +1,4 @@
-"""Straight lines to a grasp."""
+"""Straight-line paths to a grasp."""
 
 import itertools
 
@@ -68,7 +68,7 @@ def test_the_plan_from_a_point_of_a_plan_is_its_rest(x, z, step):
 
 
 def distance(point, corners):
-    """From a point to a line through corners."""
+    """Distance from a point to the polyline through corners."""
     best = np.inf
     for a, b in itertools.pairwise(corners):
         share = np.clip((point - a) @ (b - a) / max((b - a) @ (b - a), 1e-12), 0, 1)

@@ -1,4 +1,4 @@
-"""What configurations refuse."""
+"""Values that configurations refuse."""
 
 from types import SimpleNamespace
 

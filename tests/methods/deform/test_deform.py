@@ -42,7 +42,7 @@ scene_at = jax.jit(DeformingScene.at)
 
 
 def sight(problem, run, i, time=None):
-    """PSNR of the scene rendered in the camera of frame `i`, at its time or another."""
+    """PSNR of the scene rendered by the camera of frame `i`, at its time or at another."""
     seen = problem.seen[i]
     there = scene_at(run.params, seen.time if time is None else time, run.kept.moving)
     drawn = render(there, seen.cameras, run.plans[PLAN])
@@ -75,7 +75,7 @@ class TestStart:
         assert not (known_depth(first)[y[inside], x[inside]] > 0).any()
 
     def test_later_frames_add_what_lies_far_behind_something(self, frames):
-        """A plate a third nearer hides tissue in the first frame, and is gone in the others."""
+        """A plate, a third nearer, hides tissue in the first frame and is absent from the others."""
         first = replace(frames[0], masks=None, depths=frames[0].depths.copy())
         first.depths[0, 20:32, 20:44] *= 2 / 3
         alone, all_ = (start_gaussians([first, *more], 0, 1.0) for more in ([], frames[1:]))
@@ -118,7 +118,7 @@ def test_nodes_blend_to_one_and_follow_what_is_near(frames):
     nodes, means = jax.device_get((nodes_of(gaussians, 40), gaussians.means))
     np.testing.assert_allclose(nodes.weights.sum(axis=1), 1.0, atol=1e-5)
     assert (nodes.weights > 0).all()
-    # A map that is linear in the place is blended to nearly itself.
+    # Blending nearly reproduces a function that is linear in the position.
     blended_places = (means[nodes.rows][nodes.indices] * nodes.weights[..., None]).sum(axis=1)
     assert np.abs(blended_places - means).max() < 0.5 * means.std()
     assert len(nodes_of(gaussians, 10 * gaussians.num).rows) == gaussians.num
@@ -146,7 +146,7 @@ class TestLearning:
         assert not any(info["skipped"] for info in infos)
         assert np.mean(now) > np.mean(first) + 1.5
         assert min(now) > min(first) + 1
-        # The deformation has its share: the last frame is not the first.
+        # Part of it is due to deformation: rendered at the time of the first frame, the last is worse.
         last = len(first) - 1
         assert now[last] > sight(problem, run, last, problem.seen[0].time) + 0.3
 
@@ -174,13 +174,13 @@ class TestLearning:
 
     @pytest.mark.thorough
     def test_rates_decay_over_warm_up_and_joint_steps(self, frames):
-        """The optimizer is new with the deformation; its schedule is not."""
+        """The optimizer is reset when deformation begins; its schedule continues."""
         method = Deform(replace(CONFIG, warmup=3, iterations=3, schedule="cosine", warmup_frames="all"))
         problem, run = method.start(frames)
         means = [np.array(run.params.gaussians.means)]
         means += [np.array(now.run.params.gaussians.means) for now in drive(method, problem, run)]
         steps = [np.abs(b - a).max() for a, b in pairwise(means)]
-        # Adam's first step is as long as the rate: of the third step after the warm-up, half of the first.
+        # Adam's first step is as long as the learning rate, which step 3 of 6 has halved.
         fall = 0.5 * (1 + np.cos(np.pi * 3 / 6))
         np.testing.assert_allclose(steps[3] / steps[0], fall, rtol=0.02)
 
@@ -203,7 +203,7 @@ class TestLearning:
         still = np.delete(np.arange(count), rows)
         np.testing.assert_array_equal(at[still], run.params.gaussians.means[still])
         assert np.abs(np.asarray(at - run.params.gaussians.means))[rows].max() > 0
-        # What was saved goes on to the same bits.
+        # Resumed from the checkpoint, it ends with the same bits.
         again, _ = load_checkpoint(tmp_path / "run.npz")
         *_, other = drive(method, problem, again)
         jax.tree.map(np.testing.assert_array_equal, run.params, other.run.params)
@@ -212,7 +212,7 @@ class TestLearning:
     def test_with_a_graph_it_goes_on_to_the_same_bits(self, learned, frames, lesson, tmp_path):
         problem, whole, *_ = learned
         for now in drive(Deform(CONFIG), *Deform(CONFIG).start(frames, lesson)):
-            if now.step == 50:  # after the graph was made
+            if now.step == 50:  # after the graph was built
                 save_checkpoint(tmp_path / "run.npz", now.run)
                 break
         again, _ = load_checkpoint(tmp_path / "run.npz")
@@ -232,7 +232,7 @@ class TestLearning:
 
     @pytest.mark.thorough
     def test_half_precision_is_learned_from_in_single(self, frames):
-        """Adam divided 0 by 0 there, and every Gaussian was culled without a word."""
+        """Regression test: in half precision, Adam divided 0 by 0, and all Gaussians were silently culled."""
         given = start_gaussians(frames, 0, CONFIG.start_pixels)
         halved = eqx.tree_at(lambda g: g.sh0, given, given.sh0.astype(jnp.float16))
         method = Deform(replace(CONFIG, warmup=2, iterations=0))
@@ -241,7 +241,7 @@ class TestLearning:
         assert all(jnp.isfinite(leaf).all() for leaf in jax.tree.leaves(last.run.params.gaussians))
 
     def test_given_gaussians_are_not_donated(self, frames, lesson):
-        """They are those that `learned` started from, so its program serves here too."""
+        """They have the shapes of those that `learned` starts from, so its compiled program is reused."""
         given, method = start_gaussians(frames, 0, CONFIG.start_pixels), Deform(CONFIG)
         next(drive(method, *method.start(frames, lesson, gaussians=given)))
         assert not given.means.is_deleted()
@@ -249,7 +249,7 @@ class TestLearning:
 
 @pytest.mark.thorough
 def test_the_class_of_a_trained_scene_is_the_teachers(learned):
-    """Tools are left out, so one class is in view."""
+    """Tools are masked, so there is a single class."""
     _, run, *_ = learned
     found = jax.jit(prompt_probabilities)(run.params.gaussians.features, np.float32(CODES))
     assert (np.asarray(found)[:, 0] > 0.9).mean() > 0.8
@@ -258,7 +258,7 @@ def test_the_class_of_a_trained_scene_is_the_teachers(learned):
 @pytest.mark.thorough
 @pytest.mark.parametrize("smaller", [1, 2])
 def test_pixels_that_do_not_count_have_no_label(frames, smaller):
-    """Else tissue behind a tool would learn the tool's features."""
+    """Otherwise, tissue behind a tool would learn the tool's features."""
     counts = np.ones_like(frames[0].masks)
     counts[0, 10:20, 30:44] = False
     ids = np.ones(counts.shape[1:], np.int32)[::smaller, ::smaller]

@@ -1,4 +1,4 @@
-"""Features of a deforming scene: losses of a teacher and of a graph, and prompts."""
+"""Features of a deforming scene: the losses of teacher and graph, and prompts."""
 
 from dataclasses import replace
 
@@ -44,7 +44,7 @@ class TestFeatureLoss:
         drawn = np.random.default_rng(0).uniform(size=(8, 12, 4)).astype(np.float32)
         ids = np.zeros((4, 6), np.int32)
         ids[1, 2] = -1
-        # A triangle two cells wide around the middle of each cell, in each axis.
+        # A triangle filter, two cells wide, around the centre of each cell along each axis.
         by_rows, by_columns = (
             np.maximum(0, 1 - np.abs((np.arange(2 * n) + 0.5) / 2 - (np.arange(n) + 0.5)[:, None]))
             for n in ids.shape
@@ -94,7 +94,7 @@ class TestGraph:
         assert all(value == 0 for value in of_graph(features, none[0], CONFIG.graph).values())
 
     def test_the_teachers_own_features_cost_nothing(self, graphs):
-        """One class in view: features that are its code have no node loss, and no pair apart."""
+        """With one class in view and its code as the feature of all nodes, no node or pair has a loss."""
         nodes, found = graphs
         features = np.tile(CODES32[0], (nodes.max() + 1, 1))
         for kind, names in (("matching", ("node", "structure")), ("similarity", ("spatial", "temporal"))):

@@ -21,7 +21,7 @@ TINY = DeformConfig(warmup=3, iterations=3, nodes=16)
 
 @pytest.fixture(scope="module")
 def frames():
-    """A camera around an object at an unknown distance."""
+    """Frames of a camera that moves around an object at an unknown distance."""
     images = np.random.default_rng(0).integers(0, 255, (3, 32, 40, 3), np.uint8)
     eyes = np.array([[0.1, 0.2, -2.0], [0.6, 0.1, -1.8], [-0.7, 0.3, -2.2]])
     views = [look_at(eye, np.array([0.05, 0.0, 0.0]), UP) for eye in eyes]

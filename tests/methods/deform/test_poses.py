@@ -50,13 +50,13 @@ def center(viewmat):
 
 
 def turned(one, other):
-    """Degrees."""
+    """The angle between the orientations of two cameras, degrees."""
     return np.rad2deg(Rotation.from_matrix(one[:3, :3] @ other[:3, :3].T).magnitude())
 
 
 @pytest.fixture(scope="module")
 def frames():
-    """Static built-in tissue, tools left out."""
+    """Frames of static built-in tissue, with tools masked."""
     seen = gsjax.open_sequence("simulated:tissue?width=40&height=32&frames=4&still=true").select(cameras=(0,))
     return frames_of(seen)
 
@@ -78,7 +78,7 @@ def viewmats_of(frames):
 
 
 def corners_off(found, frames):
-    """Reprojection error in pixels, as rotations and translations look much alike."""
+    """Mean reprojection error of each frame, pixels, as rotations and translations are hardly separable."""
     offs = []
     for viewmat, frame in zip(found, frames, strict=True):
         pixels = np.array([[5, 5, 1], [35, 5, 1], [20, 16, 1], [5, 27, 1], [35, 27, 1]], float)
@@ -138,7 +138,7 @@ class TestRefining:
             others = np.arange(len(rows)) != i
             np.testing.assert_array_equal(slope[others], 0)
             assert slope[i].any() == (i != problem.first)
-        # Down the slope it is less.
+        # A step against the gradient lowers the loss.
         step = 1e-4 * slopes[2] / np.linalg.norm(slopes[2])
         fall = float(of(rows - step, batches[2]) - of(rows + step, batches[2]))
         np.testing.assert_allclose(fall, -2e-4 * np.linalg.norm(slopes[2]), rtol=0.15)

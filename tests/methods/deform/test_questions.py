@@ -1,4 +1,4 @@
-"""Questions on a made-up deforming scene of known facts: parsing and answers."""
+"""Questions about a synthetic deforming scene with known answers: parsing and answering."""
 
 from dataclasses import replace
 
@@ -31,21 +31,21 @@ WIDTH, HEIGHT = 64, 48
 K = intrinsics(60.0, WIDTH, HEIGHT)
 NAMES = ("tissue", "needle_driver")
 FRAMES = (10, 11, 12, 13)
-DEEP = 0.1  # of the tissue, metres
-# Of the tool: its middle pixel (column, row) and its depth, metres, in each frame; it is away in the first.
+DEEP = 0.1  # depth of the tissue, metres
+# The tool in each frame: its middle pixel (column, row) and depth, metres; absent from the first.
 TOOL = (None, (10, 8, 0.06), (32, 24, 0.09), (40, 24, 0.099))
 ask = TemplatedAnswerer()
 
 
 def pixels(columns, rows, depth):
-    """World points behind pixels of the camera, which stands at the origin."""
+    """World points at a depth behind pixels of the camera, which is at the origin."""
     x, y = np.meshgrid(columns, rows)
     ones = np.ones(x.size)
     return depth * np.stack([x.ravel() + 0.5, y.ravel() + 0.5, ones], 1) @ np.linalg.inv(K).T
 
 
 def made_up(t: int) -> LabelledView:
-    """A wall of tissue, and a tool of 7x7 pixels (11x11 in the second frame) before it."""
+    """View of frame `t`: a wall of tissue with, except in the first, a tool of 7x7 pixels in front."""
     labels, depths = np.zeros((HEIGHT, WIDTH), np.int32), np.full((HEIGHT, WIDTH), DEEP)
     points = np.full((49, 3), 9.0)
     if (tool := TOOL[t]) is not None:
@@ -111,7 +111,7 @@ class TestAnswers:
         assert found.value == pytest.approx(1e3 * np.median(np.linalg.norm(one - other, axis=1)))
 
     def test_direction_is_the_cameras(self, facts):
-        """A camera on its head sees what goes right go left."""
+        """An upside-down camera sees a motion to the right as one to the left."""
         over = np.diag([-1.0, -1.0, 1.0, 1.0])
         turned = [
             s._replace(viewmat=over, labels=s.labels[::-1, ::-1], depths=s.depths[::-1, ::-1])
@@ -242,7 +242,7 @@ class TestLanguageModel:
 
 @pytest.fixture(scope="module")
 def wall():
-    """A wall and a plate before it of 9 by 9 pixels, as Gaussians."""
+    """A wall and, in front of it, a plate of 9 by 9 pixels, as Gaussians."""
     wall = pixels(np.arange(-4, WIDTH + 4), np.arange(-4, HEIGHT + 4), DEEP)
     plate = pixels(np.arange(28, 37, 0.5), np.arange(20, 29, 0.5), 0.08)
     points = np.concatenate([wall, plate]).astype(np.float32)
@@ -271,7 +271,7 @@ class TestOfAScene:
         assert ask("how far is tissue from needle driver in frame 10", found).value == pytest.approx(
             20, abs=1.5
         )
-        assert 81 <= found.shares[0, 1] * WIDTH * HEIGHT <= 11**2  # a pixel wider at most
+        assert 81 <= found.shares[0, 1] * WIDTH * HEIGHT <= 11**2  # at most a pixel wider on each side
         np.testing.assert_allclose(found.shares.sum(), 1, atol=1e-6)
         np.testing.assert_allclose(found.centers[0, 1], (0.4, 0.4, 80), atol=1)
 

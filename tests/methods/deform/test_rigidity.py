@@ -1,4 +1,4 @@
-"""What no camera sees moves with what is around it: the strain between the nodes of a deforming scene."""
+"""Unseen Gaussians move with those around them: the strain between the nodes of a deforming scene."""
 
 from dataclasses import replace
 
@@ -17,14 +17,14 @@ from tests.methods.deform.tissue import CONFIG, tissue
 
 @pytest.fixture(scope="module")
 def begun() -> tuple:
-    """A problem, and its run as the field begins."""
+    """A problem, and its run when deformation begins."""
     method = Deform(replace(CONFIG, warmup=0, nodes=64))
     problem, run = method.start(tissue()[0])
     return problem, method.between(problem, run, 0.0)
 
 
 def with_bias(run: Run, bias) -> Run:
-    """The run with offsets added everywhere: of means, turns and sizes."""
+    """The run with constant offsets added to the field: of means, rotations and sizes."""
     bias = jnp.asarray(bias, jnp.float32)
     return run.having(params=eqx.tree_at(lambda p: p.field.layers[-1].bias, run.params, bias))
 
@@ -41,13 +41,13 @@ def test_a_scene_that_moves_or_grows_as_one_has_none(begun):
     _, run = begun
     bias = np.zeros(len(run.params.field.layers[-1].bias))
     assert strain_of(begun, run) == 0
-    bias[:3] = 0.1, -0.2, 0.3  # boxes
+    bias[:3] = 0.1, -0.2, 0.3  # units of the longest edge of the bounding box
     assert strain_of(begun, with_bias(run, bias)) < 1e-4
 
 
 @pytest.mark.thorough
 def test_turning_in_place_is_strained_as_neighbours_do_not_follow(begun):
-    """By half a turn of each node's surroundings: a strain of 2."""
+    """Each node rotates by half a turn while its neighbours stay: edges have strains of up to 2."""
     _, run = begun
     bias = np.zeros(len(run.params.field.layers[-1].bias))
     bias[3] = np.pi

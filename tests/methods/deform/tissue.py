@@ -26,13 +26,13 @@ CONFIG = DeformConfig(
 
 @cache
 def tissue():
-    """Every other frame of built-in tissue, tools left out, and the class of each pixel."""
+    """(every other frame of built-in tissue with tools masked, a lesson with the class of each pixel)."""
     seen = gsjax.open_sequence("simulated:tissue?width=64&height=52&frames=10").select(range(0, 10, 2), (0,))
     return frames_of(seen), Lesson([seen.mask(t, 0) for t in range(seen.num_frames)], CODES)
 
 
 def frames_of(seen):
-    """Frames of the first camera, tools left out."""
+    """Frames of the first camera, with tools masked."""
     last = seen.num_frames - 1
     return [
         one_frame(

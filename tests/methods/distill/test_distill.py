@@ -1,4 +1,4 @@
-"""A field learns from masks, in strips or at once, and is queried in 3D and 2D."""
+"""A field learns from masks, rendered at once or in strips, and is queried in 3D and 2D."""
 
 from dataclasses import replace
 
@@ -104,7 +104,7 @@ def test_strips_change_neither_the_loss_nor_its_slope(two_balls, kind):
         found.append(
             jax.jit(value, static_argnames="step")(run.params, given.views[0], step=0, key=jax.random.key(0))
         )
-    assert rows == 5  # which 0.1 MiB do not hold: 28 numbers and more of 384 pixels a row
+    assert rows == 5  # too many for 0.1 MiB: a row has 384 pixels of 28 numbers or more
     ((one, aux), slope), ((other, other_aux), other_slope) = found
     assert float(aux["contrast"]) > 0
     np.testing.assert_allclose(one, other, rtol=1e-5)
@@ -134,7 +134,7 @@ def test_it_learns_the_label_of_each_gaussian(two_balls, learned, problem):
 
 
 class Numerals:
-    """Reads "2" as row 2 of the book."""
+    """An encoder that embeds the text "2" as row 2 of the codebook."""
 
     min_score = 0.5
 
@@ -233,7 +233,7 @@ def test_a_threshold_names_its_rule():
     value, rule = alone.threshold(scores)
     assert 0.1 <= value < 0.8
     assert rule == "Otsu"
-    assert alone.threshold(np.full(9, 0.4)).value == np.inf  # nothing tells them apart
+    assert alone.threshold(np.full(9, 0.4)).value == np.inf  # nothing separates them
     assert alone.threshold(np.full(9, np.nan)).value == np.inf
 
 
@@ -275,7 +275,7 @@ def test_votes_are_the_light_that_gaussians_send_to_labels(two_balls):
     ids, voted = masks[0], jax.jit(label_votes, static_argnums=3)
     votes = np.zeros((scene.num, 3))
     np.add.at(votes, np.asarray(view.rows), np.asarray(voted(view, plan, ids, 3)))
-    # One Gaussian at a time: what it alone adds to the picture.
+    # The contribution of single Gaussians to the image.
     for row in (3, 90, 150):
         alone = np.float32(np.arange(scene.num) == row)[:, None]
         own = np.asarray(painted(view, alone, plan)[0])[..., 0]

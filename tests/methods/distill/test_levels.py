@@ -1,4 +1,5 @@
-"""What a view lacks on a level, others tell: a thing of two parts, which are not found in some views."""
+"""Embeddings missing from one level of a view are filled in from other views: an object of two parts, which
+some views lack."""
 
 from dataclasses import replace
 
@@ -15,7 +16,7 @@ from tests.methods.distill.two_balls import cameras, two_balls
 NAMES = ("small", "large")
 CODES = np.linalg.qr(np.random.default_rng(2).normal(size=(8, 8)))[0][:4].astype(np.float32)
 NOTHING, ONE, OTHER, THING = range(4)  # rows of the codes; the two balls together are the thing
-LACKING = {0: (1, 2), 3: (1,), 6: (2,)}  # which balls views have no small mask of
+LACKING = {0: (1, 2), 3: (1,), 6: (2,)}  # by view: the balls for which it has no small mask
 
 
 @pytest.fixture(scope="module")
@@ -24,7 +25,7 @@ def scene():
 
 
 def lesson(masks, lacking):
-    """A teacher on two levels with the small masks that are lacking filled in, and the ids of all."""
+    """A teacher on two levels, in which small masks that views lack are filled in from the large ones."""
     combinations = [(NOTHING, NOTHING), (ONE, THING), (OTHER, THING), (THING, THING)]
     codebook = np.stack([np.concatenate([CODES[k] for k in pair]) for pair in combinations])
     missing = [np.isin(mask, lacking.get(v, ())) for v, mask in enumerate(masks)]
@@ -57,12 +58,12 @@ def test_what_no_view_has_on_a_level_stays_that_of_the_next(scene):
     found = complete_teacher(given, frozen_views(gaussians, cameras(8)), gaussians.num)
     for v in range(8):
         same = np.isclose(embeddings_of(found, v), embeddings_of(given, v), atol=1e-5).all(axis=(-1, -2))
-        assert same.mean() > 0.95  # but for outlines, where Gaussians of the ball show some background
+        assert same.mean() > 0.95  # not at outlines, where the ball's Gaussians reach into the background
 
 
 @pytest.mark.thorough
 def test_many_kinds_are_clustered_and_drawn_a_few_at_a_time(scene, monkeypatch):
-    """Each view has embeddings of its own, a little beside the codes."""
+    """Each view has embeddings of its own, close to the codes."""
     gaussians, _, masks = scene
     given = lesson(masks, LACKING)
     random = np.random.default_rng(5)
@@ -91,7 +92,7 @@ def test_a_query_finds_parts_that_some_views_lack(scene):
         assert last.result.best_level(vectors) == level
         found = np.asarray(last.result.scores(vectors)) > 0.5
         assert (found == np.isin(labels, wanted)).mean() > 0.95
-    # As it came, the views that lack the parts teach that these are the thing.
+    # Without completion, views that lack the parts teach that these are the whole thing.
     start = method.start(gaussians, cameras(8), given._replace(filled=None), source=start[0].source)
     *_, raw = drive(method, *start)
     one = CODES[[ONE, NOTHING, OTHER, THING]]

@@ -1,4 +1,4 @@
-"""Vectors of Gaussians are solved for: a vote, then conjugate gradients, as a dense solution in float64."""
+"""Vectors of Gaussians by a vote and then conjugate gradients, against a dense solution in float64."""
 
 from dataclasses import replace
 
@@ -39,7 +39,7 @@ def scene():
 
 
 def teacher_with(masks, kind: str = "masks"):
-    """True masks with a few pixels unknown; or maps; or both."""
+    """A teacher with true masks in which a few pixels are unknown; or with maps; or with both."""
     random = np.random.default_rng(3)
     holes = [np.where(random.uniform(size=mask.shape) < 0.1, -1, mask) for mask in masks]
     objects = teacher_of_objects(holes, [BOOK] * len(masks))
@@ -95,7 +95,7 @@ def test_conjugate_gradients_reach_the_dense_solution_in_float64(scene, kind):
     field = ticks.result.field
     found = np.asarray(field.encoding, np.float64) @ np.asarray(field.lift, np.float64).T
     assert np.abs(found - wanted).max() < 2e-5 * np.abs(wanted).max()
-    losses = np.array([info["loss"] for info in infos])[15::8]  # after each pass but the vote
+    losses = np.array([info["loss"] for info in infos])[15::8]  # after each pass except the vote
     assert (np.diff(losses) <= 1e-6 * infos[7]["loss"]).all()
     assert not any(info["skipped"] for info in infos)
 
@@ -103,13 +103,13 @@ def test_conjugate_gradients_reach_the_dense_solution_in_float64(scene, kind):
 @pytest.mark.thorough
 @pytest.mark.parametrize("preset", ["vote", "solve"])
 def test_what_is_seen_and_in_no_mask_is_nothing(scene, preset):
-    """Not what lies beside it: one ball has masks, the other and the background have none."""
+    """It does not take the vector of its neighbours: only one ball has masks, the rest has none."""
     gaussians, labels, masks = scene
     teacher = teacher_of_objects([np.where(mask == 1, 1, -1) for mask in masks], [BOOK] * len(masks))
     ticks, _ = solved(gaussians, teacher, PRESETS[preset])
     cosines = np.asarray(ticks.result.cosines(BOOK[1:2]))[:, 0]
     assert (cosines[labels == 1] > 0.99).all()
-    assert (cosines[labels == 2] == 0).mean() > 0.8  # but for those at the outline of the first
+    assert (cosines[labels == 2] == 0).mean() > 0.8  # except at the outline of the first
 
 
 @pytest.mark.thorough
@@ -162,7 +162,7 @@ def test_strips_change_nothing(scene):
 @pytest.mark.thorough
 def test_what_no_pixel_shows_has_the_vector_of_its_neighbours(scene):
     gaussians, _labels, masks = scene
-    inside = np.array([[0.0, -0.5, 0.0], [0.0, 0.5, 0.0]], np.float32)  # of the balls, hidden by their shells
+    inside = np.array([[0.0, -0.5, 0.0], [0.0, 0.5, 0.0]], np.float32)  # centres of the balls, hidden
     means = np.concatenate([np.asarray(gaussians.means), inside, [[np.nan] * 3]]).astype(np.float32)
     rows = [*range(160), 0, 159, 0]
     both = jax.tree.map(lambda a: jnp.asarray(a)[np.array(rows)], gaussians)
@@ -249,7 +249,7 @@ def test_no_steps_at_all_are_refused():
 
 @pytest.mark.thorough
 def test_many_views_of_which_the_last_show_more_end_with_their_vote(scene):
-    """The energy of what is to be voted for rises with them, which is no divergence."""
+    """The energy of the target then rises with the views; this must not be taken for divergence."""
     gaussians, _, masks = scene
     some = [np.where((mask > 0) | (i < 120), mask, -1) for i, mask in enumerate(masks * 19)]
     method = Distill(PRESETS["vote"])

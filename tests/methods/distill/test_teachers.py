@@ -55,7 +55,7 @@ def scene():
 
 
 def halves(one: int, other: int) -> np.ndarray:
-    """Masks of a view: one object on the left, another on the right, and unknown at the top."""
+    """The mask of a view: one object on the left, another on the right, unknown at the top."""
     mask = np.full((HEIGHT, WIDTH), one, np.int64)
     mask[:, WIDTH // 2 :], mask[:4] = other, -1
     return mask
@@ -163,7 +163,7 @@ def test_the_length_of_an_encoders_vectors_does_not_matter(scene):
 
 @pytest.mark.thorough
 def test_it_learns_from_maps(scene):
-    """Maps of three stripes on the scene itself."""
+    """From maps of the scene itself, divided into three stripes by height."""
     labels = np.digitize(np.asarray(scene.means)[:, 2], [-0.25, 0.25])
     stripes = []
     for view, plan in frozen_views(scene, cameras(3)):

@@ -1,4 +1,4 @@
-"""Two balls of Gaussians, one in front of the other, with true masks of eight cameras, for fields."""
+"""Two balls of Gaussians, with true masks of eight cameras around them, from which fields learn."""
 
 import jax
 import jax.numpy as jnp
@@ -12,7 +12,7 @@ from tests.methods.around import cameras_around
 
 WIDTH, HEIGHT, DIMENSION = 48, 36, 24
 BOOK = np.linalg.qr(np.random.default_rng(0).normal(size=(DIMENSION, 3)))[0].T.astype(np.float32)
-"""A vector for the background and for each ball."""
+"""Embeddings of the background and of each ball."""
 
 painted = jax.jit(paint, static_argnames="plan")
 
@@ -23,7 +23,7 @@ def cameras(count: int) -> list[Camera]:
 
 
 def two_balls() -> tuple[Gaussians, np.ndarray, list[np.ndarray]]:
-    """A ball of Gaussians in front of another, their labels 1 and 2, and masks of eight cameras."""
+    """(two balls of Gaussians, the label of each Gaussian, 1 or 2, and the masks of eight cameras)."""
     random = np.random.default_rng(1)
     directions = random.normal(size=(160, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)

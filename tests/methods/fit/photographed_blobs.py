@@ -1,4 +1,4 @@
-"""Thirty blobs before black, and what eight cameras around them photograph."""
+"""Thirty blobs on black, photographed by eight cameras around them."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -20,7 +20,7 @@ def cameras(count: int) -> Camera:
 
 
 def photographed_blobs() -> list[Frame]:
-    """Eight photographs with depth, each a frame of one camera on the host."""
+    """Eight photographs with depth, each a frame of one camera, on the host."""
     random, count = np.random.default_rng(0), 30
     means, colors = random.uniform(-0.6, 0.6, (count, 3)), random.uniform(size=(count, 3))
     quats, scales = random.normal(size=(count, 4)), random.uniform(0.08, 0.25, (count, 3))

@@ -1,4 +1,4 @@
-"""A scene is found again from its photographs; a fit that is resumed goes on to the same bits."""
+"""Fits recover a scene from its photographs, and a resumed fit ends with the same bits."""
 
 from dataclasses import replace
 
@@ -54,13 +54,13 @@ def without_depth(views: list[Frame]) -> list[Frame]:
 
 
 def fitted_to(views, config, progress=None, **options):
-    """A fit that is yet to be driven."""
+    """The ticks of a fit, which has not run yet."""
     method = Fit(config, **options)
     return drive(method, *method.start(views), progress=progress)
 
 
 def copied(tree):
-    """What a step would give away."""
+    """A copy, on the host, of arrays that a step would donate."""
     return jax.tree.map(lambda leaf: np.array(leaf) if hasattr(leaf, "shape") else leaf, tree)
 
 
@@ -76,7 +76,7 @@ def psnr(gaussians, view: Frame) -> float:
 @pytest.mark.parametrize(("source", "steps", "seeds"), [("depth", 60, [1]), ("random", 400, range(1, 6))])
 def test_a_view_that_was_held_out_is_seen_better_and_better(views, source, steps, seeds):
     gains = []
-    for seed in seeds:  # a hundred Gaussians at random places may come to rest in others, so many are tried
+    for seed in seeds:  # random starts may end in local optima, so several are tried
         config = replace(QUICK, steps=steps, seed=seed, start=replace(QUICK.start, source=source))
         ticks = fitted_to(views[1:], config)
         assert ticks.problem.start == source
@@ -115,7 +115,7 @@ SPLITTING = replace(
 )
 def test_a_resumed_fit_is_equal_to_the_bit(views, config):
     for now in fitted_to(without_depth(views), config):
-        if now.step == 37:  # before the degree changes, or more slots are taken, at 40
+        if now.step == 37:  # at 40, the degree changes or slots are added
             params, state = jax.tree.map(jnp.copy, (now.run.params, now.run.state))
             halfway = now.run.having(params=params, state=state)
     method = Fit(config)
@@ -177,7 +177,7 @@ def test_cameras_that_stand_elsewhere_than_was_said_are_found(views):
         ]
         return np.mean([np.abs(a - b).mean() for a, b in seen])
 
-    # Turns and shifts of a camera look much alike; where the scene is seen is what can be known.
+    # A camera's rotation and translation are hardly distinguishable; the projections of points are.
     assert pixels_off(found) < 0.4 * pixels_off(off)
 
 
@@ -226,7 +226,7 @@ def test_what_a_mask_leaves_out_has_no_slope_and_costs_nothing(views):
         return jax.value_and_grad(lambda m: loss(m, batch, step=0, key=None)[0])(model)
 
     garbled = view.images.copy()
-    beyond = WIDTH // 2 + 12  # further off than SSIM's windows reach
+    beyond = WIDTH // 2 + 12  # beyond the reach of SSIM's windows
     garbled[:, :, beyond:] = 255 - garbled[:, :, beyond:]
     value, slope = of(view.images)
     other, other_slope = of(garbled)
@@ -273,7 +273,7 @@ def test_an_extent_is_that_of_the_cameras_and_where_they_look():
     found = extent_of(ahead)
     assert np.isfinite(found.focus).all()
     assert found.focus[2] > 0
-    turning = np.tile(np.eye(4), (4, 1, 1))  # all at one place, where their axes meet
+    turning = np.tile(np.eye(4), (4, 1, 1))  # all in one place, where their axes meet
     angles = np.array([-0.3, -0.1, 0.1, 0.3])
     turning[:, 0, 0], turning[:, 0, 2] = np.cos(angles), np.sin(angles)
     turning[:, 2, 0], turning[:, 2, 2] = -np.sin(angles), np.cos(angles)
@@ -318,7 +318,7 @@ def test_points_in_another_unit_than_the_poses_are_told(views):
     with pytest.warns(UserWarning, match=r"so far away .* are they in the unit of the poses"):
         start_points(views, (1e3 * points, colors), StartConfig(), 0)
     same_place = [having(view, viewmat=views[0].cameras.viewmat) for view in views]
-    start_points(same_place, (points, colors), StartConfig(), 0)  # says nothing: a warning fails the test
+    start_points(same_place, (points, colors), StartConfig(), 0)  # a warning would fail the test
 
 
 @pytest.mark.parametrize(
@@ -359,7 +359,7 @@ def test_depth_that_knows_nothing_is_no_start(views):
 def test_photographs_with_and_without_masks_and_depth_share_one_program(views):
     ones = np.ones((1, HEIGHT, WIDTH), bool)
     holed = ones.copy()
-    holed[0, 0, 0] = False  # which is gone in a smaller picture
+    holed[0, 0, 0] = False  # lost at lower resolutions
     mixed = [
         having(view, masks=[None, ones, holed][i % 3], depths=view.depths if i % 2 else None)
         for i, view in enumerate(views)

@@ -1,4 +1,4 @@
-"""Photographs of many sizes: padded to few, of which the padding counts for nothing."""
+"""Photographs of many sizes are padded to few, and the padding does not count."""
 
 from dataclasses import replace
 
@@ -68,7 +68,7 @@ def test_what_is_padded_does_not_count():
     assert (wide.cameras.width, wide.cameras.height, wide.images.shape) == (20, 15, (1, 15, 20, 3))
     assert wide.masks[0, :12, :16].all()
     assert wide.masks.sum() == 16 * 12
-    assert padded(frame, np.array([16, 12])).masks.all()  # in the form of the others
+    assert padded(frame, np.array([16, 12])).masks.all()  # all frames have the same structure
     same, none = with_common_sizes([frame, frame])
     assert (same, none) == ([frame, frame], None)
 
@@ -86,13 +86,13 @@ def test_a_padded_photograph_gives_the_steps_of_the_photograph():
         assert float(a.info["psnr"]) == pytest.approx(float(b.info["psnr"]), abs=2e-3)
     ours, theirs = a.run.params.gaussians.means, b.run.params.gaussians.means
     assert float(jnp.median(jnp.abs(ours - theirs))) < 1e-5
-    # SSIM's windows reach over the border, where they find what is there: in the padding, no error.
+    # SSIM's windows reach over the border into the padding, where there is no error.
     assert float(a.info["loss"]) == pytest.approx(float(b.info["loss"]), rel=5e-2)
 
 
 @pytest.mark.slow
 def test_padding_does_not_pull_gaussians_apart():
-    """The pull by which `split` divides Gaussians is per half a photograph, without what was padded."""
+    """The pull by which `split` divides Gaussians is in units of half the photograph, without its padding."""
     frame, method = photograph(32, 24), Fit(replace(CONFIG, strategy="split", dssim_weight=0.0, steps=1))
     problem, run = method.start([frame])
     other, second = method.start([frame])

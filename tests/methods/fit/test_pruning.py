@@ -1,4 +1,4 @@
-"""What sends light into a photograph is what compositing says, and nothing else is needed."""
+"""The light that a Gaussian sends into photographs is its compositing weights; without it, it is pruned."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -38,7 +38,7 @@ def test_light_is_the_sum_of_weights_in_the_view_that_sees_the_most():
     gaussians, views = wall(), [view((3.0, 0.2, 0.5)), view((2.5, -0.8, 0.1))]
     light = light_of(gaussians, views)
     summed = []
-    for one in views:  # each Gaussian's own colour is a unit vector: the picture holds all weights
+    for one in views:  # each Gaussian's colour is its own unit vector, so the image holds all weights
         drawn = rasterization_reference(
             gaussians.means,
             gaussians.quats,
@@ -71,7 +71,7 @@ def test_what_is_left_out_is_needed_least_and_sends_no_more_than_the_share(light
     assert light[~kept].sum() <= share + 1e-12
     if kept.any():
         assert light[~kept].max(initial=0.0) <= light[kept].min()
-        assert light[~kept].sum() + light[kept].min() > share - 1e-12  # and one more would be too much
+        assert light[~kept].sum() + light[kept].min() > share - 1e-12  # one more would exceed the share
 
 
 def test_a_scene_that_is_small_in_its_pictures_is_needed_all_the_same():

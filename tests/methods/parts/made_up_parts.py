@@ -1,4 +1,4 @@
-"""Scenes of parts and trajectories whose edits have known answers."""
+"""Synthetic scenes of parts and trajectories for which the results of edits are known."""
 
 import jax
 import jax.numpy as jnp
@@ -10,19 +10,19 @@ from gsjax.methods.parts.trajectory import Moment, PartScene, Trajectory, trajec
 from gsjax.scene.gaussians import Gaussians
 from gsjax.scene.handles import HandlePose
 
-STEP = 0.125  # seconds between moments: all times are told exactly, so moments can be hit to the bit
+STEP = 0.125  # seconds between moments; exact in binary, so that moments can be hit to the bit
 TIMES = STEP * np.arange(9.0)  # 0 to 1 s
 CENTERS = np.array([[0.0, 0.0, 0.0], [0.4, 0.1, 0.2], [-0.5, 0.3, 0.0]])
-"""Handles of a background, a lid and a drawer."""
+"""Centres of the handles of a background, a lid and a drawer."""
 
 
 def floats(values):
-    """Values on the device, in JAX's present floating type, which numpy converts them to."""
+    """Values on the device, in JAX's current default floating type; NumPy does the conversion."""
     return jax.device_put(np.asarray(values, jnp.result_type(float)))
 
 
 def scene_of(seed, num=7, parts=3):
-    """A scene with soft weights."""
+    """A random scene with soft weights."""
     rng = np.random.default_rng(seed)
     shapes = ((num, 3), (num, 4), (num, 3), (num,), (num, 1, 3))
     gaussians = Gaussians(*(floats(rng.normal(size=shape)) for shape in shapes))
@@ -31,13 +31,13 @@ def scene_of(seed, num=7, parts=3):
 
 
 def whole(scene, part):
-    """The scene, all of it one part's."""
+    """The scene with all Gaussians assigned to one part."""
     weights = floats(np.tile(np.arange(scene.weights.shape[1]) == part, (len(scene.weights), 1)))
     return PartScene(scene.gaussians, weights, scene.centers)
 
 
 def moment_of(seed, parts=3):
-    """A moment in which everything has changed."""
+    """A random moment, in which every part has moved and changed its opacity and size."""
     rng = np.random.default_rng(seed)
     pose = HandlePose(floats(rng.normal(size=(parts, 4))), floats(rng.normal(size=(parts, 3))))
     opacities, scales = rng.uniform(0.1, 0.9, parts), rng.uniform(0.5, 2.0, parts)
@@ -45,7 +45,7 @@ def moment_of(seed, parts=3):
 
 
 def trajectory(seed, moments=9, parts=4):
-    """Parts that go anywhere, by no more than half a radian and 20 cm from moment to moment."""
+    """Random motions of parts, by at most half a radian and 20 cm between moments."""
     rng = np.random.default_rng(seed)
     steps = Rotation.from_rotvec(rng.uniform(-0.25, 0.25, (moments * parts, 3)))
     turns = np.empty((moments, parts, 4))
@@ -64,7 +64,7 @@ def hinge(angles, axis=(0.0, 0.0, 1.0), point=(0.0, 0.0, 0.0)):
 
 
 def jointed(joints, centers, times):
-    """The trajectory of handles at `centers` whose parts move by these joints."""
+    """The trajectory of handles at `centers` whose parts move by the given joints."""
     motions = np.stack([joint.motions() for joint in joints], axis=1)
     turns = Rotation.from_matrix(motions[..., :3, :3].reshape(-1, 3, 3)).as_quat(scalar_first=True)
     shifts = np.einsum("tpij,pj->tpi", motions[..., :3, :3], centers) + motions[..., :3, 3] - centers
@@ -73,7 +73,7 @@ def jointed(joints, centers, times):
 
 
 def motions(trajectory, centers, part):
-    """Where a part's handle takes points of the world, [T, 4, 4]."""
+    """World-space transforms of a part at each moment, [T, 4, 4]."""
     quats = np.asarray(trajectory.poses.quats[:, part])
     turns = Rotation.from_quat(quats, scalar_first=True).as_matrix()
     found = np.tile(np.eye(4), (len(quats), 1, 1))
@@ -83,14 +83,14 @@ def motions(trajectory, centers, part):
 
 
 def rows(trajectory, parts, indices):
-    """What parts do at these moments, as one list of arrays."""
+    """Poses, opacities and scales of parts at the given moments, as a list of arrays."""
     chosen = (np.asarray(indices)[:, None], np.asarray(parts))
     leaves = (trajectory.poses, trajectory.opacities, trajectory.scales)
     return [np.asarray(leaf)[chosen] for leaf in jax.tree.leaves(leaves)]
 
 
 def assert_same(found, expected, atol=0.0):
-    """Two lists of arrays or two trees are equal, to the bit unless a tolerance is given."""
+    """Asserts that two lists of arrays or trees are equal, to the bit unless a tolerance is given."""
     if atol:
         jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=atol), found, expected)
     else:

@@ -1,4 +1,4 @@
-"""Boxes of Gaussians that move over a floor in given ways, seen by cameras around: nothing is unknown."""
+"""Boxes of Gaussians that move over a floor by given motions, seen by cameras around it, with full truth."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -20,14 +20,14 @@ _SPACING = 0.02
 
 @dataclass(frozen=True)
 class Box:
-    """A box, and where it goes.
+    """A box and its motion.
 
     Attributes:
         center, size: metres, at the canonical frame.
-        turns: [T, 3] rotation vectors about `pivot`, against the canonical frame.
-        shifts: [T, 3] metres.
+        turns: [T, 3] rotation vectors about `pivot`, relative to the canonical frame.
+        shifts: [T, 3] translations relative to the canonical frame, metres.
         pivot: the middle of the box unless given.
-        gone: frames in which it is not there.
+        gone: frames from which it is absent.
     """
 
     center: tuple[float, float, float]
@@ -38,7 +38,7 @@ class Box:
     gone: tuple[int, ...] = ()
 
     def motions(self) -> np.ndarray:
-        """[T, 4, 4], canonical to then."""
+        """[T, 4, 4] transforms from the canonical frame to each frame."""
         motions = np.tile(np.eye(4), (len(self.turns), 1, 1))
         rotations = Rotation.from_rotvec(self.turns).as_matrix()
         pivot = np.array(self.center if self.pivot is None else self.pivot)
@@ -47,7 +47,7 @@ class Box:
         return motions
 
     def points(self) -> np.ndarray:
-        """On its surface but the underside, which no camera sees, [n, 3]."""
+        """Points on its surface except the underside, which no camera sees, [n, 3]."""
         axes = [np.arange(-s / 2 + _SPACING / 2, s / 2, _SPACING) for s in self.size]
         found = []
         for k in range(3):
@@ -59,11 +59,11 @@ class Box:
 
 
 class MovingBoxes:
-    """What cameras see of boxes, 15 frames a second; a `gsjax.methods.protocols.SequenceLike`.
+    """A recording of boxes at 15 frames a second; a `gsjax.methods.protocols.SequenceLike`.
 
     Attributes:
-        gaussians: at the canonical frame, the floor's first.
-        bodies: of each Gaussian: 0 the floor, 1.. the boxes.
+        gaussians: those of the canonical frame, the floor's first.
+        bodies: the body of each Gaussian: 0 for the floor, 1 and above for the boxes.
     """
 
     def __init__(self, boxes: Sequence[Box], cameras: int = 3, seed: int = 0):
@@ -120,10 +120,10 @@ class MovingBoxes:
         return np.round(255 * np.asarray(self._frames[t].images[c])).astype(np.uint8)
 
     def masks(self, pieces: np.ndarray) -> np.ndarray:
-        """[C, H, W]: the piece in front in each pixel of the canonical frame.
+        """[C, H, W]: the piece that each pixel of the canonical frame shows.
 
         Args:
-            pieces: of each Gaussian.
+            pieces: the piece of each Gaussian.
         """
         one_hot = jax.device_put(np.eye(int(pieces.max()) + 1, dtype=np.float32)[pieces])
         drawn = render(self.gaussians, self.cameras, self._plan, features=one_hot)
@@ -131,6 +131,6 @@ class MovingBoxes:
 
 
 def linear(frames: int, end: Sequence[float], begin: int = 0) -> np.ndarray:
-    """[T, 3]: from nothing at frame `begin` to `end` at the last, at one pace."""
+    """[T, 3]: constant speed from 0 at frame `begin` to `end` at the last frame."""
     share = np.clip((np.arange(frames) - begin) / max(frames - 1 - begin, 1), 0, None)
     return share[:, None] * np.array(end, float)

@@ -1,4 +1,4 @@
-"""Parts that leave, or are yet to come, on boxes of which all is known."""
+"""Parts that leave or have yet to appear, on boxes with full ground truth."""
 
 from dataclasses import replace
 
@@ -18,8 +18,8 @@ GONE = (4, 5, 6)
 
 
 def boxes(gone, anchor=0):
-    """A box that turns, and one that slides and is not there in some frames; both go from the anchor frame,
-    the first or the last."""
+    """A box that turns, and one that slides and is absent from some frames; both start from the anchor,
+    which is the first or the last frame."""
     order = slice(None, None, -1 if anchor else 1)
     still, turns, there, back = (
         linear(FRAMES, to)[order] for to in ((0, 0, 0), (0, 0, 0.4), (0, 0.08, 0), (0, -0.1, 0))
@@ -29,7 +29,7 @@ def boxes(gone, anchor=0):
 
 
 def found(views, anchor=0, **changes):
-    """The result, and the label of the second box in it."""
+    """The result, and the label that the second box has in it."""
     config = replace(CONFIG, refine=RefineConfig(iterations=6), **changes)
     following = drive(*begun(views, views.bodies, config, anchor))
     assert all(bool(np.isfinite(now.info["loss"])) for now in following)
@@ -47,7 +47,7 @@ def test_a_part_that_leaves_or_is_yet_to_come_is_hidden(anchor, gone):
     true[list(gone)] = 0
     np.testing.assert_array_equal(shown[:, box], true)
     np.testing.assert_array_equal(np.delete(shown, box, 1), 1)
-    # It rests where it was seen last, or will be seen first, and its joint is that of the frames with it.
+    # It rests where it was last seen, or is first seen; its joint is that of the frames that show it.
     near = 3
     for t in gone:
         np.testing.assert_array_equal(result.poses(t).translations[box], result.poses(near).translations[box])

@@ -1,4 +1,4 @@
-"""Edits compose as functions do, do what they say, and touch nothing else."""
+"""Edits do what they say, change nothing else, and compose like functions."""
 
 from functools import reduce
 
@@ -66,7 +66,7 @@ class TestEveryEdit:
         assert_same(after.times, before.times)
         assert_same(rows(after, [0, 2], range(9)), rows(before, [0, 2], range(9)))
         pairs = zip(rows(after, [1, 3], range(9)), rows(before, [1, 3], range(9)), strict=True)
-        assert any((new != old).any(axis=0).all() for new, old in pairs)  # both of the parts
+        assert any((new != old).any(axis=0).all() for new, old in pairs)  # of both parts
 
     def test_does_nothing_to_no_parts(self, edit):
         assert_same(edit(trajectory(2), []), trajectory(2))
@@ -154,7 +154,7 @@ class TestPlace:
     def test_rotate_turns_what_is_seen_about_the_handle_or_another_point_of_the_part(self, seed):
         scene, turn = whole(scene_of(seed, parts=4), 1), Rotation.from_rotvec(np.asarray(TURN))
         for arm in (jnp.zeros(3), ARM):
-            point = scene.centers[1] + arm  # of the part: seen as a Gaussian of it would be
+            point = scene.centers[1] + arm  # attached to the part, as its Gaussians are
             marked = eqx.tree_at(lambda s: s.gaussians.means, scene, scene.gaussians.means.at[0].set(point))
             one = trajectory(seed)
             one = eqx.tree_at(lambda t: t.scales, one, jnp.ones_like(one.scales))
@@ -178,7 +178,7 @@ class TestPlace:
         assert_same(twice, edits.rotate(room, [1], TURN), atol=1e-6)
 
     def test_redirect_turns_the_hinge_and_not_the_lid(self, room):
-        """A quarter turn about the vertical through the handle takes the hinge from one edge to another."""
+        """Rotating by 90 degrees about the vertical through the handle moves the hinge to another edge."""
         edited = edits.redirect(room, [1], jnp.array([0.0, 0.0, np.pi / 2]))
         found = motions(edited, CENTERS, 1)
         np.testing.assert_allclose(found[0], np.eye(4), atol=1e-6)
@@ -225,7 +225,7 @@ class TestPlace:
 
     @pytest.mark.parametrize("sign", [1.0, -1.0])
     def test_amplify_knows_more_than_half_a_turn(self, sign):
-        """Also when the part returns, and whatever the signs of the quaternions are."""
+        """Also when the part returns, and whatever the signs of the quaternions."""
         with jax.enable_x64(True):
             angles = sign * np.array([0.5, 1.5, 2.9, 4.0, 5.5, 4.5, 3.3, 2.0, 0.5])
             faucet = jointed([hinge(angles, LID.axis, LID.point)], CENTERS[1:2], TIMES)
@@ -299,7 +299,7 @@ SLOPES = {
 @pytest.mark.usefixtures("x64")
 @pytest.mark.parametrize("edit", SLOPES.values(), ids=SLOPES)
 def test_each_number_of_an_edit_has_its_slope_under_jit(edit):
-    """The gradient of fade, ghost and scale was an error, and those of speed and scale under jit."""
+    """Regression test: gradients of fade, ghost and scale failed, and those of speed and scale under jit."""
     one, scene = trajectory(0), scene_of(0, parts=4)
     one, scene = jax.tree.map(lambda leaf: jnp.asarray(leaf, float), (one, scene))
     to = jax.random.normal(jax.random.key(0), (9, 7, 7))
@@ -320,7 +320,7 @@ def test_each_number_of_an_edit_has_its_slope_under_jit(edit):
 
 @pytest.mark.thorough
 def test_edits_compose_and_differentiate_as_one_function():
-    """What a user writes: half the speed, twice as far, fainter and elsewhere, for a while."""
+    """As a user would combine them: slowed down, amplified, and moved elsewhere for a while."""
     scene = scene_of(0, parts=4)
 
     @jax.jit

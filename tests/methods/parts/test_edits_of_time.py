@@ -1,4 +1,4 @@
-"""Edits of time show parts as they were at other moments, to the bit."""
+"""Edits of time show parts as they were at other moments, to the bit if a moment is hit."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -37,7 +37,7 @@ class TestAtTimes:
     @pytest.mark.usefixtures("x64")
     @given(seeds)
     def test_between_moments_a_hinge_turns_about_its_axis(self, seed):
-        """A screw, not a chord: half way in time is half way in the angle, at any place of the handle."""
+        """Interpolated as a screw: halfway in time is halfway in angle, wherever the handle is."""
         rng = np.random.default_rng(seed)
         axis, point = Rotation.random(rng=rng).apply([0.0, 0.0, 1.0]), rng.normal(size=3)
         angles, centers = np.cumsum(rng.uniform(-1.5, 1.5, 9)), rng.normal(size=(1, 3))
@@ -67,7 +67,7 @@ class TestAtTimes:
 
 
 def plays(edited, seed, indices, parts=(1,)):
-    """Whether parts show these moments of `trajectory(seed)`, to the bit."""
+    """Asserts that parts show these moments of `trajectory(seed)`, to the bit."""
     assert_same(rows(edited, parts, range(9)), rows(trajectory(seed), parts, indices))
 
 
@@ -118,7 +118,7 @@ class TestTime:
     @pytest.mark.usefixtures("x64")
     @given(st.floats(0.2, 3.0), st.floats(0.2, 3.0))
     def test_speeds_multiply(self, a, b):
-        """Of a steady motion, which has no detail between moments, in a film that is long enough for both."""
+        """For a steady motion, which interpolation reproduces, in a film that is long enough for both."""
         long = edits.at_times(jointed([hinge(TIMES)], CENTERS[1:2], TIMES), STEP * jnp.arange(210.0))
         both = edits.speed(edits.speed(long, [0], a, 0.0, 1.0), [0], b, 0.0, 1 / a)
         once = edits.speed(long, [0], a * b, 0.0, 1.0)
@@ -144,7 +144,7 @@ class TestTime:
 
     @pytest.mark.thorough
     def test_rounding_of_times_does_not_show_the_wrong_side_of_a_seam(self):
-        """Thirtieths of seconds are told inexactly; a loop of 7 frames shows 7 frames all the same."""
+        """Thirtieths of a second are inexact in binary; a loop of 7 frames shows 7 frames all the same."""
         times = jnp.arange(200.0) / 30
         shifts = jnp.arange(200.0)[:, None, None] * jnp.ones(3)
         counting = eqx.tree_at(lambda t: t.poses.translations, still(1, times), shifts)

@@ -1,4 +1,4 @@
-"""Layers drawn together: copies of parts, parts of elsewhere, and nothing that is never seen."""
+"""Films of several layers: copies of parts, parts of other runs, and no Gaussians that are never visible."""
 
 import equinox as eqx
 import jax
@@ -45,7 +45,7 @@ class TestTrimmed:
         layer = layer_of(0, num=60)
         only = Layer(layer.scene, edits.ghost(layer.trajectory, [2]))
         hidden = Layer(layer.scene, edits.fade(layer.trajectory, range(4)))
-        film = trimmed((only, hidden, layer))  # of the second nothing is left
+        film = trimmed((only, hidden, layer))  # nothing is left of the second
         assert len(film) == 2
         weights = np.asarray(layer.scene.weights)[:, 2]
         peak = np.asarray(layer.scene.gaussians.opacities) * weights
@@ -64,7 +64,7 @@ class TestTrimmed:
         assert kept.sum() == visible.sum()
 
     def test_a_faint_part_keeps_its_gaussians(self):
-        """So that dragging an opacity compiles nothing anew."""
+        """So that dragging an opacity slider causes no recompilation."""
         layer = layer_of(0, num=60)
         sizes = {
             trimmed((Layer(layer.scene, edits.ghost(layer.trajectory, [1], faint)),))[0].scene.gaussians.num
@@ -120,7 +120,7 @@ def test_composite_shows_only_these_parts_at_the_times_of_the_film():
     assert both[0] is film[0]
     assert_same(both[1].trajectory.times, film[0].trajectory.times)
     assert not np.asarray(both[1].trajectory.opacities)[:, 0].any()
-    late = np.asarray(both[1].trajectory.poses.translations)[4:]  # what is over stands still
+    late = np.asarray(both[1].trajectory.poses.translations)[4:]  # after its end it stands still
     assert_same(late, np.broadcast_to(np.asarray(other.trajectory.poses.translations)[3], late.shape))
     assert film_gaussians(both, 5).num == 14
 

@@ -1,4 +1,4 @@
-"""Whole discoveries on boxes of which all is known."""
+"""Complete discoveries on boxes with full ground truth."""
 
 from dataclasses import replace
 
@@ -55,7 +55,7 @@ def boxes():
 
 
 def begun(views, pieces, config=CONFIG, anchor=0):
-    """The method, its problem and the run before the first step; and how the Gaussians are ordered in it."""
+    """The method, its problem, and the run before the first step."""
     found = choose_anchor(views.image, views.num_frames, views.num_cameras, anchor)
     moved = moved_pixels(views.image, found, views.num_cameras)
     start = begin(views, views.gaussians, found, moved, config, None, jax.random.key(0), views.masks(pieces))
@@ -63,14 +63,14 @@ def begun(views, pieces, config=CONFIG, anchor=0):
 
 
 class Followed:
-    """Parts that were followed to the last frame.
+    """A run in which parts are followed through all frames.
 
     Attributes:
-        method, problem: how, and what.
-        steps: info of all steps.
-        run: with the last frame's pose.
+        method, problem: the method and its problem.
+        steps, order: `info` of each step, and its frame.
+        run: the run at the end, with the pose of the last frame.
         parts, weights: the discovery, and the weights of the movable Gaussians.
-        result: of the last tick.
+        result: the result of the last tick.
     """
 
     def __init__(self, views, pieces, config=CONFIG, anchor=0):
@@ -89,7 +89,7 @@ def bodies_of(views, parts):
 
 
 def errors_mm(views, followed, t):
-    """Of the Gaussians of each box, in the median."""
+    """Median position error of the Gaussians of each box at frame t, millimetres."""
     parts = followed.parts
     moved = skinned(
         parts.canonical.movable, jnp.asarray(followed.weights), parts.canonical.centers, parts.pose(t)
@@ -101,7 +101,7 @@ def errors_mm(views, followed, t):
 
 
 def of_halves(boxes):
-    """One box is two pieces."""
+    """Pieces of the Gaussians, in which the first box is split into two."""
     left = np.asarray(boxes.gaussians.means)[:, 0] < -0.12
     return np.where((boxes.bodies == 1) & left, 3, boxes.bodies)
 
@@ -114,7 +114,7 @@ def halves(boxes):
 @pytest.mark.slow
 def test_two_halves_become_one_and_are_followed(boxes, halves):
     assert halves.parts.joined in (((1, 3),), ((3, 1),))
-    assert max(errors_mm(boxes, halves, FRAMES - 1)) < 3  # a pixel is 15
+    assert max(errors_mm(boxes, halves, FRAMES - 1)) < 3  # a pixel is 15 mm
     labels, bodies = halves.weights.argmax(-1), bodies_of(boxes, halves.parts)
     for body in (1, 2):
         names, counts = np.unique(labels[bodies == body], return_counts=True)
@@ -164,7 +164,7 @@ def test_two_boxes_in_one_piece_are_divided(boxes):
 @pytest.mark.parametrize("kind", ["table", "simplex"])
 @pytest.mark.slow
 def test_weights_in_a_table_are_followed_too(boxes, kind):
-    """Once, the table itself was given away in the first step."""
+    """Regression test: the first step donated the table that the discovery holds."""
     stream = replace(CONFIG.stream, iterations=3, field_rate=0.02, past=2)
     config = replace(CONFIG, weights=kind, stream=stream)
     method, problem, run = begun(boxes, boxes.bodies, config)
@@ -181,7 +181,7 @@ def test_weights_in_a_table_are_followed_too(boxes, kind):
 
 @pytest.mark.slow
 def test_what_no_picture_needs_is_given_up(boxes, halves):
-    """A piece of floor that was taken for a part is background again; the boxes stay."""
+    """A patch of floor that was taken for a part becomes background again; the boxes remain parts."""
     parts, weights = halves.parts, halves.weights.copy()
     bodies = bodies_of(boxes, parts)
     free = int(np.flatnonzero(~np.asarray(parts.canonical.alive))[0])
@@ -233,7 +233,7 @@ def test_nothing_joins_nothing(halves):
 
 @pytest.mark.slow
 def test_from_an_anchor_in_the_middle_both_ways(boxes):
-    """Canonical is frame 2: what it needs is the scene there."""
+    """Frame 2 is canonical, so the boxes' motions are given relative to it."""
     middle = MovingBoxes(
         [
             replace(box, turns=box.turns - box.turns[2], shifts=box.shifts - box.shifts[2])

@@ -1,4 +1,4 @@
-"""What was seen is within the limits, and how far beyond them an edit goes is told in metres and radians."""
+"""Captured motions are within the limits; how far an edit exceeds them is reported in metres and radians."""
 
 import jax
 import jax.numpy as jnp
@@ -72,7 +72,7 @@ def test_one_captured_moment_is_all_there_is():
 
 
 def test_what_is_only_moved_is_not_said_to_be_turned():
-    """A little nearer to where it was than to where it now would be is the door when it is turned."""
+    """Captured poses of the opened door are slightly nearer to the moved one, but only by a rotation."""
     captured = kitchen()
     moved = edits.move(captured.trajectory, [2], jnp.array([0.3, 0.1, 0.0]))
     beyond = how_far(captured, moved)

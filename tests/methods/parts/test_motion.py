@@ -1,4 +1,4 @@
-"""What moves, told from many views, and parts that jump."""
+"""Detection of what moves, from many views, and the search for parts that jump."""
 
 import jax
 import jax.numpy as jnp
@@ -22,7 +22,7 @@ FRAMES = 5
 
 @pytest.fixture(scope="module")
 def boxes():
-    """One that slides, and one that jumps by several times its width in each frame."""
+    """A box that slides, and one that jumps by several times its width in each frame."""
     slides = Box(
         (-0.15, -0.05, 0.05), (0.12, 0.08, 0.1), linear(FRAMES, (0, 0, 0)), linear(FRAMES, (0, 0.12, 0))
     )
@@ -51,7 +51,7 @@ def changes(boxes, plan, moved):
 @pytest.mark.thorough
 def test_what_leaves_changes_and_what_is_covered_for_a_while_does_not(boxes, changes):
     usual = changes.usual >= 0.5
-    assert usual[boxes.bodies > 0].mean() > 0.8  # the one that slides slowly is still there in part
+    assert usual[boxes.bodies > 0].mean() > 0.8  # the sliding box still overlaps its first position
     assert usual[boxes.bodies == 0].mean() < 0.12
     assert (changes.most >= 0.5)[boxes.bodies == 0].mean() > 0.3
     assert (changes.most >= changes.usual).all()
@@ -84,7 +84,7 @@ def test_pixels_show_what_may_move(boxes, plan, changes):
 
 
 def test_what_moves_joins_the_part_that_it_touches(boxes):
-    """The masks know half of the first box, and nothing of the second, which touches no part."""
+    """The masks cover half of the first box, and none of the second, which touches no part."""
     left = np.asarray(boxes.gaussians.means)[:, 1] < boxes.boxes[0].center[1]
     known = (boxes.bodies == 1) & left
     weights = np.eye(4, dtype=np.float32)[np.where(known, 1, 0)]
@@ -96,7 +96,7 @@ def test_what_moves_joins_the_part_that_it_touches(boxes):
 
 
 def test_what_came_before_something_did_not_move_it():
-    """With depth, the place that is covered does not count as changed."""
+    """With depth, what a moving object comes to cover does not count as changed."""
     pictures, depths = np.full((2, 12, 16, 3), 100, np.uint8), np.full((2, 12, 16), 2.0, np.float32)
     pictures[0, 4:8, 2:6], depths[0, 4:8, 2:6] = 250, 1.5
     pictures[1, 4:8, 10:14], depths[1, 4:8, 10:14] = 250, 1.5
@@ -111,20 +111,20 @@ def test_what_came_before_something_did_not_move_it():
 
 
 GRAIN = np.random.default_rng(0).integers(60, 200, (2, 40, 60, 1)) * np.array([1.0, 0.9, 0.8])
-SHADOW = slice(16, 25), slice(21, 35)  # without the border, where it is not told
+SHADOW = slice(16, 25), slice(21, 35)  # without the border, where shadows are not detected
 
 
 @pytest.mark.parametrize(
     ("now", "farther", "moves"),
     [
         (0.5 * GRAIN[0], 0.0, False),
-        (0.5 * GRAIN[0], 0.1, True),  # another table
-        (GRAIN[1], 0.0, True),  # of the same hue, as far away
+        (0.5 * GRAIN[0], 0.1, True),  # another surface, farther away
+        (GRAIN[1], 0.0, True),  # of the same hue and at the same depth
         (0.5 * GRAIN[0, ..., ::-1], 0.0, True),  # of another hue
     ],
 )
 def test_a_shadow_that_moves_is_no_motion(now, farther, moves):
-    """On a granite table, the shadow of a lid was followed as a part."""
+    """Regression test: on a granite table, the shadow of a lid was followed as a part."""
     noise = np.random.default_rng(1).normal(1, 0.002, (2, 40, 60))
     depths = (2 * noise).astype(np.float32)
     depths[1, 10:30, 15:40] += farther
@@ -138,14 +138,14 @@ def test_a_shadow_that_moves_is_no_motion(now, farther, moves):
 
 
 def test_a_plain_plate_that_slides_is_seen_to_move():
-    """It has no pattern that would tell it from a shadow."""
+    """It has no texture that would distinguish it from a shadow."""
     pictures, depths = np.full((2, 40, 60, 3), 80, np.uint8), np.full((2, 40, 60), 2.0, np.float32)
     pictures[0, 10:30, 5:25] = pictures[1, 10:30, 30:50] = 200
     assert changed_pixels(pictures, depths)[12:28, 9:21].all()
 
 
 def changed_pixels(pictures, depths):
-    """Of the first of two pictures of one camera."""
+    """The changed pixels of the first of two pictures from one camera."""
     anchor = Anchor(0, 1, np.array([0.0, 1.0]))
     depth = None if depths is None else lambda t, c: depths[t]
     return moved_pixels(lambda t, c: pictures[t], anchor, 1, frames=1, depth=depth)[0, 0]
@@ -192,7 +192,7 @@ def test_what_lands_in_front_of_something_is_found_by_the_other_cameras(boxes, s
     discovery = initial_run(start, FRAMES, PartsConfig()).kept._replace(predicted=pose)
     now, before = boxes.frame(t), np.asarray(boxes.frame(0).images)
     images = np.array(now.images)
-    images[0][np.abs(images[0] - before[0]).max(-1) > 0.05] = 0.5  # one of five sees something else there
+    images[0][np.abs(images[0] - before[0]).max(-1) > 0.05] = 0.5  # in one camera something else is there
     hidden = Frame(jnp.asarray(images), now.depths, now.cameras)
     found = searched(discovery, hidden, boxes.frame(0), "quaternion")
     assert np.linalg.norm(found.translations[2] - shifts[t]) < 0.025  # of 0.125 m
@@ -209,7 +209,7 @@ def test_what_is_where_it_should_be_stays_to_the_bit(boxes, start):
 
 
 def test_the_exposure_of_each_camera_is_found_whatever_stands_before_it(boxes, plan):
-    """Cameras of other gains and tints; the fourth has something in a corner that the scene has not."""
+    """Cameras differ in gain and tint; the fourth also sees something that is not in the scene."""
     drawn = [render(boxes.gaussians, one_camera(boxes.cameras, c), plan) for c in range(5)]
     rng = np.random.default_rng(0)
     maps = np.eye(3, 4) + rng.uniform(-0.05, 0.05, (5, 3, 4))

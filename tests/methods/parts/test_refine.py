@@ -1,4 +1,4 @@
-"""All frames together, on boxes of which all is known."""
+"""Refinement on all frames together, on a box with full ground truth."""
 
 from dataclasses import replace
 
@@ -28,7 +28,7 @@ from gsjax.scene.handles import HandlePose
 from tests.methods.parts.moving_boxes import Box, MovingBoxes, linear
 
 FRAMES = 3
-_BRIGHTER = 0.05  # of the first harmonic
+_BRIGHTER = 0.05  # added to the coefficients of degree 0
 CONFIG = PartsConfig(
     discover=DiscoverConfig(most_parts=2, lift_iterations=9),
     refine=RefineConfig(iterations=60, rate=0.3),
@@ -44,7 +44,7 @@ def boxes():
 
 @pytest.fixture(scope="module")
 def astray(boxes):
-    """The box is followed, but for a pixel, and the floor is too bright."""
+    """A run whose box is off by a pixel in all frames but the first, and whose floor is too bright."""
     found = choose_anchor(boxes.image, FRAMES, boxes.num_cameras, 0)
     moved = moved_pixels(boxes.image, found, boxes.num_cameras)
     masks = boxes.masks(boxes.bodies)
@@ -64,7 +64,7 @@ def astray(boxes):
 
 
 def refined(boxes, astray, config):
-    """Info and parameters of each step that refines the scene."""
+    """`info` of each refinement step, and the parameters after it."""
     method, problem, kept = Parts(config), Problem(boxes), astray.kept
     poses = HandlePose(jnp.asarray(kept.quats), jnp.asarray(kept.translations))
     params = jax.tree.map(jnp.copy, RefineParams(kept.canonical.movable, kept.canonical.fixed, poses))
@@ -77,7 +77,7 @@ def refined(boxes, astray, config):
 
 
 def off_mm(boxes, astray, translations):
-    """Of the box in each frame."""
+    """Position error of the box in each frame, millimetres."""
     center = np.asarray(astray.kept.canonical.centers)[1]
     motions = boxes.boxes[0].motions()
     true = motions[:, :3, :3] @ center + motions[:, :3, 3] - center
@@ -89,7 +89,7 @@ def test_frames_are_loaded_once_while_there_is_room(boxes, monkeypatch):
     loaded: list[int] = []
     problem, order = Problem(boxes), [0, 2, 1, 2, 0, 1, 1, 2]
     frames = [boxes.frame(t) for t in range(FRAMES)]
-    brighter = frames[0].images.at[0, 0, 0].set(1.003)  # as resampled pictures may be
+    brighter = frames[0].images.at[0, 0, 0].set(1.003)  # above 1, as in resampled images
     frames[0] = eqx.tree_at(lambda frame: frame.images, frames[0], brighter)
     monkeypatch.setattr(MovingBoxes, "frame", lambda self, t: loaded.append(t) or frames[t])
     for t in order:
@@ -115,7 +115,7 @@ def test_colours_and_poses_come_back(boxes, astray):
     poses = after[-1].poses
     assert off_mm(boxes, astray, astray.kept.translations)[1:].min() > 14  # a pixel
     assert off_mm(boxes, astray, poses.translations).max() < 6
-    np.testing.assert_array_equal(poses.quats[0], astray.kept.quats[0])  # canonical is canonical
+    np.testing.assert_array_equal(poses.quats[0], astray.kept.quats[0])  # the canonical pose stays
     np.testing.assert_array_equal(poses.translations[0], 0)
     np.testing.assert_array_equal(poses.translations[:, 0], 0)  # the background stands still
     brighter = after[-1].fixed.sh0 - np.asarray(astray.kept.canonical.fixed.sh0) + _BRIGHTER
@@ -144,13 +144,13 @@ def test_pictures_are_used_equally_often(cameras, each):
     order = order_of_pictures(0, frames, cameras, each * len(frames) * cameras)
     times = {(t, c): order.count((t, c)) for t in frames for c in range(cameras)}
     assert sum(times.values()) == len(order)
-    assert max(times.values()) - min(times.values()) <= 1 + (cameras > 4)  # the last round is begun
+    assert max(times.values()) - min(times.values()) <= 1 + (cameras > 4)  # the last round is partial
     assert order != order_of_pictures(1, frames, cameras, len(order))
 
 
 def test_by_default_each_picture_has_two_steps(boxes):
     method = Parts(replace(CONFIG, refine=RefineConfig()))
-    assert method.steps_of_refinement(Problem(boxes)) == 400  # of few pictures
+    assert method.steps_of_refinement(Problem(boxes)) == 400  # the minimum, for few pictures
     still = linear(150, (0, 0, 0))
     longer = MovingBoxes([Box((0, 0, 0.05), (0.12, 0.08, 0.1), still, still)])
     assert method.steps_of_refinement(Problem(longer)) == 2 * 150 * longer.num_cameras > 400

@@ -1,4 +1,4 @@
-"""From pictures to pieces: the anchor, what changed, masks in all views, logits, weights."""
+"""From pictures to pieces: the anchor, changed pixels, masks in all views, lifted labels, weights."""
 
 import jax
 import jax.numpy as jnp
@@ -28,7 +28,7 @@ FRAMES = 5
 
 
 def pictures(at, noise=0.0, size=48):
-    """(t, c) -> a square that is at column at[t] in frame t, over a grey pattern."""
+    """load(t, c) -> a picture of a square at column at[t] on grey, with noise."""
 
     def load(t, c):
         rng = np.random.default_rng((t, c))
@@ -60,7 +60,7 @@ def test_the_anchor_differs_most_from_all_others():
 
 
 def test_a_poor_anchor_is_warned_about():
-    """Something that comes and goes is seen from most frames only."""
+    """The square moves only in the last frame, so frame 0 differs from few of the others."""
     at = [4, 4, 4, 4, 4, 30]
     with pytest.warns(UserWarning, match="anchor: frame 0 differs from the others by .* frame 5 by"):
         choose_anchor(pictures(at), 6, 1, 0)
@@ -112,7 +112,7 @@ def test_segments_count_by_the_share_that_changed():
 
 
 def test_labels_of_all_views_count_by_what_changed_in_all():
-    """Number 1 is the largest; what changed in one view alone may change too little over all."""
+    """Label 1 is the largest; a label counts if enough of its pixels changed over all views together."""
     labels = np.array([[[7, 7, 7, 7], [3, 3, 5, -1]], [[7, 7, 5, 5], [5, 5, 5, 3]]])
     moved = labels == 7
     moved[0, 1, :2] = True  # two of three pixels of 3, none of 5
@@ -135,7 +135,7 @@ def test_views_are_taken_around():
 
 
 def test_numbers_pass_from_view_to_view():
-    """What the view before calls 2 is 2 here, though the segmenter says otherwise; what is new is new."""
+    """A segment that the previous view shows keeps its number there; the others get new ones."""
     segments = {0: np.repeat([1, 2, 0], 4)[None], 1: np.repeat([3, 0, 1, 2], 3)[None]}
     pictures = [np.full((1, 12, 3), c) for c in range(2)]
 
@@ -154,7 +154,7 @@ def test_numbers_pass_from_view_to_view():
     assert len(set(masks[1, 0].tolist()) - {0}) == 3
     assert masks.max() == 4
     few = propagate_masks(pictures, *geometry, moved, [0, 1], segmenter, known, 2, 9)
-    assert few.max() == 2  # the largest, which both views see
+    assert few.max() == 2  # only the two largest remain
     assert few[1, 0, 0] == few[0, 0, 4] == 1
     assert (masks[1, 0, 3:6] == 0).all()
 
@@ -177,14 +177,14 @@ def test_votes_are_shares_of_pixels(boxes):
     masks = boxes.masks(boxes.bodies)
     total = label_votes(boxes.gaussians, boxes.cameras, plan, masks, 3)
     assert (total >= 0).all()
-    pixels = masks.size  # no pixel has more than itself to give
+    pixels = masks.size  # a pixel gives at most one vote in total
     assert 0.2 * pixels < total.sum() <= pixels * (1 + 1e-5)
 
 
 @pytest.mark.thorough
 def test_many_labels_are_voted_for_and_drawn_like_few(boxes):
     plan = plan_render(boxes.gaussians, boxes.cameras, headroom=1.3)
-    view, count = one_camera(boxes.cameras, 0), 70  # more than one program takes at once
+    view, count = one_camera(boxes.cameras, 0), 70  # more than are rendered at once
     labels = np.random.default_rng(0).integers(-1, count, boxes.masks(boxes.bodies).shape[1:])
     votes = label_votes(boxes.gaussians, view, plan, labels[None], count)
     for some in (np.arange(3), np.arange(60, 70)):
@@ -196,7 +196,7 @@ def test_many_labels_are_voted_for_and_drawn_like_few(boxes):
     drawn = render_features(boxes.gaussians, view, plan, features)
     values = np.random.default_rng(2).random(drawn.shape, np.float32)
     there = (pixel_votes(boxes.gaussians, view, plan, values) * features).sum()
-    assert there == pytest.approx((drawn * values).sum(), rel=1e-4)  # one is the other's transpose
+    assert there == pytest.approx((drawn * values).sum(), rel=1e-4)  # they are adjoint
     assert not label_votes(boxes.gaussians, view, plan, np.full_like(labels, -1)[None], 3).any()
 
 
@@ -263,7 +263,7 @@ def test_a_start_knows_its_pieces(boxes):
     for part in (1, 2):
         middle = np.asarray(boxes.gaussians.means)[boxes.bodies == part].mean(0)
         assert np.linalg.norm(start.canonical.centers[part] - middle) < 0.02
-    # Each row of neighbours is of places nearby, none of them the Gaussian itself.
+    # The neighbours of a Gaussian are nearby, and it is none of them.
     near = means[np.asarray(start.canonical.neighbors)] - means[:count, None]
     assert np.linalg.norm(near, axis=-1).max() < 0.08
     assert (np.asarray(start.canonical.neighbors) != np.arange(count)[:, None]).all()

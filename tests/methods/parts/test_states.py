@@ -1,4 +1,4 @@
-"""Parts from two states: motions that nobody saw are found, and parts that nobody named."""
+"""Parts from two states: unobserved motions and unlabelled parts are recovered."""
 
 from dataclasses import replace
 
@@ -50,7 +50,7 @@ def found(cabinet):
 
 
 def true_motions(sequence, anchor=0):
-    """From one state to the other, for each part."""
+    """True motions from one state to the other, of each part."""
     return [relative_motion(sequence.truth.poses[:, k], anchor)[1 - anchor] for k in range(2)]
 
 
@@ -80,8 +80,8 @@ def test_points_follow_the_motion_of_what_they_are_on(cabinet, found):
 
 
 def worst_gap(found, sequence, anchor=0):
-    """The largest of the mean distances, of points of each part, between its true motion and the nearest that
-    was found, in pixels."""
+    """Mean distance of a part's points between its true motion and the nearest one found, pixels; the largest
+    of all parts."""
     points, labels = found.surface.points, true_labels_at(sequence, anchor, found.surface.points)
     gaps = []
     for k, label in enumerate(sequence.truth.label_ids):
@@ -92,7 +92,7 @@ def worst_gap(found, sequence, anchor=0):
 
 @pytest.mark.slow
 def test_backwards_the_motions_are_the_inverse(cabinet):
-    """Plates were off by pixels within their plane, until their edges and patterns were registered."""
+    """Regression test: plates were off by pixels within their plane. Edges and patterns prevent that."""
     found = states_of(cabinet.frame(1), cabinet.frame(0))
     assert worst_gap(found, cabinet, anchor=1) < 1.5
 
@@ -102,7 +102,7 @@ def test_backwards_the_motions_are_the_inverse(cabinet):
     "parts", ["doors=3&drawers=0&width=160&height=120", "doors=0&drawers=2&width=200&height=150"]
 )
 def test_parts_that_look_alike_are_not_mistaken_for_each_other(parts):
-    """Doors whose edges are hidden between their neighbours; drawers that would fit in each other's place."""
+    """Doors whose edges are hidden by their neighbours, and drawers that fit into each other's places."""
     sequence = gsjax.open_sequence(f"simulated:cabinet?{parts}")
     found = states_of(sequence.frame(0), sequence.frame(1))
     assert worst_gap(found, sequence) < 0.5
@@ -110,7 +110,7 @@ def test_parts_that_look_alike_are_not_mistaken_for_each_other(parts):
 
 @pytest.mark.slow
 def test_depth_may_be_noisy(cabinet):
-    """By half a percent, a millimetre to three pixels: no part was found."""
+    """Regression test: with noise of half a percent, no part was found."""
     random = np.random.default_rng(0)
 
     def noisy(frame):
@@ -142,7 +142,7 @@ def test_two_states_without_depth_are_refused(cabinet):
 
 
 def test_what_is_lit_otherwise_after_its_motion_is_as_like_as_before(corner):
-    """One side is in the light now, another in the shadow."""
+    """After the motion, one side is lit and another in shadow."""
     random = np.random.default_rng(0)
     colors = random.uniform(0.2, 0.4, corner.points.shape)
     part = corner._replace(colors=colors, brightness=colors.mean(-1))
@@ -154,7 +154,7 @@ def test_what_is_lit_otherwise_after_its_motion_is_as_like_as_before(corner):
 
 
 def test_edges_tell_where_a_plain_plate_lies_within_its_plane(corner):
-    """Its plane and its colour say nothing."""
+    """Its plane and its uniform colour do not determine that."""
     count = len(corner.points) // 3
     face = Surface(*(values[:count] for values in corner))
     face = face._replace(outward=around(face.points, face.normals, face.colors, 0.015)[0])
@@ -173,7 +173,7 @@ def test_edges_tell_where_a_plain_plate_lies_within_its_plane(corner):
 
 @pytest.mark.thorough
 def test_the_run_of_two_states_has_joints_and_is_refined(cabinet):
-    """Without a fit: the points that the cameras measure, as Gaussians."""
+    """Without a fit: the points measured by the cameras serve as Gaussians."""
     surface = surface_of(cabinet.frame(0), 2 * pixel_width(cabinet.frame(0)))
     gaussians = gaussians_from_points(surface.points, surface.colors)
     config = PartsConfig()
@@ -199,7 +199,7 @@ def test_an_anchor_that_is_neither_state_is_refused(cabinet):
 
 @pytest.fixture(scope="module")
 def corner():
-    """Points on three faces of a box, whose motion they determine."""
+    """Points on three faces of a box, which determine its motion."""
     flat = np.stack(np.meshgrid(np.linspace(0, 0.3, 21), np.linspace(0, 0.2, 15)), -1).reshape(-1, 2)
     points, normals = [], []
     for axis in range(3):
@@ -227,7 +227,7 @@ def test_a_motion_near_a_guess_is_found(corner, seed):
 
 
 def test_a_plate_that_may_slide_along_its_hinge_does_not(corner):
-    """Its plane tells neither its place within it nor, about an axis within it, the slide along that."""
+    """A plane determines neither the position within it nor a translation along a hinge that lies in it."""
     face = Surface(*(values[: len(values) // 3] for values in corner))
     true, guess = np.eye(4), np.eye(4)
     true[:3, :3] = Rotation.from_rotvec([0, 0, 1.0]).as_matrix()
@@ -246,12 +246,12 @@ def test_guesses_are_rigid_and_the_axes_those_of_the_normals(corner):
         rotations @ np.swapaxes(rotations, 1, 2), np.tile(np.eye(3), (len(motions), 1, 1)), atol=1e-9
     )
     np.testing.assert_allclose(np.linalg.det(rotations), 1)
-    for few in (np.zeros((0, 3)), np.tile([[0.0, 0.0, 1.0]], (9, 1))):  # no plane, or one
+    for few in (np.zeros((0, 3)), np.tile([[0.0, 0.0, 1.0]], (9, 1))):  # no normals, or a single direction
         np.testing.assert_allclose(axes_of(few) @ axes_of(few).T, np.eye(3), atol=1e-9)
 
 
 def test_a_surface_knows_its_edges_and_the_slope_of_its_brightness(cabinet):
-    """A sheet that is darker to one side."""
+    """On a sheet whose brightness increases along x."""
     flat = np.stack(np.meshgrid(np.arange(0, 0.4, 0.01), np.arange(0, 0.2, 0.01), indexing="ij"), -1)
     points = np.insert(flat.reshape(-1, 2), 2, 0.0, axis=1)
     normals, colors = np.tile([0, 0, 1.0], (len(points), 1)), np.tile(0.2 + points[:, :1], 3)
@@ -292,7 +292,7 @@ def test_what_nothing_is_known_of_takes_the_label_around_it(corner):
 
 @pytest.mark.parametrize("slides", [False, True])
 def test_a_hidden_wall_does_not_follow_what_slides_along_it(slides):
-    """Where a drawer hides it, a wall fits its other points as if it had slid; it was labelled so."""
+    """Regression test: a wall behind a drawer was labelled as sliding, as its hidden points fit that, too."""
     along, up = np.meshgrid(np.arange(0, 1, 0.01), np.arange(0, 0.2, 0.01), indexing="ij")
     points = np.stack([along.ravel(), up.ravel(), np.zeros(along.size)], -1)
     plain = np.tile([0.0, 0.0, 1.0], (len(points), 1))
@@ -309,7 +309,7 @@ def test_a_hidden_wall_does_not_follow_what_slides_along_it(slides):
 
 @pytest.mark.parametrize(("off", "worth"), [(0.0, 1.0), (0.01, 0.75), (0.018, 0.19)])
 def test_a_point_counts_less_the_farther_off_the_plane_it_comes(off, worth):
-    """Two drawers that had moved by five pixels more and less were one that had moved by the mean."""
+    """Regression test: drawers that moved five pixels more and less than their mean were found as one."""
     flat = np.stack(np.meshgrid(np.arange(0, 0.4, 0.01), np.arange(0, 0.2, 0.01), indexing="ij"), -1)
     points = np.insert(flat.reshape(-1, 2), 2, 0.0, axis=1)
     normals, colors = np.tile([0, 0, 1.0], (len(points), 1)), np.full_like(points, 0.5)

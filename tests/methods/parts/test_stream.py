@@ -1,4 +1,4 @@
-"""One step of the stream: its loss, its derivatives, what it may change; and the loss as residuals."""
+"""One step of streaming: its loss, its derivatives, and what it may change; and its loss as residuals."""
 
 from dataclasses import replace
 
@@ -43,7 +43,7 @@ def boxes():
 @pytest.mark.usefixtures("x64")
 @pytest.mark.parametrize("of", ["pose", "field"])
 def test_derivatives_are_those_of_finite_differences(boxes, of):
-    """Of the field without what tears, from which it is not to learn."""
+    """For the field without the tearing loss, from which it does not learn."""
     batch, bodies = batch_of(boxes, jnp.float64)
     moved = shifted(0.01, jnp.float64)
     quats = moved.quats.at[1].set(jnp.array([1.0, 0.02, -0.03, 0.05]))
@@ -76,7 +76,7 @@ def test_the_past_teaches_the_field_alone(boxes):
 
 @pytest.mark.thorough
 def test_what_a_step_may_change(boxes):
-    """The background's handle and empty slots stay, whatever pictures say; quaternions stay of length 1."""
+    """The background's handle and empty slots stay fixed, and quaternions keep unit length."""
     batch, bodies = batch_of(boxes)
     params = params_of(shifted(0.02), soft(bodies), bodies)
     step = stream_step(CONFIG)
@@ -97,7 +97,7 @@ def test_what_a_step_may_change(boxes):
 
 @pytest.mark.thorough
 def test_what_both_plans_need_is_reported(boxes):
-    """Of this frame and of the past, also where the first plan is too small."""
+    """The capacities for this frame and for past ones, also if the first plan is too small."""
     batch, bodies = batch_of(boxes)
     params = params_of(shifted(0.0), soft(bodies), bodies)
     small = batch._replace(plan=replace(batch.plan, capacity=64))
@@ -133,7 +133,7 @@ def test_what_moves_together_is_not_torn(boxes):
     torn = jax.jit(tearing)
     assert torn(canonical, weights, at_rest(PARTS), scale) == 0
     apart = torn(canonical, weights, shifted(0.05), scale)
-    # Of the neighbours those on the floor stay behind, those on the same box do not.
+    # Neighbours on the floor stay behind; those on the same box do not.
     floor = np.asarray(canonical.neighbors) >= len(bodies)
     assert apart == pytest.approx(floor.mean() * 300 / 301, rel=1e-3)
     assert torn(canonical, weights, shifted(0.5), scale) < 1.02 * apart
@@ -183,7 +183,7 @@ def test_several_frames_of_the_past_count_in_the_mean(boxes):
 
 
 def forward(batch):
-    """With a plan through which columns of a Jacobian can be pushed."""
+    """The batch with a plan for forward-mode derivatives."""
     return batch._replace(plan=replace(batch.plan, derivative="forward"))
 
 
@@ -223,17 +223,17 @@ def test_the_derivative_of_residuals_is_that_of_differences(boxes):
 
     rng = np.random.default_rng(0)
     at, way, far = jnp.zeros((PARTS, 6)), jnp.asarray(rng.normal(size=(PARTS, 6))), 1e-6
-    still = way.at[1:3].set(0)  # of the background and the empty slot
+    still = way.at[1:3].set(0)  # twists of the background and the empty slot alone
     np.testing.assert_array_equal(jax.jvp(values, (at,), (still,))[1], 0)
     way = way - still
     found = jax.jvp(values, (at,), (way,))[1]
     expected = (values(far * way) - values(-far * way)) / (2 * far)
-    # Where a faint edge ends, a pixel jumps; its difference is none of the derivative.
+    # Pixels jump where a faint Gaussian is cut off, which the derivative does not include.
     cosine = jnp.vdot(found, expected) / (jnp.linalg.norm(found) * jnp.linalg.norm(expected))
     assert cosine > 0.99
 
 
-# The background and the empty slot have columns of zeros, so there is more than one best move.
+# The background and the empty slot have zero columns, so the normal equations are singular.
 UNDAMPED = optimistix.GaussNewton(1e-4, 1e-5, linear_solver=lineax.AutoLinearSolver(well_posed=False))
 
 

@@ -1,4 +1,4 @@
-"""The films that edit scripts make: what is written is done, and a film is as long as it needs."""
+"""Films made by edit scripts: the edits are applied in order, and the film is as long as they need."""
 
 from dataclasses import replace
 
@@ -35,7 +35,7 @@ gaussians_then = jax.jit(film_gaussians)
 
 
 def layer_of(seed=0, moments=9, start=0.0):
-    """Four parts, each Gaussian of one of them, from 0 to 1 s unless told."""
+    """A layer of four parts with hard weights, from 0 to 1 s by default."""
     scene = scene_of(seed, num=8, parts=4)
     weights = jnp.asarray(np.eye(4)[np.arange(8) % 4], jnp.float32)
     scene = PartScene(scene.gaussians, weights, scene.centers)
@@ -48,7 +48,7 @@ def film_of(*script, layer=None, load_scene=None, **options):
 
 
 def shows(film, part, indices, layer=None):
-    """Whether a part shows these moments of the recording, to the bit."""
+    """Asserts that a part shows these moments of the recording, to the bit."""
     found = film[0].trajectory
     assert len(found.times) == len(indices)
     assert_same(
@@ -64,7 +64,7 @@ class TestLength:
     @pytest.mark.parametrize(
         ("edit", "moments"),
         [
-            (Speed(parts=(1,), factor=0.5), 17),  # the last of 1 s is shown at 2 s
+            (Speed(parts=(1,), factor=0.5), 17),  # the last moment, at 1 s, is shown at 2 s
             (Speed(parts=(1,), factor=2.0), 9),  # the others go on
             (Speed(parts=("all",), factor=2.0), 5),
             (Speed(parts=("all",), factor=-4.0), 3),
@@ -98,7 +98,7 @@ class TestLength:
         ],
     )
     def test_and_no_longer(self, edit):
-        """At the end of the film the part still moves."""
+        """The part still moves at the end of the film."""
         before, last = np.asarray(film_of(edit)[0].trajectory.poses.quats)[-2:, 1]
         assert np.abs(last - before).max() > 1e-3
 
@@ -108,7 +108,7 @@ class TestLength:
         np.testing.assert_array_equal(found, recorded[[0] * 4 + [*range(9)]])
 
     def test_of_copies_the_scene_itself_knows_nothing(self):
-        """It goes backwards from its own end."""
+        """Echoes that last longer do not change where the part itself ends: it plays backwards from there."""
         shows(
             film_of(Echo(parts=(1,), copies=2, every=0.25), Speed(parts=(1,), factor=-1), length=1),
             1,
@@ -130,7 +130,7 @@ class TestLength:
         assert_same(found, edits.at_times(layer_of().trajectory, found.times), atol=1e-6)
 
     def test_what_is_slowed_down_and_sped_up_again_has_lost_nothing(self):
-        """Half way it is longer than the film that comes of it."""
+        """Between the two edits it is longer than the resulting film."""
         film = film_of(Speed(parts=(1,), factor=0.5), Speed(parts=(1,), factor=2.0))
         shows(film, 1, range(9))
 
@@ -167,7 +167,7 @@ class TestFilms:
             shows(film, part, range(9))
 
     def test_time_edits_follow_each_other(self):
-        """The second sees what the first has made of the part, and where its motion now ends."""
+        """An edit applies to what the edits before it have made of the part, including its new end."""
         film = film_of(
             Freeze(parts=("drawer",), begin=0.25, end=0.5),
             Speed(parts=("drawer",), factor=-1),
@@ -179,7 +179,7 @@ class TestFilms:
 
     @pytest.mark.parametrize("edit", [Speed, Loop])
     def test_what_is_over_stands_still_whatever_is_done_to_all(self, edit):
-        """The drawer is done after 0.25 s, when all others begin to go backwards."""
+        """The drawer has stopped at 0.25 s, when the other parts begin to go backwards."""
         keys = {"factor": -1} if edit is Speed else {"bounce": True, "times": 1}
         first = Speed(parts=("drawer",), factor=4)
         film = film_of(first, edit(parts=("all",), begin=0.25, **keys), length=1.125)
@@ -318,7 +318,7 @@ class TestComposite:
         np.testing.assert_array_equal(np.asarray(film[2].scene.labels), 2)
 
     def test_they_come_to_their_place(self):
-        """The handle at the start is where it was sent; what is 10 cm from it is 5 cm at half the size."""
+        """The handle starts at the given place, and offsets from it are rotated and halved."""
         place = Place(to=(1, 2, 3), axis=(0, 0, 1), degrees=90, scale=0.5)
         plain, there = jax.device_get((self.film()[1], self.film(place=place)[1]))
         start = gaussians_then((plain,), 0).means
@@ -339,8 +339,8 @@ class TestComposite:
             ({}, 9),  # 0.5 s of another run, in a film of 1 s
             ({"edits": (Speed(parts=("cup",), factor=0.25),)}, 17),
             ({"edits": (Speed(parts=("cup",), factor=0.25),), "end": 1.5}, 13),
-            ({"edits": (Speed(parts=("hand",), factor=0.25),)}, 9),  # which is not brought in
-            ({"edits": (Echo(parts=("hand",), copies=1, every=0.75),)}, 11),  # but a copy of it is
+            ({"edits": (Speed(parts=("hand",), factor=0.25),)}, 9),  # not part of the composite
+            ({"edits": (Echo(parts=("hand",), copies=1, every=0.75),)}, 11),  # but its copy is
             (
                 {"edits": (Composite(parts=(1,), from_run="elsewhere", edits=(Loop(parts=(1,), times=4),)),)},
                 17,

@@ -1,4 +1,4 @@
-"""A scene of parts at a moment: shown, scaled and moved as the moment says, and otherwise as it was."""
+"""Scenes of parts at a moment: opacities, sizes and poses are those of the moment, all else is unchanged."""
 
 import equinox as eqx
 import jax
@@ -35,7 +35,7 @@ def unedited(pose):
 
 @given(seeds)
 def test_where_nothing_is_edited_it_is_skinning_to_the_bit(seed):
-    """Whatever the weights' rounding is, also of what is wholly opaque or all but invisible."""
+    """Whatever the rounding of the weights, also for opaque and almost invisible Gaussians."""
     scene, now = made_up(seed)
     logits = jnp.array([-30.0, -9.0, -1.0, 0.0, 2.0, 17.0, 39.0])
     scene = eqx.tree_at(lambda s: s.gaussians.logit_opacities, scene, logits)

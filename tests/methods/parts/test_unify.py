@@ -1,4 +1,4 @@
-"""Which parts are one, on motions whose answer is known."""
+"""Which parts are joined or cut, on motions for which the answer is known."""
 
 import numpy as np
 import pytest
@@ -13,7 +13,7 @@ seeds = st.integers(0, 10_000)
 
 
 def motions(*bodies):
-    """Of the background and then each body, given as (rotation vectors [T,3], shifts [T,3])."""
+    """Motions of the background and then of each body, given as (rotation vectors [T,3], shifts [T,3])."""
     still = np.zeros((T, 3)), np.zeros((T, 3))
     turns, shifts = zip(still, *bodies, strict=True)
     rotations = np.stack([Rotation.from_rotvec(turn).as_matrix() for turn in turns], axis=1)
@@ -33,7 +33,7 @@ def joined(found, points, labels, alive=None, since=None, noise_m=0.005, toleran
 
 @pytest.fixture
 def points():
-    """Of the background, and of two halves of a bar along x."""
+    """(points of the background and of two halves of a bar along x, their labels)."""
     rng = np.random.default_rng(0)
     bar = rng.uniform([-0.1, -0.02, 0], [0.1, 0.02, 0.04], (60, 3))
     return np.concatenate([rng.uniform(-1, 1, (20, 3)), bar]), np.r_[np.zeros(20, int), 1 + (bar[:, 0] > 0)]
@@ -45,7 +45,7 @@ def test_two_halves_of_one_rigid_body_are_one(points):
 
 
 def test_the_pivot_does_not_matter(points):
-    """The same motion about two pivots has two translations, by which the halves would be different parts."""
+    """About two pivots, the same motion has two translations; compared by these, the halves would differ."""
     rotations = Rotation.from_rotvec(ramp(0, 0, 0.8)).as_matrix()
     centers = np.array([[0, 0, 0], [-0.05, 0, 0], [0.05, 0, 0]])
     shifts = np.stack([rotations @ c - c for c in centers], axis=1)
@@ -65,7 +65,7 @@ def test_a_hinge_is_two(points):
 
 
 def test_parts_that_still_stand_are_not_one(points):
-    """They move alike, and nothing follows from that: one of them starts late."""
+    """Parts that both stand still move alike, but one may start later."""
     still = np.zeros((T, 3)), np.zeros((T, 3))
     late = np.zeros((T, 3)), ramp(0.08, 0, 0) * (np.arange(T) > 3)[:, None]
     assert joined(motions(still, still), *points) == [0, 1, 2]
@@ -80,7 +80,7 @@ def test_one_that_moves_as_little_as_tracking_errs_waits(points):
 
 
 def test_what_was_together_before_a_split_does_not_count(points):
-    """Two that part only at the end were alike for most of the time, when they were one."""
+    """Two that separate in the last frame moved alike before, but only because they were one part then."""
     together = ramp(0.2, 0, 0)
     apart = together + np.r_[np.zeros((T - 1, 3)), [[0, 0.05, 0]]]
     found = motions((np.zeros((T, 3)), together), (np.zeros((T, 3)), apart))
@@ -89,8 +89,8 @@ def test_what_was_together_before_a_split_does_not_count(points):
 
 
 def test_one_born_where_all_stands_again_is_none_of_them(points):
-    """It has moved as what it was split from. Since then it and another stand where they stood at first, as
-    frames before the anchor may have it: they move alike, and nothing follows from that."""
+    """A new part has moved like the one that it was split from. Since then, it and another part have both
+    been at their first poses, as may be in frames before the anchor: that they move alike says nothing."""
     there, elsewhere = np.zeros((T, 3)), np.zeros((T, 3))
     there[1:4], elsewhere[1:4] = [0.2, 0, 0], [0, 0.3, 0]
     found = motions((np.zeros((T, 3)), there), (np.zeros((T, 3)), elsewhere))
@@ -107,7 +107,7 @@ def test_slots_without_a_part_join_nothing(points):
 def test_three_that_move_alike_become_the_largest(seed):
     rng = np.random.default_rng(seed)
     turning = ramp(*rng.normal(size=3)), ramp(*rng.normal(size=3))
-    sizes = rng.permutation([5, 9, 24])  # the two small ones together are fewer
+    sizes = rng.permutation([5, 9, 24])  # the two small ones together are smaller
     labels = np.repeat([1, 2, 3], sizes)
     into = joined(motions(turning, turning, turning), rng.normal(size=(38, 3)), labels)
     assert into == [0] + [1 + int(sizes.argmax())] * 3

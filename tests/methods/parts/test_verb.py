@@ -1,4 +1,4 @@
-"""`gsjax.engine.verbs.parts`: a sequence as it was opened goes in, parts that can be edited come out."""
+"""`gsjax.engine.verbs.parts`: from a sequence as opened to editable parts."""
 
 from dataclasses import replace
 
@@ -47,7 +47,7 @@ def sequence(boxes):
 
 @pytest.fixture(scope="module")
 def segmenter(boxes):
-    """Knows the true masks of the canonical frame."""
+    """A segmenter that returns the true masks of the canonical frame."""
     masks = boxes.masks(boxes.bodies)
 
     def segment(image, depth, K):
@@ -67,7 +67,7 @@ def test_a_discovery_is_stored_and_goes_on_to_the_same_bits(boxes, sequence, seg
     assert len(steps) == 3 * (FRAMES - 1) + 2
     assert np.isfinite(steps).all()
     loaded = load(tmp_path / "run.npz")
-    assert loaded.result.done.tolist() == [True, True, False]  # the second frame is half found
+    assert loaded.result.done.tolist() == [True, True, False]  # step 4 is within the last frame
     assert len(loaded.result.layer.trajectory.times) == 2
     *_, again = parts(sequence, loaded.method.config, eval_cameras=[HELD_OUT], after=loaded)
     for a, b in zip(jax.tree.leaves(again.result), jax.tree.leaves(now.result), strict=True):
@@ -79,7 +79,7 @@ def test_a_discovery_is_stored_and_goes_on_to_the_same_bits(boxes, sequence, seg
 @pytest.mark.thorough
 def test_custom_losses_are_told_the_frame_the_camera_and_the_progress(sequence, boxes, segmenter):
     def centroid(image):
-        """Of brightness, so that it is the same at other sizes and exposures."""
+        """The relative centroid of brightness, which resizing and exposure hardly change."""
         shares = [(jnp.arange(size) + 0.5) / size for size in image.shape[:2]]
         return jnp.stack([shares[0] @ image.sum((1, 2)), shares[1] @ image.sum((0, 2))]) / image.sum()
 

@@ -1,4 +1,4 @@
-"""Two boxes on a floor as one step of a stream of parts is given them, and poses and fields to begin with."""
+"""Two boxes on a floor as inputs of one streaming step, and initial poses and fields."""
 
 import jax
 import jax.numpy as jnp
@@ -16,7 +16,7 @@ PARTS = 4  # slots: the background, two boxes, and one that is free
 
 
 def two_boxes() -> MovingBoxes:
-    """Before two cameras."""
+    """Two boxes at rest, seen by two cameras."""
     still = np.zeros((2, 3)), np.zeros((2, 3))
     first, second = (
         Box((-0.1, 0, 0.04), (0.08, 0.08, 0.08), *still),
@@ -49,7 +49,7 @@ def canonical_of(boxes, field=None, dtype=jnp.float32):
 
 
 def batch_of(boxes, dtype=jnp.float32, past=True):
-    """Frame 0's pictures, for a scene that is then moved by the test."""
+    """(the batch of a step with frame 0's picture of one camera, the bodies of the movable Gaussians)."""
     canonical, bodies = canonical_of(boxes, dtype=dtype)
     weights = jax.nn.one_hot(bodies, PARTS, dtype=dtype)
     frame = jax.tree.map(lambda a: jnp.asarray(a, dtype)[:1], boxes.frame(0))
@@ -61,7 +61,7 @@ def batch_of(boxes, dtype=jnp.float32, past=True):
 
 
 def params_of(pose, field, bodies):
-    """What a step changes, for boxes whose movable Gaussians are of these bodies."""
+    """The parameters that a step changes; `bodies` are those of the movable Gaussians."""
     return StreamParams(pose, field, jnp.zeros((len(bodies), 3)))
 
 

@@ -1,4 +1,4 @@
-"""A ball of coloured Gaussians before a wall, as the tracker's refinement is given it."""
+"""A ball of coloured Gaussians in front of a wall, as input of the tracker's refinement."""
 
 import jax
 import numpy as np
@@ -16,7 +16,7 @@ OBJECT, BACKGROUND = 150, 200
 
 
 def batch_after(twist) -> RefineBatch:
-    """A ball of coloured Gaussians before a wall, and what two cameras see after the twist."""
+    """The ball at rest in front of the wall, and what two cameras see after it moved by `twist`."""
     rng = np.random.default_rng(0)
     on_ball = rng.normal(size=(OBJECT, 3))
     ball = 0.1 * on_ball / np.linalg.norm(on_ball, axis=1, keepdims=True)

@@ -1,4 +1,4 @@
-"""The carton of the simulated table as alignment sees it, and how well points that stand for it fit."""
+"""The carton of the simulated table as alignment sees it, and how well its points fit."""
 
 from dataclasses import replace
 
@@ -21,12 +21,12 @@ def see(frame):
 
 @jax.jit
 def middle(points):
-    """The mean of the points that count."""
+    """The mean of the points that are seen."""
     return (points.means * (points.seen[:, None] > 0)).sum((0, 2)) / (points.seen > 0).sum()
 
 
 def gap(points, sight, config=CONFIG):
-    """Disagreement of points where they are."""
+    """The disagreement of points at their present positions."""
     return float(_disagreement(np.zeros(6, np.float32), points, np.zeros(3, np.float32), sight, config))
 
 

@@ -1,4 +1,4 @@
-"""Direct alignment finds a known motion of a textured object, and leaves what nobody sees where it is."""
+"""Direct alignment finds a known motion of a textured object, and leaves unseen groups where they are."""
 
 import jax
 import jax.numpy as jnp
@@ -25,7 +25,7 @@ normal_equations = jax.jit(_normal_equations, static_argnums=4)
 
 
 def run(points, center, sight, config=CONFIG):
-    """(the twist found from standing still, where it carries the points)."""
+    """(the twist found from a start at rest, the positions to which it carries the points)."""
     found = found_by(np.zeros(6, np.float32), points, center, sight, config)
     return found, np.asarray(carried(points, found, center).means)
 
@@ -82,7 +82,7 @@ def test_bilinear_reads_between_pixel_centres_and_knows_its_slope():
 def test_gradients_of_residuals_are_those_of_finite_differences(moved, depth):
     points, _, sight, _, _ = moved
     sight = sight if depth else without_depth(sight)
-    # Off the centres of pixels, where a bilinear image has its kinks.
+    # Not at pixel centres, where a bilinear image has kinks.
     one = Points(*(np.asarray(a)[..., :20] for a in points))
     one = one._replace(means=one.means + np.float32(1.3e-3))
     gradients = np.asarray(residuals(one, sight, CONFIG).gradients)
@@ -94,7 +94,7 @@ def test_gradients_of_residuals_are_those_of_finite_differences(moved, depth):
             for s in (1, -1)
         )
         slope = (ahead - behind) / (2 * small)
-        # A depth edge is a jump: few points sit on one.
+        # Depth jumps at edges, on which few points lie.
         close = np.isclose(slope, gradients[:, axis], rtol=0.05, atol=2.0)
         assert close.mean() > 0.9
 
@@ -102,7 +102,7 @@ def test_gradients_of_residuals_are_those_of_finite_differences(moved, depth):
 @pytest.mark.thorough
 @pytest.mark.parametrize("depth", [True, False])
 def test_normal_equations_are_those_of_differentiation(moved, depth):
-    """J^T W J and J^T W r, put together by hand, against the Jacobian that forward mode has."""
+    """J^T W J and J^T W r, as assembled by hand, against the Jacobian of forward-mode differentiation."""
     points, center, sight, _, _ = moved
     sight = sight if depth else without_depth(sight)
     still = np.zeros(6, np.float32)
@@ -114,7 +114,7 @@ def test_normal_equations_are_those_of_differentiation(moved, depth):
     jacobian, base = jax.device_get((jax.jit(jax.jacfwd(values))(still), residuals(points, sight, CONFIG)))
     squared = base.values**2
     squared[:, :3] = squared[:, :3].mean(1, keepdims=True)
-    counts = base.counts[:, [0, 0, 0, 1][: squared.shape[1]]]  # the channels of colour share theirs
+    counts = base.counts[:, [0, 0, 0, 1][: squared.shape[1]]]  # the colour channels share one
     weights = np.asarray(points.seen)[:, None] * counts / (1 + squared) ** 2
     expected = np.einsum("cdpi,cdp,cdpj->ij", jacobian, weights, jacobian)
     np.testing.assert_allclose(fit.hessian, expected, rtol=1e-3, atol=1e-3 * np.abs(expected).max())

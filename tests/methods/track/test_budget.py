@@ -1,4 +1,4 @@
-"""A budget is met by omitting searches, and delays are compensated."""
+"""Budgets are met by the choice of a rung and by omitting searches, and delays are compensated."""
 
 import pytest
 from hypothesis import given
@@ -13,7 +13,7 @@ NAMES = list(RUNGS)
 
 
 def measured(**base_ms):
-    """A measurement by the place of a rung on the ladder: what is richer costs more."""
+    """(a stand-in for measuring, which returns the given cost of a rung; the rungs it was called for)."""
     calls = []
 
     def measure(config):
@@ -52,8 +52,8 @@ def test_the_ladder_goes_from_the_richest_to_one_camera():
     ("budget_ms", "expected", "fits", "most_measured"),
     [
         (33.0, "fast", True, 1),
-        (60.0, "fast", True, 1),  # fast fits with all groups, but not twice
-        (100.0, "fast", True, 2),  # twice does, and balanced does not
+        (60.0, "fast", True, 1),  # fast fits with all groups, but not at twice its cost
+        (100.0, "fast", True, 2),  # at twice its cost too; balanced does not
         (250.0, "balanced", True, 2),
         (5000.0, "accurate", True, 3),
         (15.0, "fast, half the resolution", True, 2),
@@ -89,7 +89,7 @@ def test_a_delay_is_compensated_and_then_forgotten():
 
 @given(st.lists(st.floats(0, 0.2), min_size=1, max_size=60))
 def test_a_governor_always_recovers(hiccups):
-    """However late updates were, undisturbed ones search for groups again within a second or so."""
+    """However late updates were, 60 undisturbed ones suffice until groups are searched for again."""
     governor, costs = Governor(0.033, Costs(0.010, 0.004), 9), Costs(0.010, 0.004)
     for hiccup in hiccups:
         count = governor.allowed()
@@ -120,7 +120,7 @@ def test_settings_that_a_budget_does_not_use_are_named():
 @pytest.mark.filterwarnings("ignore:under a budget")
 @pytest.mark.thorough
 def test_costs_are_measured_with_the_second_frame(table, started, monkeypatch):
-    """Where cameras move, updates to the first one again would draw no background."""
+    """With moving cameras, updates with the first frame again would leave out redrawing the background."""
     _, frames, _ = table()
 
     class Measured(Exception):

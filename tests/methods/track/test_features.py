@@ -27,8 +27,8 @@ MOVING, COUNT, WIDTH, HEIGHT = 18, 40, 24, 16
 
 @pytest.fixture(scope="module")
 def little():
-    """Forty Gaussians before two cameras; the first 9 are object 1, the next 9 object 2, of which one lies
-    behind both cameras; so does all of the background's last five."""
+    """Forty Gaussians in front of two cameras: 9 of object 1, 9 of object 2, the rest background. One of
+    object 2 and the last five of the background are behind both cameras."""
     rng = np.random.default_rng(0)
     means = rng.uniform([-0.3, -0.2, -0.1], [0.3, 0.2, 0.1], (COUNT, 3))
     means[[17, *range(35, 40)], 1] = -5.0
@@ -45,7 +45,7 @@ def little():
 
 @pytest.fixture(scope="module")
 def weights(little):
-    """W [pixels, N], by rendering a one for each Gaussian."""
+    """The compositing weights W [pixels, N], by rendering a one-hot feature for each Gaussian."""
     scene, frame = little
     plan, ones = plan_render(scene.gaussians, frame.cameras), jnp.eye(COUNT, 42)
     parts = [
@@ -57,7 +57,7 @@ def weights(little):
 
 @pytest.fixture(scope="module")
 def maps():
-    """Smooth, so that neither way can be perfect nor is hopeless."""
+    """Smooth maps, which neither method can fit exactly, but both approximately."""
     y, x = np.mgrid[:HEIGHT, :WIDTH] / 8.0
     view = np.stack([np.sin(x), np.cos(y), np.sin(x + y)], axis=-1)
     return np.stack([view, 0.9 * view + 0.1]).astype(np.float32)
@@ -168,7 +168,7 @@ def test_the_transpose_is_exact_and_the_step_is_pure(little, maps):
     step = feature_distiller()
     blank = step.init(features)
     still, state, info = step.update(features, blank, batch, step=0, key=None)
-    np.testing.assert_array_equal(still, features)  # the first only finds the residual
+    np.testing.assert_array_equal(still, features)  # the first step only computes the residual
     assert info["loss"] == state.energy.sum() > 0
     first, second, info = step.update(features, state, batch, step=1, key=None)
     assert not info["skipped"]
@@ -186,7 +186,7 @@ def test_the_transpose_is_exact_and_the_step_is_pure(little, maps):
 
 
 def test_features_ride_along(little):
-    """Moved together with the camera, an object shows the same features."""
+    """An object that moves together with the cameras shows the same features."""
     scene, frame = little
     shift = jnp.array([0.4, 0.1, -0.2])
     features = jax.nn.one_hot(scene.labels, 3)
@@ -199,7 +199,7 @@ def test_features_ride_along(little):
     cameras = Camera(moved, cameras.K, WIDTH, HEIGHT)
     later, _ = render_features(only, Pose(pose.means + shift, pose.quats), features, cameras)
     np.testing.assert_allclose(later, still, atol=2e-4)
-    # A mean of unit vectors over what is shown: no matter how opaque.
+    # A weighted mean of one-hot vectors sums to 1, whatever the opacity.
     shown = np.asarray(alphas) > 0.01
     assert 0 < shown.sum() < shown.size
     np.testing.assert_allclose(np.asarray(still)[shown].sum(-1), 1.0, atol=1e-3)

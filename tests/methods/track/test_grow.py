@@ -36,7 +36,7 @@ def plan(table, started):
 
 @pytest.fixture(scope="module")
 def torn(started):
-    """The scene without one half of the carton, as if never seen."""
+    """The scene without one half of the carton, as if it had never been seen."""
     member = np.asarray(started.labels) == started.label_ids.index(CARTON)
     means, logits = map(np.array, (started.gaussians.means, started.gaussians.logit_opacities))
     gone = member & (means[:, 0] > np.median(means[member, 0]))
@@ -84,7 +84,7 @@ def test_some_of_the_chosen_places_are_drawn_and_over_time_all_of_them(size, num
 @pytest.mark.slow
 @pytest.mark.parametrize("none_taken", [False, True])
 def test_the_nearest_is_that_of_all_distances(started, none_taken):
-    """The count of Gaussians fills no row of lanes; empty slots are no neighbours."""
+    """Also where the number of Gaussians is no multiple of the lane width; empty slots are no neighbours."""
     scene = with_slots(started, 32)
     if none_taken:
         scene = eqx.tree_at(lambda s: s.labels, scene, jnp.full_like(scene.labels, scene.num_objects + 1))
@@ -130,7 +130,7 @@ def test_what_is_missing_joins_the_object_that_it_continues(table, torn, plan):
     masks, depths = [[np.asarray(a(0, c)) for c in range(2)] for a in (sequence.mask, sequence.depth)]
     truth = true_labels(where, masks, depths, list(sequence.viewmats[0]), list(sequence.Ks[0]))
     assert (truth[values == CARTON] == CARTON).mean() > 0.9
-    # They stand where they were seen, in its colour, and are drawn with the object's label.
+    # They are rendered with the label of the object.
     drawn = np.asarray(labels_of(scene, pose, frames[0], plan).features)
     share = drawn[..., scene.label_ids.index(CARTON)] > 0.5
     torn_share = np.asarray(labels_of(torn, first_pose(torn), frames[0], plan).features)

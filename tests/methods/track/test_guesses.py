@@ -1,4 +1,4 @@
-"""Guesses of where a lost object may be: near the last one, and spun about the middle of the object."""
+"""Guesses of the pose of a lost object: near the last guess, and rotated about the middle of the object."""
 
 from dataclasses import replace
 
@@ -26,8 +26,8 @@ def test_guesses_near_the_last_one_stay_near():
 
 
 def can_shell(seed=0, count=64):
-    """Points and outward normals of the upper side and half of the wall of a can, of which nothing below is
-    known: radius 34 mm, 110 mm high, its middle at (0.3, -0.2, 0.1)."""
+    """(points and outward normals of the top and of half of the wall of a can, the middle of the can): radius
+    34 mm, height 110 mm."""
     rng = np.random.default_rng(seed)
     angle, height = rng.uniform(-1.6, 1.6, count), rng.uniform(-0.055, 0.055, count)
     around = np.stack([np.cos(angle), np.sin(angle), 0 * angle])

@@ -1,4 +1,4 @@
-"""Moving Gaussians over a stored background show what the whole scene shows."""
+"""Moving Gaussians rendered over a stored background match a rendering of the whole scene."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -38,7 +38,7 @@ def plans(table, started):
 
 @pytest.fixture(scope="module")
 def both(table, started, plans):
-    """(the whole scene, what moves over the backdrop, the backdrop)."""
+    """(the whole scene as rendered, moving Gaussians rendered over the backdrop, the backdrop)."""
     whole_plan, still_plan, moving_plan = plans
     frame, pose = table()[1][0], first_pose(started)
     whole = shown_by(render_labels(started, pose, frame, whole_plan))
@@ -54,7 +54,7 @@ def test_layers_show_what_the_whole_scene_shows(both, started):
     whole, shown, _ = both
     assert set(np.unique(whole.labels)) == set(range(started.num_objects + 1))
     agree = np.asarray(whole.labels) == np.asarray(shown.labels)
-    assert agree.mean() > 0.97  # outlines are where the two may differ
+    assert agree.mean() > 0.97  # the two may differ along outlines
     assert (np.asarray(whole.covered) == np.asarray(shown.covered)).mean() > 0.98
     inside = agree & (np.asarray(whole.labels) > 0)
     assert np.median(np.abs(whole.depths - shown.depths)[inside]) < 2e-3
@@ -63,7 +63,7 @@ def test_layers_show_what_the_whole_scene_shows(both, started):
 @pytest.mark.thorough
 @pytest.mark.parametrize("more", [0.0, 2.5, 9.0])
 def test_what_the_plan_leaves_out_changes_hardly_a_label(both, started, more):
-    """As fitted, and as opaque as 0.99 and 1: a single Gaussian that hides all else must still be drawn."""
+    """With opacities as fitted, and raised to 0.99 and 1: single opaque Gaussians must still be drawn."""
     _, _, backdrop = both
     opaque = eqx.tree_at(
         lambda s: s.gaussians.logit_opacities, started, started.gaussians.logit_opacities + more

@@ -1,4 +1,4 @@
-"""Whether a group is where it is believed to be, and where it is searched for if not."""
+"""Whether a group is at its estimated pose, and where it is searched for if not."""
 
 from dataclasses import replace
 
@@ -53,7 +53,7 @@ referred = jax.jit(reference_points, static_argnums=2)
 
 @pytest.fixture(scope="module")
 def carton(table):
-    """(images, points that show the carton in it, as one group)."""
+    """(images, the points of the carton in them, as one group)."""
     sequence, frames, _ = table(8, 2, **SIZE)
     labels = np.stack([sequence.mask(6, c) for c in range(2)])
     images = toned(frames[6], 0.3)
@@ -68,7 +68,7 @@ def moved(points: Points, *twist: float) -> Points:
 
 
 def with_depth(images, depths):
-    """The images with these measurements of depth."""
+    """The images with the measured depths replaced."""
     pixels = np.array(images.pixels)
     pixels[..., 3] = depths
     return images._replace(pixels=pixels)
@@ -89,7 +89,7 @@ def test_a_group_agrees_in_its_place_and_nowhere_else(carton):
 
 @pytest.mark.thorough
 def test_an_occluder_is_inconclusive(carton):
-    """A hand before the left camera: the other camera decides; with both hidden, none does."""
+    """If something occludes one camera, the other decides; if both are occluded, none does."""
     images, points = carton
     depths = np.array(images.depths)
     depths[0] = 0.2
@@ -108,7 +108,7 @@ def test_an_occluder_is_inconclusive(carton):
 
 
 def test_what_shows_the_background_does_not_show_the_group(carton):
-    """A can that slips into a garage's front agrees with it in depth and nearly in colour."""
+    """A can placed on the front of a garage by mistake agrees with it in depth and nearly in colour."""
     images, points = carton
     usual = confidence(points, images, GAP)
     depths = np.asarray(images.depths)
@@ -125,7 +125,7 @@ def test_what_shows_the_background_does_not_show_the_group(carton):
 
 
 def test_a_card_on_a_table_is_not_lost(carton):
-    """A flat object is measured like the surface on which it lies; colour decides."""
+    """A flat object has nearly the depth of the surface on which it lies, so colour decides."""
     images, points = carton
     depths = np.asarray(images.depths)
     under = np.where(depths > 0, depths + np.float32(GAP / 5), 0)
@@ -133,7 +133,7 @@ def test_a_card_on_a_table_is_not_lost(carton):
     assert confidence(points, images, GAP, under).agreement[0] == pytest.approx(float(usual.agreement[0]))
     other = images._replace(pixels=images.pixels + np.float32([0.5, 0.5, 0.5, 0]))
     assert confidence(points, other, GAP, under).agreement[0] < LOST
-    of_others = confidence(points, images, GAP, None, under)  # which exempt no card
+    of_others = confidence(points, images, GAP, None, under)  # the exemption is for the background alone
     assert of_others.agreement[0] < LOST
     nothing = np.zeros_like(under)
     assert confidence(points, images, GAP, None, nothing).agreement[0] == pytest.approx(
@@ -142,7 +142,7 @@ def test_a_card_on_a_table_is_not_lost(carton):
 
 
 def test_a_suspect_is_searched_for_with_all_points_that_face_a_camera(table, started, quick):
-    """It may be hidden where it is believed to be; for other groups, the points seen last count."""
+    """At its estimated pose it may be occluded; for other groups, the points seen last are used."""
     _, frames, _ = table()
     pose, cameras, count = first_pose(started), frames[0].cameras, started.num_objects
     group = np.asarray(started.labels[: started.num_moving])
@@ -160,7 +160,7 @@ def test_a_suspect_is_searched_for_with_all_points_that_face_a_camera(table, sta
         np.testing.assert_array_equal(seen[k].sum(-1), faces[:, group == k + 1].sum(-1))
     first = jax.tree.map(lambda a: np.asarray(a)[0], reference)
     around = facing_at(first, np.float32([0, 0, 0, 0, 0, np.pi]), np.float32([0.0, 0.0, 0.1]), images)
-    assert (np.asarray(around.seen) != seen[0]).any()  # points that turn away no longer face them
+    assert (np.asarray(around.seen) != seen[0]).any()  # points that turned away no longer face a camera
 
 
 def test_without_depth_colour_alone_decides(carton):
@@ -177,7 +177,7 @@ def test_unexplained_pixels_are_nearer_than_the_model(carton):
     strange = (depths > 0) & (depths < 0.9 - GAP)
     assert 0 < strange.mean() < 1
     found = jax.jit(unexplained_pixels, static_argnums=(2, 3, 4))
-    for labels, limit in ((0, 0.9 - GAP), (1, 0.8)):  # a group explains depth that is slightly nearer
+    for labels, limit in ((0, 0.9 - GAP), (1, 0.8)):  # a group also explains depth that is slightly nearer
         shown = Shown(jnp.full(model.shape, labels, jnp.int32), model, model > 0)
         pixels = found(shown, images, GAP, replace(PRESETS["accurate"].align, max_thickness=0.1), 1)
         z = seen_depths(pixels.means, images)[np.asarray(pixels.seen) > 0]
@@ -187,14 +187,14 @@ def test_unexplained_pixels_are_nearer_than_the_model(carton):
 
 
 def seen_depths(means, images):
-    """Depths of points of each camera, metres."""
+    """Depths of points in the camera to which they belong, metres."""
     viewmats = np.asarray(images.cameras.viewmat)
     return np.einsum("ci,cip->cp", viewmats[:, 2, :3], np.asarray(means)) + viewmats[:, 2, 3:]
 
 
 @pytest.fixture(scope="module")
 def one(table, started, quick):
-    """(the carton's first Gaussians, their centre, what is seen then, which pixels show the carton)."""
+    """(reference points of the carton, their centre, images of the first frame, the carton's pixels)."""
     sequence, (frame, *_), _ = table()
     reference = referred(started, first_pose(started), quick.align)
     mine = jax.tree.map(lambda a: np.asarray(a)[started.label_ids.index(CARTON) - 1], reference)
@@ -233,7 +233,7 @@ def test_guesses_bring_points_to_unexplained_pixels(one):
 
 @pytest.mark.thorough
 def test_a_lost_group_is_recovered_over_frames_but_not_at_another_object(one):
-    """From 15 cm and 57 degrees off; each frame continues from the guess of the last."""
+    """From 15 cm and 57 degrees off; in each frame the search continues from the last guess."""
     reference, center, images, shown = one
     off = np.float32([0.1, -0.1, 0.05, 0.0, 0.0, 1.0])
 
@@ -267,10 +267,10 @@ def test_a_lost_group_is_recovered_over_frames_but_not_at_another_object(one):
     ).coverage
     assert is_found(jax.tree.map(lambda a: a[None], found.confidence), showed)[0]
     assert is_found(jax.tree.map(lambda a: a[None], found.guess_confidence), showed)[0]
-    first = after(1, others)  # the first guess is where the group is not
+    first = after(1, others)  # after one frame, the guess is still wrong
     assert not is_found(jax.tree.map(lambda a: a[None], first.guess_confidence), showed)[0]
     for explained, there in ((np.zeros_like(others), True), (images.depths, False)):
-        from_there = after(1, explained, found.twists)  # it is not where all depth is of other groups
+        from_there = after(1, explained, found.twists)  # not found where other groups explain all depth
         assert is_found(jax.tree.map(lambda a: a[None], from_there.confidence), showed)[0] == there
 
 
@@ -321,7 +321,7 @@ def test_groups_in_doubt_take_turns_of_two_frames_in_a_row():
 @pytest.mark.parametrize("redraw", ["moving", "all"])
 @pytest.mark.slow
 def test_an_object_that_is_elsewhere_is_reported_lost_until_it_is_found(table, started, quick, redraw):
-    """The scene has the carton 12 cm off, too far for a search from there."""
+    """In the scene, the carton is 12 cm off, which is out of reach of a search from there."""
     _, frames, _ = table()
     config = replace(
         quick, redraw=redraw, matching=False, refine=RefineConfig(iterations=0), grow=GrowConfig(slots=0)
@@ -342,7 +342,7 @@ def test_an_object_that_is_elsewhere_is_reported_lost_until_it_is_found(table, s
 
 @pytest.mark.slow
 def test_without_depth_a_vanished_object_is_reported_lost_and_stays(table, started, quick):
-    """Colour shows that it is gone, and nothing where else to search."""
+    """Colour tells that it is gone, but without depth there are no other places to search."""
     sequence, frames, _ = table()
     config = replace(
         quick, redraw="moving", matching=False, refine=RefineConfig(iterations=0), grow=GrowConfig(slots=0)

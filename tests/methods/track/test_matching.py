@@ -1,4 +1,5 @@
-"""Template matching: the score is its formula, its peak is sub-pixel, cameras agree on one translation."""
+"""Template matching: the score follows its formula, peaks are sub-pixel, and several cameras yield one
+translation."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -15,7 +16,7 @@ EYES = ([0.9, -0.3, 0.6], [0.2, 0.9, 0.7])
 
 
 def slow_correlation(template, mask, search):
-    """The formula of the module's docstring, place by place."""
+    """The formula in the module's docstring, evaluated position by position."""
     patch, places = len(template), len(search) - len(template) + 1
     m, total = mask[..., None], mask.sum()
     centred = template - (m * template).sum((0, 1)) / total
@@ -188,7 +189,7 @@ def test_a_camera_that_does_not_see_the_object_does_not_spoil_the_others(blind):
 
 @pytest.mark.thorough
 def test_what_the_picture_does_not_show_of_a_template_does_not_count():
-    """A blob at the border has moved along it; repeated border pixels would say that it stood still."""
+    """A blob has moved along the border; with replicated border pixels, it would seem to stand still."""
     start, shift = np.array([1.0, 20.0]), np.array([0.0, 5.0])
     (color, value), (image, _) = blob(start), blob(start + shift)
     depths = jnp.full((1, HEIGHT, WIDTH), 1.1)

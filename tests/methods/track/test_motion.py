@@ -1,4 +1,4 @@
-"""How groups move, against scipy's rotations."""
+"""Motions of groups, against SciPy's rotations."""
 
 import equinox as eqx
 import jax
@@ -93,7 +93,7 @@ def test_no_motion_has_a_gradient_without_nan(pose):
 
 
 def scene_of(pose: Pose, normals) -> TrackedScene:
-    """The pose's Gaussians and two of the background behind them."""
+    """A scene of the pose's Gaussians and two of the background behind them."""
     means, quats = np.asarray(pose.means), np.asarray(pose.quats)
     gaussians = gaussians_from_activated(
         np.concatenate([means, [[0, 0, -5.0], [0, 0, -6.0]]]),

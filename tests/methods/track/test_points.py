@@ -1,4 +1,4 @@
-"""The points of a group: their pixels, their tones, and the keyframe that stores them."""
+"""The points of groups: their pixels, their tones, and the keyframe that stores them."""
 
 import equinox as eqx
 import jax
@@ -31,7 +31,7 @@ def test_only_pixels_of_the_group_are_picked(moved, table):
         theirs = np.asarray(sight.tones)[c][labels[c] == 1]
         found = np.asarray(points.tones)[c].T[chosen]
         assert {tuple(row) for row in found} <= {tuple(row) for row in theirs}
-        assert len(np.unique(np.asarray(points.means)[c].T[chosen], axis=0)) == chosen.sum()  # none twice
+        assert len(np.unique(np.asarray(points.means)[c].T[chosen], axis=0)) == chosen.sum()  # no pixel twice
 
 
 def test_a_camera_without_depth_gives_pixels_at_the_models_depth(moved, table):
@@ -90,7 +90,7 @@ def test_a_keyframe_is_carried_and_renewed_where_a_group_has_turned():
         np.testing.assert_allclose(keyframe.points.tones[:, 0, 0, 0], expected, err_msg=str(turn))
         count = later.seen[:, 0, 0]
         np.testing.assert_allclose(count, [0.4 if turn == 0.3 else 1.0, 1.0], rtol=1e-5)
-    # Not renewed, so carried twice; renewed, so new, and unturned.
+    # The second group is carried twice; the first is renewed in the second step, so its points are new.
     np.testing.assert_allclose(keyframe.points.means[1, 0, :, 0], [1.2, 1.0, 1.0], rtol=1e-6)
     np.testing.assert_allclose(keyframe.points.means[0, 0, :, 0], [2.0, 2.0, 2.0])
     np.testing.assert_allclose(keyframe.turned, [[1, 0, 0, 0], [1, 0, 0, 0]], atol=1e-6)

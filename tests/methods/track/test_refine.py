@@ -1,4 +1,4 @@
-"""The refinement's differences as residuals: the same loss, the right derivative, and the way home."""
+"""The refinement as residuals: same loss, correct derivative, and convergence of Levenberg-Marquardt."""
 
 from dataclasses import replace
 
@@ -40,7 +40,7 @@ def test_half_the_squares_are_refines_loss(batch):
         for softness in (1e-4, 0.3)
     ]
     assert found[0] == pytest.approx(1e3 * loss, rel=1e-3)
-    assert found[1] < found[0]  # rounded off
+    assert found[1] < found[0]  # by the softness
 
 
 @pytest.mark.thorough
@@ -75,7 +75,7 @@ def test_its_derivative_is_that_of_differences():
     _, found = jax.jvp(values, (at,), (direction,))
     step = 1e-6
     expected = (values(at + step * direction) - values(at - step * direction)) / (2 * step)
-    # Weights are constants of the derivative, but not of the differences: so only what is alike on the whole.
+    # The derivative treats weights as constants, differences do not, so the two agree only roughly.
     cosine = jnp.vdot(found, expected) / (jnp.linalg.norm(found) * jnp.linalg.norm(expected))
     assert cosine > 0.99
 

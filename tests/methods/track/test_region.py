@@ -1,4 +1,4 @@
-"""What is left out of the refinement would not have changed a pixel of it; capacities climb one ladder."""
+"""Gaussians left out of the refinement do not change its pixels; capacities grow in common rungs."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -17,7 +17,7 @@ def test_the_near_scene_draws_the_region_as_the_whole_scene_does(table, started)
     _, frames, _ = table()
     pose, cameras = first_pose(started), frames[0].cameras
     plan = plan_render(started.gaussians, cameras)
-    member = np.asarray(started.labels[: started.num_moving]) == started.num_objects  # the block alone
+    member = np.asarray(started.labels[: started.num_moving]) == started.num_objects  # the last object alone
     tiles = touched_tiles([pose.means[member]], frames[0])
     roi = tiles_to_pixels(tiles, frames[0])
     whole = render(started.gaussians, cameras, plan)
@@ -32,7 +32,7 @@ def test_the_near_scene_draws_the_region_as_the_whole_scene_does(table, started)
 
 def test_touched_tiles_hold_the_points_and_their_neighbours(table):
     _, frames, _ = table()
-    tiles = touched_tiles([jnp.array([[-0.03, 0.0, 0.04]])], frames[0])  # where all cameras look
+    tiles = touched_tiles([jnp.array([[-0.03, 0.0, 0.04]])], frames[0])  # the point that all cameras look at
     assert tiles.shape == (2, 5, 6)
     np.testing.assert_array_equal(tiles.sum((1, 2)), 9)
     assert tiles[:, 2, 3].all()

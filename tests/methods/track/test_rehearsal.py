@@ -1,4 +1,4 @@
-"""An update that is compiled while the first scene is fitted is the update of the fitted scene."""
+"""An update compiled while the first scene is fitted serves for the fitted scene."""
 
 import equinox as eqx
 import jax
@@ -11,7 +11,7 @@ from gsjax.engine.track.tracking import track
 
 @pytest.fixture(scope="module")
 def rehearsed(table, started, quick):
-    """The first frames, and a rehearsal on the scene that they show."""
+    """The frames, and a rehearsal begun with the scene of the first one."""
     _, frames, _ = table()
     rehearsal = Rehearsal(frames[0], quick)
     rehearsal.begin(started)
@@ -23,7 +23,7 @@ def test_poses_are_those_without_a_rehearsal_and_nothing_is_compiled(rehearsed, 
     frames, rehearsal = rehearsed
     assert rehearsal.tick() is not None
     (with_one,) = track(started, frames[0], frames[1:2], quick, like=rehearsal.tick)
-    assert with_one.compile_seconds < 0.1  # nothing was waited for
+    assert with_one.compile_seconds < 0.1  # nothing was compiled
     (without,) = track(started, frames[0], frames[1:2], quick)
     for one, other in zip(*map(jax.tree.leaves, (with_one.result.pose, without.result.pose)), strict=True):
         np.testing.assert_array_equal(one, other)

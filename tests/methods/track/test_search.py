@@ -1,4 +1,4 @@
-"""Groups that jump are found by a search everywhere, the most urgent ones first."""
+"""Groups that jump are found by a search in all directions, the most urgent ones first."""
 
 from dataclasses import replace
 from functools import partial
@@ -22,7 +22,7 @@ from tests.methods.track.carton import CONFIG, SIZE, error, gap, middle, see
 # Compiled once for calls that differ in values alone.
 @partial(jax.jit, static_argnums=(4, 9))
 def search(starts, points, centers, images, config, watch, visible, everywhere, *elsewhere) -> SearchResult:
-    """What the groups are followed to, and what a search makes of that."""
+    """The result of following the groups and then searching for them."""
     given = (starts, points, centers, images, config, watch, visible, everywhere)
     return search_from(follow(*given), *given, *elsewhere)
 
@@ -32,24 +32,24 @@ BRIEF = replace(CONFIG, iterations=3)
 
 
 def of_several(points, center, count=3):
-    """(points, centres) of groups that are alike."""
+    """(points, centres) of several identical groups."""
     return jax.tree.map(lambda a: np.stack([a] * count), (points, center))
 
 
 def search_one(points, center, images, config=BRIEF, everywhere=1) -> SearchResult:
-    """A search of one group from standing still, beside two that nobody sees."""
+    """A search for one group from a start at rest, beside two that no camera sees."""
     how = (config, first_watch(jnp.ones(3)), np.array([True, False, False]), np.int32(everywhere))
     return search(np.zeros((1, 3, 6), np.float32), *of_several(points, center), images, *how)
 
 
 def look(*given):
-    """The twist that a search of one group finds from standing still."""
+    """The twist that a search for one group finds from a start at rest."""
     return np.asarray(search_one(*given).estimate.twists)[0]
 
 
 @pytest.fixture(scope="module")
 def jumped(moved, table):
-    """(points of the carton before it was carried 40 mm, their middle, what is seen then, that shift)."""
+    """(points of the carton before a shift by 40 mm, their middle, images after it, the shift)."""
     points = jax.device_get(moved[0])
     shift = np.float32([0.03, -0.025, 0.01])
     behind = points._replace(means=points.means - shift[:, None])
@@ -58,7 +58,7 @@ def jumped(moved, table):
 
 @pytest.mark.thorough
 def test_search_finds_a_jump_that_alignment_alone_misses(jumped):
-    """There is no overlap at the start, and no hint how far it went."""
+    """There is no overlap at the start, and no prior on the shift."""
     *given, shift = jumped
     miss = [np.linalg.norm(look(*given, BRIEF, n)[:3] - shift) for n in (0, 1)]
     assert miss[0] > 5e-3
@@ -67,7 +67,7 @@ def test_search_finds_a_jump_that_alignment_alone_misses(jumped):
 
 @pytest.mark.slow
 def test_search_finds_what_is_pushed_while_it_turns(moved):
-    """It keeps turning as before, but 36 mm further than expected: only a shift from there finds it."""
+    """It keeps rotating as before, but is 36 mm off its prediction: only shifts from there find it."""
     (points, center), images, then = jax.device_get(moved[:2]), *moved[2:4]
     middle_then = np.float32(center + (then - points.means).mean((0, 2)))
     expected = np.float32([0.02, 0.02, 0.02, 0.0, 0.0, 0.6])
@@ -111,7 +111,7 @@ def test_without_turns_only_translations_are_tried_and_found(moved):
     result = search_one(behind, start, images, config)
     twist = np.asarray(result.estimate.twists)[0]
     np.testing.assert_array_equal(twist[3:], 0)
-    assert result.leads[0] == 1  # no other orientation is possible, so this one is known
+    assert result.leads[0] == 1  # no other orientation is tried, so this one is known
     after = carried(behind, twist, start)
     behind = jax.tree.map(jnp.asarray, behind)
     assert gap(after, images, config) < gap(behind, images, config)
@@ -119,7 +119,7 @@ def test_without_turns_only_translations_are_tried_and_found(moved):
 
 @pytest.fixture(scope="module")
 def suspected(jumped):
-    """changes of the watch -> the result of a search for a group that jumped and is a suspect."""
+    """suspected(**changes of the watch) -> the result of a search for a suspect group that jumped."""
     *given, _ = jumped
     points, centers = jax.tree.map(lambda a: a[None], given[:2])
     sure, yes = Confidence(jnp.float32(1), jnp.float32(1), jnp.array(True)), jnp.array([True])
@@ -137,8 +137,8 @@ def suspected(jumped):
 
 @pytest.mark.slow
 def test_a_suspect_that_jumps_is_followed_before_it_is_relocated(suspected, jumped):
-    """It may have been where it was believed to be. A lost one was not, and one that agrees as usual has not
-    jumped."""
+    """Its pose before the jump may have been right. That of a lost group was not, and a group that agrees as
+    usual has not jumped."""
     followed = suspected(usual=jnp.array([0.05]))
     np.testing.assert_allclose(followed.estimate.twists[0, :3], jumped[-1], atol=1e-3)
     assert not followed.relocation_tried[0]
@@ -150,7 +150,7 @@ def test_a_suspect_that_jumps_is_followed_before_it_is_relocated(suspected, jump
 
 @pytest.mark.thorough
 def test_what_shifts_and_turns_miss_is_relocated_in_the_same_frame(jumped):
-    """It was knocked away by more than the shifts reach."""
+    """The group was knocked out of reach of the shifts."""
     *given, _ = jumped
     far = given[0]._replace(means=given[0].means + np.float32([0.15, 0.0, 0.0])[:, None])
     points, centers = jax.tree.map(lambda a: a[None], (far, middle(far).astype(np.float32)))
@@ -168,7 +168,7 @@ def test_what_shifts_and_turns_miss_is_relocated_in_the_same_frame(jumped):
 
 @pytest.mark.slow
 def test_one_group_is_relocated_in_the_time_in_which_two_are_turned(jumped):
-    """And the time for one search suffices for a relocation, or nothing would be found."""
+    """A relocation takes the time of two searches, but is done even if there is time for one alone."""
     *given, _ = jumped
     sure = Confidence(jnp.float32(1), jnp.float32(1), jnp.array(True))
     watch = first_watch(jnp.ones(3))._replace(waited=np.float32([3.0, 2.0, 1.0]))
@@ -192,8 +192,8 @@ def test_one_group_is_relocated_in_the_time_in_which_two_are_turned(jumped):
 
 @pytest.mark.thorough
 def test_groups_that_agree_worst_or_have_waited_longest_are_searched_for_first(jumped):
-    """Four groups jumped alike. Shifts find three of them; what they left is turned first, unless another was
-    glimpsed elsewhere or has waited for long."""
+    """Of four identical groups that jumped, shifts find three. The fourth is searched for first, unless
+    another was glimpsed elsewhere or has waited for long."""
     *given, shift = jumped
     visible, first = np.array([True] * 4), first_watch(jnp.ones(4))
     unusual = first._replace(usual=np.float32([0.3, 0.1, 0.3, 0.3]))

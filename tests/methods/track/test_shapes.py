@@ -1,4 +1,4 @@
-"""Known shapes are found on their plane and coloured; a scene without depth starts so."""
+"""Known shapes are located on their plane and coloured, which initializes a scene without depth."""
 
 from dataclasses import dataclass, replace
 
@@ -44,7 +44,7 @@ class Model:
 
 
 def block(**fields) -> Model:
-    """An L of 12 x 8 x 2 cm, which no turn maps onto itself, orange."""
+    """An orange L of 12 x 8 x 2 cm, without rotational symmetry."""
     x, y, z = np.meshgrid(np.arange(0, 0.12, 0.01), np.arange(0, 0.08, 0.01), [0.005, 0.015])
     means = np.stack([x, y, z], -1).reshape(-1, 3)
     means = means[(means[:, 0] < 0.035) | (means[:, 1] < 0.035)] - [0.04, 0.03, 0.0]
@@ -59,7 +59,7 @@ def ground(**fields) -> Model:
 
 @pytest.fixture(scope="module")
 def frame() -> Frame:
-    """The block at its true pose on the ground, drawn for two cameras."""
+    """The block at its true pose on the ground, rendered for two cameras."""
     parts = []
     for model, pose in ((block(), TRUE_POSE), (ground(), np.eye(4))):
         means = model.means @ pose[:3, :3].T + pose[:3, 3]
@@ -79,7 +79,7 @@ def frame() -> Frame:
 
 
 def miss(pose: np.ndarray) -> tuple[float, float]:
-    """(mean distance of the block's points from the truth, metres; by how many degrees it is turned)."""
+    """(mean distance of the block's points from the truth, metres; rotation error, degrees)."""
     means = block().means
     there, truth = (means @ p[:3, :3].T + p[:3, 3] for p in (pose, TRUE_POSE))
     turn = Rotation.from_matrix(TRUE_POSE[:3, :3].T @ pose[:3, :3]).magnitude()
@@ -90,13 +90,13 @@ def miss(pose: np.ndarray) -> tuple[float, float]:
 def test_a_pose_is_found_on_the_plane(frame):
     pose = find_pose(block(plane=np.array([0, 0, 2.0, 0.0])), frame, ground().means)
     distance, turn = miss(pose)
-    assert distance < 12e-3  # what lies inside the block's outline costs nothing: rendering does the rest
+    assert distance < 12e-3  # points inside the block's outline cost nothing; refinement by rendering follows
     assert turn < 6
 
 
 @pytest.mark.thorough
 def test_the_plane_may_lie_any_way_in_the_world(frame):
-    """The same in a world whose ground is a wall, and slanted."""
+    """The same in a rotated world, whose ground is steep and slanted."""
     world = np.eye(4)
     world[:3, :3] = Rotation.from_euler("yx", [80, 25], degrees=True).as_matrix()
     cameras = eqx.tree_at(
@@ -113,7 +113,7 @@ def test_the_plane_may_lie_any_way_in_the_world(frame):
 def test_a_scene_from_shapes_is_posed_coloured_and_labelled(frame):
     shapes = [ground(), block(plane=np.array([0, 0, 1.0, 0.0]))]
     assert all(isinstance(shape, Shape) for shape in shapes)
-    shapes[1].colors = shapes[1].colors * 0.8  # the pictures know better
+    shapes[1].colors = shapes[1].colors * 0.8  # the images correct that
     scene = scene_from_shapes(shapes, frame)
     assert scene.label_ids == (0, 1)
     assert scene.num_moving == len(block().means)

@@ -1,5 +1,5 @@
-"""The tracker's step as a pair of pure functions: how it composes, and what it does with frames that say
-nothing."""
+"""The tracker's step as a pair of pure functions: how it composes, and what it does with frames that cannot
+be read."""
 
 from dataclasses import replace
 from functools import partial
@@ -13,7 +13,8 @@ from gsjax.methods.track import PLAN, PRESETS, AlignConfig, Track, TrackBatch
 from gsjax.methods.track.frames import prepared
 from gsjax.methods.track.grow import empty_slots
 
-# Looks nowhere but where things were, which compiles fast, and for all groups, so that rounding chooses none.
+# Searches only at the last known poses, which compiles fast, and for all groups, so that none is chosen by
+# rounding.
 LITTLE = AlignConfig(iterations=2, reach=0.0, turns=(), pixels=32, centers=32, everywhere=None)
 CONFIG = replace(PRESETS["fast"], align=LITTLE)
 
@@ -102,8 +103,8 @@ def test_it_runs_in_a_scan_as_frame_by_frame_and_grows_there(table, begun):
 
     stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *frames[1:])
     (scanned, _), joined = jax.jit(partial(jax.lax.scan, body))((run.params, run.state), stacked)
-    # The same bits as XLA compiles by default. Unoptimised, rounding decides between steps of half a
-    # millimetre.
+    # With XLA's default optimisations these are the same bits. Unoptimised, rounding decides between steps of
+    # half a millimetre.
     np.testing.assert_allclose(scanned.pose.means, params.pose.means, atol=1e-3)
     taken = CONFIG.grow.slots - empty_slots(scanned.scene).sum()
     assert joined[-1] == taken > 0
@@ -144,7 +145,7 @@ def test_bytes_are_seen_as_floats_are(in_bytes_and_floats, begun):
 
 @pytest.mark.thorough
 def test_what_draws_at_random_takes_its_key(table, begun):
-    """Nothing does where nothing is lost: another key gives the same bits."""
+    """Where no group is lost, nothing is drawn at random: another key and step give the same bits."""
     _, frames, _ = table()
     _, update, run = begun
     batch = TrackBatch(frames[1], run.plans[PLAN])

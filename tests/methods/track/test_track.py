@@ -1,4 +1,4 @@
-"""The tracker from end to end on a tiny simulated table. Figures are millimetres at 96 x 72 pixels."""
+"""The tracker from end to end on a tiny simulated table. Tolerances are for images of 96 x 72 pixels."""
 
 import re
 from dataclasses import replace
@@ -35,12 +35,12 @@ from gsjax.scene.gaussians import take
 
 @pytest.fixture(scope="module")
 def quick(quick):
-    return replace(quick, headroom=1.51)  # not one that another module has compiled
+    return replace(quick, headroom=1.51)  # unlike other modules, so that nothing is compiled yet
 
 
 @pytest.fixture(scope="module")
 def traced(table, started, quick):
-    """The updates of a short recording, and how often one was traced for them."""
+    """(the updates of a short recording, how often the update was traced)."""
     _, frames, _ = table()
     traces = []
 
@@ -79,7 +79,7 @@ def test_objects_are_followed(table, started, tracked, centroid_errors):
 
 @pytest.mark.slow
 def test_what_moves_is_followed_and_not_left_behind(table, quick, centroid_errors):
-    """Frames in which the gripper carries the carton while the can rolls and the ball flies."""
+    """In these frames, the gripper carries the carton while the can rolls and the ball flies."""
     sequence, frames, _ = table(11)
     start = 7
     late = sequence.select(slice(start, None))
@@ -136,7 +136,7 @@ def test_settings_without_meaning_are_refused(config, changes, message):
 def test_labels_keep_the_masks_values(table, started):
     _, _, mask = table()
     assert started.label_ids[0] == 0
-    assert started.label_ids[-4:] == (2, 3, 4, 5)  # the robot, 1, is too long to be rigid: it comes in parts
+    assert started.label_ids[-4:] == (2, 3, 4, 5)  # the robot, 1, is too long to be rigid, so it is split
     assert set(started.label_ids) == set(np.unique(mask).tolist())
     labels = np.asarray(started.labels)
     assert (labels[: started.num_moving] > 0).all()
@@ -156,7 +156,7 @@ def test_each_gaussian_knows_its_objects_mask_value(started):
 
 @pytest.mark.thorough
 def test_what_joins_an_object_comes_after_its_first_gaussians(started, tracked):
-    """As docs/track.md takes the path of an object."""
+    """docs/track.md relies on this for the path of an object."""
     groups = np.asarray(started.labels)[: started.num_moving]
     mine = np.asarray(started.label_ids)[groups] == 3
     assert 0 < mine.sum() < len(mine)
@@ -207,7 +207,7 @@ def background_of(scene: TrackedScene) -> np.ndarray:
 
 @pytest.mark.slow
 def test_parts_of_the_tracker_can_be_left_out(table, started, tracked, quick, centroid_errors):
-    """Without matching nothing is found; without a warm start the last motion changes nothing."""
+    """Without matching, nothing is found; without a warm start, the last motion has no effect."""
     sequence, frames, _ = table()
     config = replace(quick, warm_start=False, matching=False)
     before, last = tracked[0], tracked[1]
@@ -225,7 +225,7 @@ def test_parts_of_the_tracker_can_be_left_out(table, started, tracked, quick, ce
 
 @pytest.mark.slow
 def test_an_overflow_changes_nothing_and_track_plans_again(table, started, tracked, quick):
-    """Capacities too small for the scene, in the step alone and then under `track`."""
+    """With capacities too small for the scene, in the step alone and then in `track`."""
     _, frames, _ = table()
     tracker = Track(quick)
     shape, run = tracker.start(started, frames[0])
@@ -246,7 +246,7 @@ def test_an_overflow_changes_nothing_and_track_plans_again(table, started, track
     assert plan.num_near >= int(info["needed"].num_near) > 16
     assert plan.full.capacity >= int(info["needed"].full) > 4096
     assert not now.info["overflow"]
-    # Rounding decides between two turns of an arm's part that agree equally well: a millimetre.
+    # Rounding decides between two rotations of a part of the arm that agree equally well: a millimetre.
     own = slice(started.num_moving)
     np.testing.assert_allclose(now.result.pose.means[own], tracked[0].result.pose.means[own], atol=2e-3)
 

@@ -1,4 +1,5 @@
-"""The record of each group: its usual residual, and whether it is lost, glimpsed elsewhere, or turned."""
+"""The record of each group: its usual residual, whether it is lost or glimpsed elsewhere, and whether its
+orientation is known."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -23,7 +24,8 @@ def test_a_watch_records_usual_residuals_and_waiting_times():
 
 
 def test_what_lags_does_not_become_usual():
-    """A cereal box that lagged by 6 mm was soon taken to agree as usual, and was not searched for."""
+    """Regression test: the residual of a cereal box that lagged by 6 mm soon became its usual one, so
+    that it was not searched for."""
     watch, none, one = first_watch(jnp.ones(1)), jnp.zeros(1), jnp.array([True])
     sure = Confidence(none + 0.9, none + 0.9, one)
     for confirmed, usual in ((False, 0.1), (True, 0.8 * 0.1 + 0.2 * 0.3)):
@@ -34,8 +36,8 @@ def test_what_lags_does_not_become_usual():
 
 
 def empty_result(searched, leads=jnp.inf, confirmed=None, elsewhere=False):
-    """A search result with nothing but which groups were searched for, found in the best place and searched
-    for elsewhere, and the leads of their orientations."""
+    """A search result without motion: which groups were searched for, confirmed and searched for elsewhere,
+    and the leads of their orientations."""
     still = jnp.zeros((len(searched), 6))
     estimate, none = Estimate(still, still[:, 0]), still[:, 0]
     sure = Confidence(none, none, none > 0)
@@ -47,7 +49,7 @@ def empty_result(searched, leads=jnp.inf, confirmed=None, elsewhere=False):
 
 
 def test_a_group_is_lost_at_once_if_its_agreement_drops_while_its_residual_rises():
-    """Seen from a frame to the next; the usual residual is 0.1."""
+    """From one frame to the next; the usual residual is 0.1."""
     none, one = jnp.zeros(1), jnp.array([True])
     for residual, agreement, lost in ((0.25, 0.5, True), (0.15, 0.5, False), (0.25, 0.6, False)):
         watch = first_watch(jnp.ones(1))._replace(agrees=none + 0.9)
@@ -57,7 +59,8 @@ def test_a_group_is_lost_at_once_if_its_agreement_drops_while_its_residual_rises
 
 
 def test_what_agrees_as_usual_and_has_a_known_turn_is_lost_only_when_little_is_left():
-    """A box that was turned by 149 degrees agreed in 0.36 of its points, and was not lost."""
+    """Regression test: a box whose orientation was off by 149 degrees agreed in 0.36 of its points, and was
+    not reported lost."""
     none, one = jnp.zeros(1), jnp.array([True])
     cases = [(0.1, True, 0.3, False), (0.1, True, 0.2, True), (0.1, False, 0.3, True), (0.2, True, 0.3, True)]
     for residual, known, agreement, lost in cases:
@@ -105,7 +108,8 @@ def test_what_was_found_is_on_probation_until_searches_find_nothing_better_and_t
 
 
 def test_where_nothing_can_be_searched_for_elsewhere_probation_ends_once_the_turn_is_told():
-    """Without depth: it lasted to the end, and what agreed in half of its points was lost again and again."""
+    """Regression test: without depth, probation never ended, and groups that agreed in half of their points
+    were lost again and again."""
     none, one = jnp.zeros(1), jnp.array([True])
     sure, watch = Confidence(none + 0.9, none + 0.9, one), first_watch(jnp.ones(1))._replace(lost=one)
     for result in (empty_result([False]), empty_result([True], leads=0.2)):
@@ -114,7 +118,7 @@ def test_where_nothing_can_be_searched_for_elsewhere_probation_ends_once_the_tur
 
 
 def test_a_lost_group_is_found_only_when_enough_of_it_shows():
-    """Behind an occluder, the little that is visible may agree, and the group is still lost. Half of the
+    """If the little that is visible beside an occluder agrees, the group may still be lost. Here, half of the
     points that faced a camera were visible at first, and no more need be visible now."""
     watch, none, one = first_watch(jnp.array([0.5])), jnp.zeros(1), jnp.array([True])
     cases = [
@@ -132,14 +136,15 @@ def test_a_lost_group_is_found_only_when_enough_of_it_shows():
 
 
 def test_what_is_found_elsewhere_once_is_glimpsed_and_checked_in_the_next_frame():
-    """A can that came out of a garage was found in one frame, and not searched for in the next four."""
+    """Regression test: a can that came out of a garage was found in one frame, and not searched for in the
+    next four."""
     watch, none, one = first_watch(jnp.ones(1)), jnp.zeros(1), jnp.array([True])
     unsure = Confidence(none + 0.4, none + 0.3, one)
     cases = [
         (0.9, one, ~one, True),
         (0.9, one, one, False),  # found twice, so it is moved there
         (0.9, one, ~one, True),
-        (0.9, one, ~one, False),  # checked, but no better than in its own place: others may be searched
+        (0.9, one, ~one, False),  # checked, but no better than in its own place: it is the turn of others
         (0.9, one, ~one, True),
         (0.4, one, ~one, False),  # not there
         (0.9, ~one, ~one, False),  # not searched for, or no better than in its own place
