@@ -49,7 +49,13 @@ def test_help_does_not_wait_for_jax():
 
 @pytest.mark.parametrize("command", ["track", "info", "view", "export", "poses", "distill", "experiment"])
 def test_help_of_a_command_needs_no_extra(command):
-    asked = f"from gsjax.cli import main\ntry: ended = main([{command!r}, '--help'])\nexcept SystemExit as left: ended = left.code\nassert not ended, ended"
+    asked = f"""
+from gsjax.cli import main
+try:
+    ended = main([{command!r}, "--help"])
+except SystemExit as left:
+    ended = left.code
+assert not ended, ended"""
     assert not loaded(asked) & OPTIONAL
 
 

@@ -196,8 +196,10 @@ def test_an_error_while_tracing_is_raised_as_it_is(folder):
         jit_once(fails, None)(1.0)
 
 
-def test_nothing_is_written_where_compiled_programs_are_not_kept(tmp_path):
+def test_nothing_is_kept_without_a_folder_of_traces(folder):
+    folder.rmdir()
     count = Counted()
     for _ in range(2):
         count.jitted()(*BALL)
     assert count.traced == 2
+    assert not folder.exists()

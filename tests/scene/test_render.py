@@ -48,11 +48,6 @@ def cameras():
     return make_cameras()
 
 
-def test_cameras_are_stacked_along_a_first_axis(cameras):
-    assert cameras.viewmat.shape == (2, 4, 4)
-    assert (cameras.width, cameras.height) == (WIDTH, HEIGHT)
-
-
 @pytest.mark.thorough
 def test_it_is_the_rasterizer_on_activated_values(scene, cameras):
     features = jnp.asarray(np.random.default_rng(1).normal(size=(scene.num, 5)), jnp.float32)
