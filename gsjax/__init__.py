@@ -16,8 +16,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from gsjax.data import Photographs, Sequence, open_photographs, open_sequence
-    from gsjax.engine.checkpoint import load, open_field, open_scene, save
-    from gsjax.engine.distill.file import write_field
+    from gsjax.engine.checkpoint import load, open_field, open_scene, save, write_field
     from gsjax.engine.show import show
     from gsjax.engine.verbs import deform, distill, fit, parts, track
     from gsjax.geometry.cameras import Camera
@@ -42,8 +41,7 @@ __version__ = "0.1.0"
 # Loaded at first use (PEP 562): `gsjax --help` need not wait for JAX.
 _HOMES = {
     "gsjax.data": ("Photographs", "Sequence", "open_photographs", "open_sequence"),
-    "gsjax.engine.checkpoint": ("load", "open_field", "open_scene", "save"),
-    "gsjax.engine.distill.file": ("write_field",),
+    "gsjax.engine.checkpoint": ("load", "open_field", "open_scene", "save", "write_field"),
     "gsjax.engine.show": ("show",),
     "gsjax.engine.verbs": ("deform", "distill", "fit", "parts", "track"),
     "gsjax.geometry.cameras": ("Camera",),

@@ -1,14 +1,20 @@
 """Saving and reopening results. `gsjax.save` and `gsjax.load` store a tick of any method in one file and read
-it back without a template; `gsjax.open_scene` and `gsjax.open_field` open what commands wrote."""
+it back without a template; `gsjax.open_scene` and `gsjax.open_field` open what commands wrote, and
+`gsjax.write_field` writes a field as `gsjax distill` does."""
 
 import dataclasses
+import json
 import os
 import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from gsjax.engine.drive import Tick
+from gsjax.io.atomic import write_npz
 from gsjax.io.checkpoints import CheckpointError, load_checkpoint, save_checkpoint
+from gsjax.scene.feature_grid import FeatureGrid
 
 if TYPE_CHECKING:
     from gsjax.methods.distill import DistillResult
@@ -16,6 +22,10 @@ if TYPE_CHECKING:
 else:
     DistillResult = Any
     Viewable = Any  # slow to import, like everything that shows a scene
+
+FIELD_FORMAT = 1
+"""Format of field.npz."""
+_UNKNOWN_SOURCE = {"kind": "files", "names": {}, "weights": None}
 
 
 def save(path: str | os.PathLike, now: Tick) -> None:
@@ -110,3 +120,26 @@ def open_field(path: str | os.PathLike, scene: str | os.PathLike | None = None) 
     for text in notes.warnings:
         warnings.warn(text, UserWarning, stacklevel=2)
     return found
+
+
+def write_field(path: str | os.PathLike, result: DistillResult) -> None:
+    """Write field.npz, which `gsjax query` and `gsjax view` read beside the scene. An existing file is
+    replaced only once the new one is complete.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
+    encoding = result.field.encoding
+    source = _UNKNOWN_SOURCE if result.source is None else result.source.plain()
+    about: dict[str, Any] = {"format": FIELD_FORMAT, "source": source, "scene": dict(result.scene)}
+    arrays = {"lift": result.field.lift}
+    if isinstance(encoding, FeatureGrid):
+        assert result.rows is not None
+        about["grid"] = dataclasses.asdict(encoding.config)
+        arrays |= {"rows": result.rows, "table": encoding.table, "bounds": np.array(encoding.bounds)}
+        for i, layer in enumerate(encoding.layers):
+            assert layer.bias is not None
+            arrays |= {f"weight_{i}": layer.weight, f"bias_{i}": layer.bias}
+    else:
+        arrays["vectors"] = encoding
+    write_npz(path, {**arrays, "about": json.dumps(about)})

@@ -1,8 +1,6 @@
-"""field.npz, the file of a feature field, which is separate from that of its scene."""
+"""Reading field.npz, the file of a feature field, which is separate from that of its scene. It is written by
+`gsjax.write_field`."""
 
-import json
-import os
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -11,9 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 from equinox import nn, tree_at
 
+from gsjax.engine.checkpoint import FIELD_FORMAT
 from gsjax.engine.files import check_arrays, read_arrays
 from gsjax.engine.teaching.source import Source
-from gsjax.io.atomic import write_npz
 from gsjax.io.brief import brief
 from gsjax.io.parsed import parse_json
 from gsjax.methods.distill import DistillResult, FeatureField
@@ -22,32 +20,7 @@ from gsjax.scene.feature_grid import FeatureGrid, FeatureGridConfig
 NAME = "field.npz"
 FOLDER = "field"
 """Folder of a run's field, within the run."""
-_FORMAT = 1
-_UNKNOWN = {"kind": "files", "names": {}, "weights": None}  # an unknown source
 _AGAIN = "distil it again with this version of gsjax"
-
-
-def write_field(path: str | os.PathLike, result: DistillResult) -> None:
-    """Write field.npz, which `gsjax query` and `gsjax view` read beside the scene. An existing file is
-    replaced only once the new one is complete.
-
-    Raises:
-        OSError: the file cannot be written.
-    """
-    encoding = result.field.encoding
-    source = _UNKNOWN if result.source is None else result.source.plain()
-    about: dict[str, Any] = {"format": _FORMAT, "source": source, "scene": dict(result.scene)}
-    arrays = {"lift": result.field.lift}
-    if isinstance(encoding, FeatureGrid):
-        assert result.rows is not None
-        about["grid"] = asdict(encoding.config)
-        arrays |= {"rows": result.rows, "table": encoding.table, "bounds": np.array(encoding.bounds)}
-        for i, layer in enumerate(encoding.layers):
-            assert layer.bias is not None
-            arrays |= {f"weight_{i}": layer.weight, f"bias_{i}": layer.bias}
-    else:
-        arrays["vectors"] = encoding
-    write_npz(path, {**arrays, "about": json.dumps(about)})
 
 
 def read_field(path: Path) -> DistillResult:
@@ -64,7 +37,7 @@ def read_field(path: Path) -> DistillResult:
         about = parse_json(str(arrays["about"]))
         source, scene = Source.of(about["source"]), dict(about["scene"])
         config = FeatureGridConfig(**about["grid"]) if "grid" in about else None
-        if about["format"] != _FORMAT:
+        if about["format"] != FIELD_FORMAT:
             raise ValueError(f"format {about['format']}")
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise ValueError(

@@ -11,7 +11,8 @@ import jax
 from rich.console import Console
 
 from gsjax.engine.budget import Budget, note_if_few
-from gsjax.engine.distill.file import FOLDER, NAME, write_field
+from gsjax.engine.checkpoint import write_field
+from gsjax.engine.distill.file import FOLDER, NAME
 from gsjax.engine.distill.judge import judge
 from gsjax.engine.distill.results import asked_by, summarize
 from gsjax.engine.distill.scene import FieldScene, SceneOptions, open_field_scene

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from gsjax.data import open_sequence, photographs_of
-from gsjax.engine.checkpoint import load, save
-from gsjax.engine.distill.file import read_field, write_field
+from gsjax.engine.checkpoint import load, save, write_field
+from gsjax.engine.distill.file import read_field
 from gsjax.engine.teaching.choice import TeacherChoice
 from gsjax.engine.verbs import distill
 from gsjax.methods.distill import DistillConfig, Teacher, teacher_of_objects
