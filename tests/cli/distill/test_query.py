@@ -91,7 +91,7 @@ def test_an_answer_elsewhere_and_without_pictures(gsjax, closed, tmp_path):
 
 @pytest.mark.thorough
 def test_a_text_within_another_finds_what_both_mean(gsjax, field, closed, scene, tmp_path):
-    """In the field of colours and names, "blue" within "can" finds the blue Gaussians of the can, "ball" none."""
+    """In the field of colours and names, the blue Gaussians of the can; there is no ball within the can."""
     closed = shutil.copytree(closed, tmp_path / "closed")
     assert gsjax("query", closed, "can")[0] == 0
     cans = found_of(closed)["indices"]

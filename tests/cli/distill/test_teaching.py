@@ -114,7 +114,7 @@ def test_weights_are_read_once_however_many_pictures_there_are(tmp_path, monkeyp
 
 
 def test_masks_of_sam_teach_on_all_levels_or_on_one(tmp_path, monkeypatch):
-    """A thing and its part, which is on the middle level and, as there is nothing smaller, on the smallest."""
+    """A thing and its part, which is on the middle level and, as nothing is smaller, also on the smallest."""
     weights = tmp_path / "sam"
     weights.mkdir()
     monkeypatch.setattr(field_teacher, "folder_digest", lambda path: "digest")
