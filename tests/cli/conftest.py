@@ -1,4 +1,4 @@
-"""A tiny recording for tests to corrupt, and a tracker that stands still, to test what is around it."""
+"""A tiny recording for tests to corrupt, and a stand-in for the tracker, to test the code around it."""
 
 import json
 import shutil
@@ -41,7 +41,7 @@ def pristine(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="session")
 def photographs(tmp_path_factory) -> Path:
-    """Nine photographs of the built-in table, 48x36, and one that is listed and not there."""
+    """Nine photographs of the built-in table, 48x36, and one that is listed but missing."""
     folder = tmp_path_factory.mktemp("photographs") / "table"
     (folder / "images").mkdir(parents=True)
     frames = []
@@ -81,7 +81,7 @@ def interrupted(monkeypatch) -> Callable[[int], AbstractContextManager]:
 
 @pytest.fixture
 def recording(pristine, tmp_path) -> Path:
-    """A copy of it to corrupt."""
+    """A copy of `pristine` to corrupt."""
     return Path(shutil.copytree(pristine, tmp_path / "table"))
 
 
@@ -92,7 +92,7 @@ def unfitted(frame, mask, mask_camera, config, before_fit):
 
 
 def still_tick(scene, step: int, info: dict, seconds: float = 0.01) -> Tick:
-    """That of a tracker whose objects are where they were at first."""
+    """The tick of a tracker whose objects are where they were at first."""
     run = Run(Tracked(scene, first_pose(scene)), None, step, {PLAN: None}, Kept(1))
     return Tick(Track(), None, run, info, seconds, 0.0)
 
@@ -108,7 +108,7 @@ def standing_still(scene, first, frames, config, **how):
 
 @pytest.fixture
 def still(monkeypatch):
-    """Tracking is replaced by standing still, which compiles nothing; that is given."""
+    """Replaces tracking by `standing_still`, which compiles nothing; returns that function."""
     monkeypatch.setattr(run, "start_scene", unfitted)
     monkeypatch.setattr(loop, "track", standing_still)
     return standing_still
@@ -116,7 +116,7 @@ def still(monkeypatch):
 
 @pytest.fixture
 def gsjax_track(tmp_path, capfd):
-    """Runs `gsjax track` in this process, into tmp_path/run; returns the exit code and what was said."""
+    """Runs `gsjax track` in this process, into tmp_path/run; returns the exit code and its output."""
 
     def call(dataset, *options: str) -> tuple[int, str]:
         code = main(["track", str(dataset), "--out", str(tmp_path / "run"), *options])
@@ -129,7 +129,7 @@ def gsjax_track(tmp_path, capfd):
 
 @pytest.fixture
 def gsjax(capfd):
-    """Runs a command in this process; returns the exit code and what was said, spaces as one."""
+    """Runs a command in this process; returns the exit code and its output, with whitespace collapsed."""
 
     def call(*arguments) -> tuple[int, str]:
         capfd.readouterr()
@@ -142,7 +142,7 @@ def gsjax(capfd):
 
 
 LABELS = {0: "background", 1: "robot", 2: "carton", 3: "can", 4: "ball", 5: "block"}
-"""Of the recording's masks."""
+"""The labels of the recording's masks."""
 
 
 def first_picture(pristine: Path) -> tuple[Gaussians, np.ndarray]:
@@ -161,7 +161,7 @@ def first_picture(pristine: Path) -> tuple[Gaussians, np.ndarray]:
 def write_made_field(
     folder: Path, scene: Path, images: Path | None, source: Source, labels: np.ndarray, vectors: np.ndarray
 ) -> Path:
-    """A field that nobody had to distil: of each Gaussian the row `vectors[label]`."""
+    """Writes a field without distilling it: each Gaussian has the row `vectors[label]`; returns `folder`."""
     photographs = None
     if images is not None:
         told = SceneOptions(scene, str(images), frames="0:1", test_every=0)

@@ -1,4 +1,4 @@
-"""Bad recordings and bad wishes: each a clear sentence and exit code 2, or a warning and a sound run."""
+"""Bad recordings and options: each gives a clear error and exit code 2, or a warning and a sound run."""
 
 import json
 import os
@@ -14,7 +14,7 @@ from gsjax.data import Sequence, open_sequence
 
 @pytest.fixture
 def refused(gsjax_track, tmp_path):
-    """Runs `gsjax track`, which must refuse; returns what it said."""
+    """Runs `gsjax track`, which must refuse; returns its output."""
 
     def call(dataset, *options) -> str:
         code, said = gsjax_track(dataset, *options)
@@ -28,7 +28,7 @@ def refused(gsjax_track, tmp_path):
 
 @pytest.fixture
 def sound(gsjax_track, tmp_path):
-    """Runs `gsjax track`, which must succeed with finite numbers; returns what it said, and metrics.json."""
+    """Runs `gsjax track`, which must succeed with finite numbers; returns its output and metrics.json."""
 
     def call(dataset, *options) -> tuple[str, dict]:
         code, said = gsjax_track(dataset, *options)

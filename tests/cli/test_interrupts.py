@@ -112,7 +112,7 @@ def test_what_must_not_be_disturbed_ends_before_an_interrupt_is_raised():
 
 
 def test_nothing_stands_between_an_undisturbed_call_and_who_made_it():
-    # Once the types of results were checked there, and an interrupt in the check lost what the call gave.
+    # A type check of results used to wrap it, and an interrupt within the check lost the call's result.
     assert not hasattr(shielded, "__wrapped__")
 
 

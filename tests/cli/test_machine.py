@@ -1,4 +1,4 @@
-"""Which cores a process keeps to."""
+"""The cores, backend and memory that a process uses, and how a machine is described."""
 
 import os
 import subprocess
@@ -48,7 +48,7 @@ print(cores, len(pool) > 0, all(os.sched_getaffinity(t) == {max(before)} for t i
 @pytest.mark.thorough
 @needs_affinity
 def test_threads_run_on_the_cores_that_are_kept_to_those_of_jax_too():
-    """Importing a command must not have started JAX's yet."""
+    """Importing a command must not start JAX's threads."""
     said = subprocess.run([sys.executable, "-c", KEPT], capture_output=True, text=True, check=True)
     assert said.stdout.split() == ["1", "True", "True"]
 

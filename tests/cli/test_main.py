@@ -1,4 +1,4 @@
-"""The front door: help, unknown words, info, and how errors and warnings are said."""
+"""The entry point of the command line: help, unknown commands, `gsjax info`, errors and warnings."""
 
 import os
 import re
@@ -67,7 +67,7 @@ def test_every_option_is_explained(say, capfd, command):
     out = capfd.readouterr().out
     opens = {"track": "DATASET", "info": "DATASET", "query": "RUN [TEXT]", "grasp": "RUN TEXT"}
     assert opens.get(command, "") in out
-    # What it takes, two spaces or a new line, and at once its default.
+    # An option without help: its value, two spaces or a new line, then directly its default.
     assert not re.findall(r"│ --[\w.-]+(?: \S+)*(?:  +|\s*│\n│\s+)\((?:default|required)", out)
     if command == "track":
         assert "--track.refine.iterations" in out

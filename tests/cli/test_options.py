@@ -1,4 +1,4 @@
-"""What commands share: an option of one name means the same thing wherever it stands."""
+"""The options that commands share: a name means the same in every command."""
 
 import dataclasses
 import inspect
@@ -27,28 +27,28 @@ SHARED = ("frames", "cameras", "eval_cameras", "test_every", "scale", "seed", "m
 SHARED += ("dataset", "mask_camera", "masks", "sam", "weights", "encoder", "min_score")
 SHARED += ("resume", "overwrite", "cores", "debug")
 OWN = {
-    ("query", "frames"),  # those of which pictures are made; a run has chosen its own
-    ("fit", "scale"),  # of which None is moderate
-    ("live", "minutes"),  # of a stream, which has no other end
+    ("query", "frames"),  # the frames to draw; the run has chosen its own
+    ("fit", "scale"),  # None chooses a moderate size
+    ("live", "minutes"),  # of a stream, which otherwise has no end
     ("parts", "masks"),  # of the anchor, in all cameras
     ("distill", "masks"),  # of every photograph
     ("deform", "masks"),  # of every frame
-    ("query", "weights"),  # also where they are now, of what CLIP taught
-    ("view", "weights"),  # only that
+    ("query", "weights"),  # also where the weights are now, for a field that CLIP taught
+    ("view", "weights"),  # only where the weights are now
     ("export", "frames"),  # of a scene; a run has chosen its own
     ("export", "overwrite"),  # of a file
 }
 
 
 def options_of(command: str) -> list[type]:
-    """The dataclasses of a command's options: one, or one a subcommand."""
+    """The dataclasses of a command's options: one, or one per subcommand."""
     kinds = import_module(COMMANDS[command][0]).Options
     members = [kinds] if isinstance(kinds, type) else get_args(kinds)
     return [get_args(m)[0] if get_origin(m) else m for m in members]
 
 
 def groups_of(kind: type) -> list[type]:
-    """The dataclass, and those within it whose options stand beside its own."""
+    """The dataclass, and those nested in it whose options have no prefix."""
     hints = get_type_hints(kind, include_extras=True).values()
     return [kind, *(get_args(h)[0] for h in hints if tyro.conf.OmitArgPrefixes in get_args(h))]
 

@@ -30,7 +30,7 @@ def photographs(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def found(photographs, tmp_path_factory):
-    """The dataset that is made of them."""
+    """The dataset that is made from `photographs`."""
     out = tmp_path_factory.mktemp("found") / "dataset"
     assert main(["poses", str(photographs), "--out", str(out)]) == 0
     return out
@@ -117,7 +117,7 @@ def test_a_video(say, tmp_path):
 
 @pytest.mark.thorough
 def test_pictures_in_formats_that_colmap_lacks(say, photographs, tmp_path):
-    """They are read as any other, whatever their extension, and come out as they went in."""
+    """They are read like any other, whatever their extension, and copied unchanged."""
     folder, out = tmp_path / "photos", tmp_path / "out"
     shutil.copytree(photographs, folder)
     for name, suffix in (("0", ".webp"), ("1", ".png")):

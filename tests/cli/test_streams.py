@@ -1,4 +1,4 @@
-"""Whatever becomes of the standard streams, a command does its work, and its exit code tells of that."""
+"""Whatever happens to the standard streams, a command does its work, and its exit code tells how it went."""
 
 import os
 import subprocess

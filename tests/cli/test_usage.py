@@ -1,4 +1,4 @@
-"""What `--help` shows, and what is said of an option that does not exist."""
+"""What `--help` shows, and the errors for options that do not exist."""
 
 import re
 from importlib import import_module
@@ -26,7 +26,7 @@ def test_help_is_wrapped_once_and_says_no_empty_default(command, width, monkeypa
     assert max(map(len, said.splitlines())) <= width
     assert not re.search(r"\(default: (:|False|None)?\)", said)
     assert "{None}" not in said.replace("everywhere {None}|INT", "")  # where None means all
-    # A word begins a line only where it did not fit into the line above.
+    # A word begins a line only if it did not fit into the line above.
     lines = [line.strip("│") for line in said.splitlines()]
     for above, below in pairwise(lines):
         words, column = below.split(), len(below) - len(below.lstrip())

@@ -1,4 +1,4 @@
-"""Small problems of every method, for laws that all of them keep."""
+"""Small problems of every method, on which tests check the laws that all steps keep."""
 
 from dataclasses import replace
 from functools import cache
@@ -74,13 +74,13 @@ def started(make):
 
 def fit_step_case():
     step, run, batch = started(fit_problem)
-    batch = batch._replace(plan=replace(batch.plan, capacity=1024))  # for the scene and little more
-    sick = batch._replace(progress=jnp.nan)  # what the rasterizer is given it culls
+    batch = batch._replace(plan=replace(batch.plan, capacity=1024))  # enough for the scene and little more
+    sick = batch._replace(progress=jnp.nan)  # not the scene: the rasterizer would cull NaN
     return step, run.params, batch, sick
 
 
 def deform_step_case():
-    """With deformation, features and a graph."""
+    """A step of `deform` with deformation, features and a graph."""
     frames, lesson = tissue()
     method = Deform(replace(CONFIG, warmup=0, graph=replace(CONFIG.graph, after=0)))
     problem, run = method.start(frames, lesson)
@@ -109,22 +109,22 @@ def distill_step_case():
 
 
 def solve_step_case():
-    """The vote of a solution, of one view."""
+    """The step of `start="solve"`: the vote of one view."""
     step, run, batch = little_distillation(DistillConfig(start="solve", iterations=0))
-    batch = batch._replace(is_last=False)  # the end of a pass goes on whatever a view adds
+    batch = batch._replace(is_last=False)  # the last view of a pass changes the state in any case
     codebook = batch.view.codebook.at[0, 0].set(jnp.nan)
     return step, run.params, batch, batch._replace(view=batch.view._replace(codebook=codebook))
 
 
 def stream_step_case():
-    """A frame of parts, with a picture of the past."""
+    """A step of `parts` on one frame, with an image of a past frame."""
     batch, bodies = batch_of(two_boxes())
     params = params_of(shifted(0.01), soft(bodies), bodies)
     return parts_step(PartsConfig()), params, batch, batch._replace(progress=jnp.nan)
 
 
 def refine_step_case():
-    """All frames of parts together."""
+    """A step of `parts` that refines all frames together."""
     given, _ = batch_of(two_boxes())
     scene, rest = given.canonical, at_rest(PARTS)
     poses = jax.tree.map(lambda a: jnp.stack([a, a]), rest)
@@ -148,7 +148,7 @@ def track_step_case():
     tracker = Track(TRACK)
     shape, run = tracker.start(scene, first)
     plan = run.plans[PLAN]
-    plan = replace(plan, near=replace(plan.near, capacity=256))  # for the scene and little more
+    plan = replace(plan, near=replace(plan.near, capacity=256))  # enough for the scene and little more
     batch = TrackBatch(second, plan)
     sick = TrackBatch(eqx.tree_at(lambda f: f.images, second, jnp.full_like(second.images, jnp.nan)), plan)
     return tracker.step(shape), run.params, batch, sick, TrackBatch(first, plan)
@@ -165,8 +165,8 @@ def features_case():
     return feature_distiller(), prior, batch, sick
 
 
-# Each makes a step, its params, a batch, one with a number that is not finite, and, for a step that needs it,
-# one to be seen before the others.
+# Each returns a step, its params, a batch, a batch with a number that is not finite and, if the step needs
+# it, a batch that it must see before the others.
 STEPS = {
     "fit": fit_step_case,
     "distill": distill_step_case,
@@ -178,11 +178,11 @@ STEPS = {
     "features": features_case,
 }
 
-WITHOUT_PLAN = ("distill", "distill, solved")  # draws frozen views
+WITHOUT_PLAN = ("distill", "distill, solved")  # they render frozen views
 
 
 def enlarged(tree):
-    """The tree with its Gaussians fifty times as large."""
+    """The tree with its Gaussians about fifty times as large."""
 
     def larger(node):
         return eqx.tree_at(lambda g: g.log_scales, node, node.log_scales + 4) if is_gaussians(node) else node

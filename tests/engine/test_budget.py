@@ -1,4 +1,4 @@
-"""What a command does with the minutes that it was given."""
+"""How a command spends the minutes that it is given."""
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ from gsjax.engine.messages import Notes
 
 @pytest.fixture
 def clock(monkeypatch):
-    """The time, which a test sets."""
+    """A clock that the test sets."""
 
     class Clock:
         now = 1000.0
@@ -21,7 +21,7 @@ def clock(monkeypatch):
 
 
 def begun(clock, minutes, *, used=0.0, earlier=0.0):
-    """A budget whose steps begin after `used` seconds; those in which a program starts are among them."""
+    """A budget whose steps begin after `used` seconds, the start of the program included."""
     budget = Budget(minutes, clock.now + module._LOADING_S)
     clock.now += used
     budget.begin_steps(earlier, Console(quiet=True))
@@ -97,7 +97,7 @@ def test_of_many_items_as_many_as_there_is_time_for_are_taken_evenly_spread(cloc
         clock.now += 2 if item == 0 else 1  # the first compiles
     assert taken == [0, 1, 2, 34, 67, 99]
     clock.now += 1
-    assert list(budget.affordable(range(3))) == [0]  # one always
+    assert list(budget.affordable(range(3))) == [0]  # always at least one
 
 
 def test_items_that_are_all_needed_stop_where_time_ends(clock):

@@ -1,4 +1,4 @@
-"""The one loop, on a method small enough to see through: what it guarantees to all of them."""
+"""The loop that drives every method, and what it guarantees, on a method small enough to follow by hand."""
 
 import signal
 import threading
@@ -29,8 +29,8 @@ TRACES = []
 class WalkConfig:
     steps: int = 8
     seed: int = 0
-    needs: tuple[int, ...] = ()  # of each step
-    sick: int = -1  # the step that is not finite
+    needs: tuple[int, ...] = ()  # the capacity that each step needs
+    sick: int = -1  # the step whose numbers are not finite
 
 
 class WalkBatch(NamedTuple):
@@ -144,7 +144,7 @@ def test_programs_are_compiled_once_for_each_shape_and_their_time_stands_apart()
     list(walked())
     TRACES.clear()
     ticks = list(walked())
-    assert TRACES == []  # an equal method finds what was compiled for the first
+    assert TRACES == []  # an equal method reuses what was compiled for the first
     ticks = list(walked(WalkConfig(steps=9, seed=11)))
     compiled = [now.step for now in ticks if now.compile_seconds > 0]
     assert {1, 5, 9} <= set(compiled) | {9}

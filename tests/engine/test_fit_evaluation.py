@@ -20,7 +20,7 @@ from gsjax.optim.method import Run
 
 
 class Given(Budget):
-    """A budget of 100 s, of which a test says how much is used."""
+    """A budget of 100 s; the test sets how much of it is used."""
 
     spent = 0.0
 

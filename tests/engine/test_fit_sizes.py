@@ -15,7 +15,7 @@ CONSOLE = Console(quiet=True)
 
 
 class Given(Budget):
-    """A budget of so many seconds for steps, of which a test says how many are left."""
+    """A budget of `seconds` for steps; the test sets how many are left."""
 
     def __init__(self, seconds):
         super().__init__(seconds / 60, 0.0)

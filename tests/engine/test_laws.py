@@ -1,4 +1,4 @@
-"""The laws of steps, held by every step of the package: a case makes a small problem, and each law takes it.
+"""The laws that every step of the package keeps, each tested on a small problem for each step.
 
 A step keeps the tree and shapes of its state; an update that is not finite, or that overflowed its plan,
 changes neither params nor state; `info` has loss, skipped, overflow and needed; `step` may be traced; it runs
@@ -23,14 +23,14 @@ KEY = jax.random.key(7)
 
 
 class Case(NamedTuple):
-    """A step and what it is tried with.
+    """A step and the inputs it is tested with.
 
     Attributes:
         step: the step.
-        params: to begin with.
-        batch: one in which nothing is wrong.
-        sick: one with a number that is not finite; None if params are poisoned instead.
-        first: a batch to be seen before the others, by the step itself; None for a step that needs none.
+        params: the initial params.
+        batch: a sound batch.
+        sick: a batch with a number that is not finite.
+        first: a batch that the step must see before the others; None if it needs none.
     """
 
     step: Step
@@ -67,7 +67,7 @@ def case_of(name: str) -> Case:
 
 
 def averaged(step: Step) -> Step:
-    """A step that wraps another, with an average of params over steps, as one keeps for evaluation."""
+    """A step that wraps another and keeps a running average of its params, as is common for evaluation."""
 
     def update(params, state, batch, *, step_=step, step, key):
         inner, mean = state
@@ -80,7 +80,7 @@ def averaged(step: Step) -> Step:
 
 @cache
 def jitted(name: str) -> Callable:
-    """The wrapped update of a case: one program for the laws of both."""
+    """The jitted update of a case's wrapped step: one program for the laws of the step and of its wrapper."""
     update = averaged(case_of(name).step).update
     return jax.jit(lambda params, state, batch, step: update(params, state, batch, step=step, key=KEY))
 

@@ -1,4 +1,4 @@
-"""Rows of parts are read with care: one that leaves the scene is warned of."""
+"""A warning names parts that move farther than the scene is wide."""
 
 import io
 
@@ -15,7 +15,7 @@ from gsjax.scene.initialize import gaussians_from_points
 
 @pytest.mark.parametrize("moved_mm", [900.0, 5000.0])
 def test_a_part_that_moves_farther_than_the_scene_is_wide_is_warned_of(moved_mm):
-    means = np.random.default_rng(0).uniform(size=(500, 3))  # a cube of a metre, and one far away
+    means = np.random.default_rng(0).uniform(size=(500, 3))  # in a cube of one metre, but for two
     means[0] = 100.0
     means[1] = np.nan
     gaussians = gaussians_from_points(means, means[:, ::-1].clip(0, 1))

@@ -1,4 +1,4 @@
-"""The words of summaries: figures are named for what they are, datasets as people call them."""
+"""The wording of summaries: scores are labelled as what they are, and datasets have readable titles."""
 
 import pytest
 
@@ -10,7 +10,7 @@ def test_the_tile_of_the_tracker_is_a_mean_and_says_so():
     score = next(score for score in SCORES if score.key == "centroid_error_mm")
     still, moved = {"moved_mm": 0.0}, {"moved_mm": 200.0}
     objects = {
-        "block": {"centroid_error_mm": 9.0, **still},  # no test of a tracker
+        "block": {"centroid_error_mm": 9.0, **still},  # it stood still, so it tests no tracker
         "can": {"centroid_error_mm": 7.6, **moved},
         "ball": {"centroid_error_mm": 0.8, **moved},
     }
@@ -25,7 +25,7 @@ def test_the_tile_of_the_tracker_is_a_mean_and_says_so():
         ("tabletop_seed0", "tabletop, seed 0"),
         ("bar_seed12", "bar, seed 12"),
         ("fox", "fox"),
-        ("room_seed3", "room_seed3"),  # somebody's folder
+        ("room_seed3", "room_seed3"),  # a user's folder
         ("a_seeds", "a_seeds"),
     ],
 )

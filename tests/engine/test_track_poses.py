@@ -1,4 +1,4 @@
-"""Poses of tracked objects: which points stand for an object, and from what its pose is known."""
+"""Scores of the poses of tracked objects: which points represent an object, and which poses are scored."""
 
 from dataclasses import replace
 from functools import cache
@@ -24,7 +24,7 @@ def recording():
 
 
 def tracking(shift=0.0):
-    """Gaussians that move as the truth does, but for a shift of object 3 from the second frame on."""
+    """Gaussians that move as the ground truth does, but for a shift of object 3 from the second frame on."""
     rng, truth = np.random.default_rng(0), recording().truth
     local = 0.03 * rng.normal(size=(2, EACH, 3))
     means = np.einsum("tkij,knj->tkni", truth.poses[:, :2, :3, :3], local) + truth.poses[:, :2, None, :3, 3]
@@ -68,7 +68,7 @@ def test_a_model_of_the_recording_is_preferred_and_its_symmetries_count():
     model = ObjectModel("models_eval/obj_000003.ply", points, 0.06, np.stack([np.eye(4), turn]))
     models = (None, model, *[None] * (len(recording().truth.names) - 2))
     sequence = replace(recording(), truth=replace(recording().truth, models=models))
-    # Object 3 turns by its symmetry at once.
+    # From the second frame on, object 3 is rotated by its symmetry.
     tracked = tracking()
     centers = recording().truth.poses[:, 1]
     for t in range(1, FRAMES):

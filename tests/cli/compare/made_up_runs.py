@@ -1,4 +1,4 @@
-"""Folders of runs of each method, as far as their scores are read."""
+"""Made-up run folders of each method, with as much in them as readers of their scores need."""
 
 import json
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""`gsjax compare`: what is best of what can be compared, over the views that runs have in common."""
+"""`gsjax compare`: the best run by each comparable score, over the views that the runs have in common."""
 
 import json
 import shutil
@@ -24,7 +24,7 @@ def photograph(view, size=(240, 320)):
 
 @pytest.fixture
 def make(tmp_path):
-    """Writes the folder of a run of `gsjax fit` as far as a comparison reads it; returns it."""
+    """Writes as much of a run of `gsjax fit` as a comparison reads; returns its folder."""
 
     def made(name, psnr=(20.0, 22.0, 24.0), views=VIEWS, evaluated=None, config=None, **metrics):
         run = tmp_path / name
@@ -70,7 +70,7 @@ def make(tmp_path):
 
 @pytest.fixture
 def gsjax_compare(tmp_path, capfd):
-    """Runs `gsjax compare` into tmp_path/comparison; returns the exit code, what was said and is written."""
+    """Runs `gsjax compare` into tmp_path/comparison; returns the exit code, output and comparison.json."""
 
     def call(*runs, out=tmp_path / "comparison"):
         code = main(["compare", *map(str, runs), *(["--out", str(out)] if out else [])])
@@ -96,7 +96,7 @@ def test_the_best_of_each_column_stands_out(make, gsjax_compare, tmp_path):
     assert by_run(found, "minutes") == {"a": 1.5, "b": 1.5}
     (group,) = found["groups"]
     assert group["views"] == list(VIEWS)
-    # Equal ones (MS-SSIM, minutes) have no best, and of steps none is better.
+    # Equal scores (MS-SSIM, minutes) have no best, and neither more nor fewer steps are better.
     assert group["best"] == {"psnr": ["b"], "ssim": ["b"], "lpips": ["a"], "num_gaussians": ["a"]}
     assert found["options"] == {"fit.steps": {"a": 100, "b": 200}}
     assert "Another version of gsjax made a: no setting fit.cap there." in found["notes"]
@@ -107,7 +107,7 @@ def test_the_best_of_each_column_stands_out(make, gsjax_compare, tmp_path):
     assert '<td class="number">22.00</td>' in page
     assert page.count("data:image/png") == len(VIEWS)
     assert page.count("data:image/svg") == 1
-    # The photograph, then each run; below the captions the pictures are those of the runs.
+    # The photograph, then each run; below the captions, the pictures are the runs' own.
     strip = cv2.imread(str(tmp_path / "comparison" / "pictures" / "0_0000.png"))[..., ::-1]
     assert strip.shape == (240, 3 * 320, 3)
     truth = photograph(VIEWS[0]).astype(int)
@@ -247,7 +247,7 @@ def test_mistakes_are_said_and_nothing_is_written(make, gsjax_compare, tmp_path)
     code, said, _ = gsjax_compare(a, b)
     assert code == 2
     assert "found holiday.png; move it elsewhere" in said
-    assert list((tmp_path / "comparison" / "plots").glob("*.svg"))  # that is as it was too
+    assert list((tmp_path / "comparison" / "plots").glob("*.svg"))  # the plots are as they were, too
 
 
 def test_labels_say_as_much_of_a_path_as_tells_it_from_others(tmp_path):

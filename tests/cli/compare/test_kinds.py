@@ -1,4 +1,4 @@
-"""`gsjax compare` knows runs of every method: what it shows stands in their metrics.json."""
+"""`gsjax compare` on runs of the other methods, whose scores it reads from metrics.json."""
 
 import json
 

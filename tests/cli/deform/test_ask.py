@@ -1,4 +1,4 @@
-"""`gsjax ask`: questions on a scene that nobody had to learn."""
+"""`gsjax ask`: questions about a scene that is made by hand, not learned."""
 
 import json
 import re
@@ -19,7 +19,7 @@ WIDTH, HEIGHT, FRAMES = 48, 40, 3
 
 
 def written(run, names=("tissue", "tool"), metric=True, nearer=0.0):
-    """A wall, and a smaller plate 20 mm before it, on its left; they stand still."""
+    """Writes a run of a wall and a plate 20 mm in front of its left half, both still; returns its folder."""
     wall, plate = (
         np.stack(np.meshgrid(np.arange(*x, 0.002), np.arange(*y, 0.002), [z]), -1).reshape(-1, 3)
         for x, y, z in (((-0.06, 0.06), (-0.05, 0.05), 0.1), ((-0.03, -0.015), (-0.006, 0.006), 0.08))

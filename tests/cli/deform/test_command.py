@@ -1,4 +1,4 @@
-"""`gsjax deform` from the command line: what it writes, resuming, and what is odd."""
+"""`gsjax deform` from the command line: what it writes, resuming, and options it refuses."""
 
 import json
 
@@ -49,7 +49,7 @@ def test_what_a_run_writes(deformed):
     assert told.names == ("tissue", "tool")
     assert not (deformed / "resume").exists()
     assert [row["step"] for row in found["curve"]] == [10, 20, 30]
-    assert found["curve"][-1]["structure"] is not None  # the graph counts in the end
+    assert found["curve"][-1]["structure"] is not None  # by the end the graph has a loss
 
 
 @pytest.mark.thorough
@@ -68,7 +68,7 @@ def test_scores_over_time_and_of_classes(deformed):
     for name in ("iou", "dice", "f1"):
         assert test[name] == pytest.approx(np.mean([one[name] for one in found["classes"]]))
     assert 0.5 < test["accuracy"] <= 1
-    assert test["f_psnr"] > 6  # 6.0 dB: a code at random, four channels
+    assert test["f_psnr"] > 6  # 6.0 dB is that of a random code of four channels
     report = (deformed / "report.html").read_text()
     assert "t-SSIM" in report
     assert "Dice" in report
@@ -91,7 +91,7 @@ def test_resumed_it_is_the_same_scene(gsjax, deformed, interrupted, tmp_path):
 
 @pytest.mark.slow
 def test_a_recipe_by_its_name(gsjax, tmp_path):
-    """GaussianClin's turns are differences of quaternions; with tools left out there is one class."""
+    """GaussianClin's rotations are differences of quaternions; with tools left out there is one class."""
     run = tmp_path / "run"
     code, said = gsjax("deform", SCENE, "--preset", "clin", "--out", run, "--scale", 0.5, *SMALL)
     assert code == 0, said

@@ -1,4 +1,4 @@
-"""What `gsjax deform` learns from: frames without masks, and what is a tool."""
+"""The data `gsjax deform` learns from: which classes are tools, and frames without masks."""
 
 from dataclasses import replace
 
@@ -58,14 +58,14 @@ def test_frames_without_a_mask_are_left_out_with_the_tools_and_said():
     assert "frames 2, 5, 6, 7, 8, 9 have no tool mask" in said
     data, _ = read(recording(masked=[0, 3, 4]), tools="draw")
     assert data.train == [0, 2, 3, 4, 5, 6, 7, 8]
-    assert (data.lesson.ids[1] == -1).all()  # nobody says what frame 2 shows
+    assert (data.lesson.ids[1] == -1).all()  # nothing says what frame 2 shows
     with pytest.raises(ValueError, match="expected masks of training frames"):
         read(recording(masked=[1]))
 
 
 @pytest.mark.thorough
 def test_the_scene_begins_where_most_classes_are_seen():
-    """The instrument comes in at frame 4, as a few pixels first; frame 5 has no depth."""
+    """The instrument enters in frame 4, with only two pixels; frame 5 has no depth."""
     seen = recording()
 
     def mask(t, c):

@@ -1,4 +1,4 @@
-"""deformation.npz: what is written is what is read, and what a file may not be."""
+"""deformation.npz: it is read as it was written, and malformed files are refused."""
 
 from dataclasses import replace
 

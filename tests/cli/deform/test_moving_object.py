@@ -1,5 +1,5 @@
-"""D-NeRF's layout: photographs of a moving object by a camera that jumps around it, split in three that share
-times."""
+"""D-NeRF's layout: photographs of a moving object from a camera that jumps around it, in three splits that
+share times."""
 
 import json
 from dataclasses import replace
@@ -53,7 +53,7 @@ def read(sequence, every=8):
 
 
 def test_splits_share_times(folder, sequence):
-    assert sequence.splits[:3] == ("train", "val", "test")  # all of them at 0
+    assert sequence.splits[:3] == ("train", "val", "test")  # all of them at time 0
     assert sequence.times[:3].tolist() == [0, 0, 0]
     assert (np.diff(sequence.times) >= 0).all()
     assert sequence.background == (1, 1, 1)
@@ -92,7 +92,7 @@ def test_the_data_says_what_is_held_out(sequence):
 
 @pytest.mark.slow
 def test_times_that_are_missing_are_told_of(gsjax, tmp_path):
-    """The order of the files, test after train, was taken for time without a word."""
+    """The order of the files, test after train, was once taken for time without a warning."""
     write_dnerf(tmp_path / "things", SIZE, {"train": 4, "val": 1, "test": 2})
     path = tmp_path / "things" / "transforms_train.json"
     meta = json.loads(path.read_text())
@@ -114,8 +114,8 @@ def test_the_scene_starts_within_what_most_frames_show(sequence, data):
     assert len(means) == 500
     inside = np.linalg.norm(means[:, :2], axis=1) < 0.33  # the disc reaches 0.3
     inside &= (means[:, 2] > -0.05) & (means[:, 2] < 0.55)
-    assert inside.mean() > 0.7  # by twelve views
-    assert 0.05 < (means[:, 2] > 0.15).mean() < 0.95  # of the bar on it, too
+    assert inside.mean() > 0.7  # as far as twelve views can tell
+    assert 0.05 < (means[:, 2] > 0.15).mean() < 0.95  # some on the bar upon it
     nothing = [replace(frame, images=np.full_like(frame.images, 255)) for frame in data.frames]
     with pytest.raises(ValueError, match="expected something before the background"):
         hull_gaussians(nothing, sequence.background, 500, 0)
@@ -148,7 +148,7 @@ def test_a_run_is_learned_and_scored_on_white(gsjax, folder, tmp_path):
     assert found["depth"] == {"source": "hull", "metric": False}
     assert found["preset"] == "around"
     settings = yaml.safe_load((run / "config.yml").read_text())
-    given = {"quats": 1e-3}  # though it is the default of surst
+    given = {"quats": 1e-3}  # though that is surst's default
     assert settings["deform"]["rates"] == vars(PRESETS["around"].rates) | given
     assert "words" not in settings
     assert (settings["deform"]["warmup"], settings["deform"]["deformation"]["resolution"]) == (6, 8)
@@ -169,7 +169,7 @@ def test_a_run_is_learned_and_scored_on_white(gsjax, folder, tmp_path):
 
 @pytest.mark.slow
 def test_opaque_pictures_are_told_of(gsjax, tmp_path):
-    """The settings of surst were taken for D-NeRF's layout without a word."""
+    """For these, surst's settings were once taken in D-NeRF's layout without a warning."""
     write_dnerf(tmp_path / "things", SIZE, {"train": 4, "val": 1, "test": 2})
     for picture in (tmp_path / "things").rglob("*.png"):
         cv2.imwrite(str(picture), cv2.imread(str(picture)))

@@ -1,5 +1,5 @@
-"""`gsjax query` and `gsjax view` of a run of `gsjax deform`: what is meant, over time, what is written and
-refused. The run is made up: a scene before its first step, in which a corner is called tool."""
+"""`gsjax query` and `gsjax view` on a run of `gsjax deform`: what they find over time, write and refuse.
+The run is made up: a scene before its first step, in which a corner is labelled tool."""
 
 import json
 import shutil
@@ -30,7 +30,7 @@ from gsjax.methods.deform.query import most_likely, prompt_probabilities, region
 from gsjax.scene.deformation import DeformationConfig
 from tests.cli.deform.test_command import SCENE
 
-FAINT = 0.3  # of a feature's length
+FAINT = 0.3  # the length of a feature
 
 
 @pytest.fixture(scope="module")
@@ -106,12 +106,12 @@ def test_a_name_is_found_and_deleted_in_every_frame(gsjax, run):
     for name, kept in (("object", corner), ("without", ~corner)):
         np.testing.assert_allclose(read_ply(folder / f"{name}.ply")[0].means, first.means[kept])
     assert read_ply(folder / "recolored.ply")[0].num == read_ply(folder / "moved.ply")[0].num == len(corner)
-    # A pixel's own features say where it shows.
+    # The mask is found from the features rendered at each pixel.
     mask = cv2.imread(str(folder / "masks" / "000001.png"), cv2.IMREAD_UNCHANGED) > 0
     quarter = np.zeros_like(mask)
     quarter[26:, :32] = True
     assert (mask & quarter).sum() / (mask | quarter).sum() > 0.75
-    # The scene, the scene without it, it alone, recoloured, and moved: what was deleted is black.
+    # The scene, without the tool, the tool alone, recoloured, and moved; deleted regions are black.
     panels = cv2.imread(str(folder / "frames" / "000001.png"))
     assert panels.shape == (3 * 260, 2 * 320, 3)
     scene, without, alone = (panels[50 + y : 260 + y, x : x + 320] for y, x in ((0, 0), (0, 320), (260, 0)))
@@ -123,7 +123,7 @@ def test_a_name_is_found_and_deleted_in_every_frame(gsjax, run):
 
 @pytest.mark.thorough
 def test_a_point_and_a_box_mean_what_is_rendered_there(gsjax, run):
-    """Where both kinds lie in a box, its mean is held against what is the less like it."""
+    """The mean feature of a box means the class it is most like, and is compared with the other class."""
     for option, where, meant in (
         ("--point", "8,44", "tool"),
         ("--point", "50.5,8", "tissue"),
@@ -228,7 +228,7 @@ def test_a_run_whose_recording_is_gone(run):
 
 
 def test_features_that_change_are_those_of_the_frame(run):
-    """All are tissue, and the field adds the difference to tool as time goes on."""
+    """All Gaussians are tissue, and the deformation field adds the difference to tool."""
     stored = read_deformation(run / "deformation.npz")
     tissue, tool = stored.meaning.codebook
     field = stored.scene.field

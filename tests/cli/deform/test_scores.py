@@ -1,4 +1,4 @@
-"""What of a deforming scene's frames is scored, and against what."""
+"""Scores of a deforming scene's frames over time, and the classes of their pixels."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -56,5 +56,5 @@ def test_too_small_pictures_have_none():
 
 def test_pixels_are_of_the_class_whose_code_is_nearest():
     codes = jnp.eye(3, 5)
-    features = jnp.array([[[0.1, 0.02, 0, 0, 0], [0, 0, 7.0, 0, 1], [0, 0, 0, 0, 0]]])  # nothing said at last
+    features = jnp.array([[[0.1, 0.02, 0, 0, 0], [0, 0, 7.0, 0, 1], [0, 0, 0, 0, 0]]])  # the last has none
     np.testing.assert_array_equal(classes_of_pixels(features, codes), [[0, 2, -1]])

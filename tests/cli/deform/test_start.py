@@ -1,4 +1,4 @@
-"""`gsjax deform` without depth: matched between two eyes, or on a plane."""
+"""`gsjax deform` without depth: depth is matched between a stereo pair, or the scene starts on a plane."""
 
 import json
 import shutil
@@ -27,7 +27,7 @@ def metrics(run):
 
 @pytest.fixture(scope="module")
 def clip(tmp_path_factory):
-    """A pattern that shifts by a pixel a frame before a camera that stands still, as a video."""
+    """A video of a pattern that shifts by a pixel per frame in front of a fixed camera."""
     noise = np.random.default_rng(0).uniform(30, 220, (16, 24, 3))
     wide = cv2.resize(noise, (96, 64), interpolation=cv2.INTER_CUBIC).clip(0, 255).astype(np.uint8)
     path = tmp_path_factory.mktemp("clip") / "pulled.mp4"
@@ -46,12 +46,12 @@ def test_two_eyes_without_depth_are_matched_and_poses_refined(gsjax, tmp_path):
     assert found["depth"] == {"source": "stereo", "metric": True}
     assert found["curve"][-1]["depth"] is not None
     assert found["test"]["depth_mm"] < 5
-    assert found["tracks"]["points"] > 50  # the scene is in metres, as truth is
+    assert found["tracks"]["points"] > 50  # the scene is in metres, as the ground truth is
     assert any("Depth is matched between cameras 0 and 1" in note for note in found["notes"])
     assert any("Poses were refined (poses.npz)" in note for note in found["notes"])
     stored, given = np.load(run / "poses.npz"), open_sequence(EYES).viewmats
     assert stored["viewmats"].shape == given.shape
-    np.testing.assert_allclose(stored["viewmats"][0], given[0], atol=1e-6)  # the first stands as given
+    np.testing.assert_allclose(stored["viewmats"][0], given[0], atol=1e-6)  # the first stays as given
     assert np.abs(stored["viewmats"][2] - given[2]).max() > 1e-6
     assert 0 < found["poses"]["moved"]["max"] < 0.02
 
@@ -106,7 +106,7 @@ def test_in_python_each_kind_of_warning_is_given_once():
 
 
 def test_photographs_that_were_placed_are_frames(gsjax, photographs, tmp_path):
-    """What `gsjax poses` writes has an order, and no depth."""
+    """What `gsjax poses` writes has an order, but no depth."""
     table = shutil.copytree(photographs, tmp_path / "table")
     told = json.loads((table / "transforms.json").read_text())
     told["frames"] = [frame for frame in told["frames"] if "lost" not in frame["file_path"]][::-1]

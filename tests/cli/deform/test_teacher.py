@@ -1,5 +1,5 @@
-"""What `gsjax deform` learns besides classes of masks: features of files and of encoders, and how a scene
-that learned them is asked."""
+"""What `gsjax deform` learns besides classes of masks: features from files and encoders, and how a scene
+that learned them is queried."""
 
 import json
 import re
@@ -31,7 +31,7 @@ OF_TISSUE, OF_TOOL = np.random.default_rng(0).normal(size=(2, DIMENSION)).astype
 
 
 def feature_map(t, shape=GRID):
-    """A map as a model might give it: a vector for the tissue and one for the tool, with some noise."""
+    """A feature map as a model might return it: a vector for tissue and one for the tool, with some noise."""
     mask = open_sequence(SCENE).mask(t, 0)
     rows, columns = (np.arange(n) * m // n for n, m in zip(shape, mask.shape, strict=True))
     tool = mask[np.ix_(rows, columns)] > 0
@@ -169,7 +169,7 @@ def test_the_closed_vocabulary_teaches_and_reads(tmp_path):
     assert (scores[ids[mask == 0]] < threshold.value).all()
     with pytest.raises(ValueError, match="--weights"):
         data.meaning.source.encoder(Path("x"))
-    assert text_prompt(data.meaning, "Group 2").name == "group 2"  # its names are its own
+    assert text_prompt(data.meaning, "Group 2").name == "group 2"  # names of its groups need no encoder
     assert "or one of: group 1, group 2" in data.meaning.hint()
 
 
@@ -188,14 +188,14 @@ def test_cells_of_which_a_tool_has_a_part_do_not_count(files):
     mask = seen.mask(data.train[0], 0) > 0
     cells = mask.reshape(13, 4, 16, 4).any(axis=(1, 3))
     np.testing.assert_array_equal(counted_ids(data.lesson.ids[0], data.frames[0].masks[0]) < 0, cells)
-    tool = OF_TOOL @ data.meaning.basis  # of which nothing was learned
+    tool = OF_TOOL @ data.meaning.basis  # which was not learned
     assert np.linalg.norm(tool) < 0.75 * np.linalg.norm(OF_TOOL)
     problem, _ = Deform(DeformConfig(channels=4)).start(data.frames, data.lesson)
     np.testing.assert_array_equal(problem.ids[0] < 0, cells)
 
 
 def test_files_are_found_by_the_names_of_pictures(tmp_path):
-    """Of a recording of which some frames are taken, smaller."""
+    """Also for some frames of a recording, scaled down."""
     for t in range(10):
         np.save(tmp_path / f"frame-{t:06d}.color.npy", feature_map(t))
         (tmp_path / f"frame-{t:06d}.color.png").touch()
@@ -254,7 +254,7 @@ def test_a_place_is_told_apart_from_the_other_names():
 
 
 def test_what_was_asked_for_is_meant_however_alike_the_names_are():
-    """Groups of CLIP's features, say, whose cosines are 0.9: a share among all of eight would be 0.28."""
+    """As with groups of CLIP features, whose cosines are 0.9: a share among all eight would be only 0.28."""
     codebook = np.sqrt(0.9) * np.eye(9)[[0] * 8] + np.sqrt(0.1) * np.eye(9)[1:]
     names = tuple(f"group {n}" for n in range(1, 9))
     prompt = feature_prompt(Meaning(Source("files"), names, codebook, np.eye(9)), 0.3 * codebook[4])
@@ -294,7 +294,7 @@ def test_groups_are_kinds_the_largest_first():
 @settings(deadline=None, max_examples=30)
 @given(st.integers(0, 2**31), st.integers(1, 5), st.integers(1, 60))
 def test_groups_are_as_many_as_there_are_kinds(seed, kinds, each):
-    """Kinds at right angles, a twentieth of noise: one kind is one group, and so are two codes of one."""
+    """For orthogonal kinds with 5 % of noise, however few codes there are of each."""
     rng = np.random.default_rng(seed)
     of = np.repeat(np.arange(kinds), each)
     codes = np.eye(8)[of] + 0.02 * rng.normal(size=(len(of), 8))

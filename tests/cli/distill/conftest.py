@@ -1,4 +1,4 @@
-"""A scene to distil into, a made-up field to ask, an empty cache of features, and what a command wrote."""
+"""A scene to distil into, a made-up field to query, an empty cache of features, and readers of results."""
 
 import json
 import shutil
@@ -12,7 +12,7 @@ from gsjax.perception.codebook import ClassCodebook
 from tests.cli.conftest import LABELS, first_picture, write_made_field
 
 CAN = 3
-NAMES = {label + 1: name for label, name in LABELS.items()}  # as a distillation counts them
+NAMES = {label + 1: name for label, name in LABELS.items()}  # as a distillation numbers them
 SMALL = ("--distill.encoding", "table", "--distill.channels", 8, "--distill.contrast-patch", 4)
 
 
@@ -26,7 +26,7 @@ def scene(pristine, tmp_path_factory):
 
 @pytest.fixture(scope="session")
 def labelled(pristine, tmp_path_factory):
-    """A PLY file of those Gaussians with labels, and these."""
+    """A PLY file of the same Gaussians with labels, and the labels."""
     path = tmp_path_factory.mktemp("scene") / "scene.ply"
     gaussians, labels = first_picture(pristine)
     write_ply(path, gaussians, labels=labels)
@@ -35,7 +35,7 @@ def labelled(pristine, tmp_path_factory):
 
 @pytest.fixture(scope="session")
 def made(pristine, labelled, tmp_path_factory):
-    """The field of the classes, which nobody had to distil."""
+    """A field of the classes, written without distilling it."""
     book = ClassCodebook(NAMES)
     vectors = np.stack([book.embed_text(name) for name in LABELS.values()])
     return write_made_field(
@@ -50,13 +50,13 @@ def made(pristine, labelled, tmp_path_factory):
 
 @pytest.fixture
 def field(made, tmp_path):
-    """A copy of it to ask and to corrupt."""
+    """A copy of `made` to query and to corrupt."""
     return shutil.copytree(made, tmp_path / "field")
 
 
 @pytest.fixture(autouse=True)
 def cache(tmp_path, monkeypatch):
-    """No test finds what another one encoded."""
+    """A new cache for each test, so that none finds what another one encoded."""
     monkeypatch.setattr("gsjax.engine.teaching.cache.user_cache", lambda: tmp_path / "cache")
 
 

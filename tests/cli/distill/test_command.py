@@ -1,4 +1,4 @@
-"""`gsjax distill` where something is odd: folders, options, views, and what a resumed run finds."""
+"""`gsjax distill` on bad folders, options and views, and runs that are resumed with other data."""
 
 import shutil
 from dataclasses import replace

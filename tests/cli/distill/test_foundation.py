@@ -1,4 +1,4 @@
-"""`gsjax distill` from CLIP, MaskCLIP and SAM, tiny ones of random weights."""
+"""`gsjax distill` with tiny CLIP, MaskCLIP and SAM models of random weights as teachers."""
 
 from dataclasses import replace
 
@@ -11,7 +11,7 @@ from tests.perception.test_foundation import needs_foundation, sam_folders  # no
 
 @pytest.fixture
 def encoders(request, monkeypatch):
-    """Tiny CLIP and SAM of random weights, and what tells `gsjax distill` of them."""
+    """The options of `gsjax distill` for tiny CLIP and SAM models of random weights."""
     from gsjax.perception import sam
 
     def unsure(path, load=sam.load_sam):

@@ -1,4 +1,4 @@
-"""Pictures of a field: its features, its classes, its scene in one colour a Gaussian, and their names."""
+"""Pictures of a field: its features, its classes, its scene in one colour per Gaussian, and their names."""
 
 import equinox as eqx
 import jax
@@ -31,12 +31,12 @@ features_of_field = jax.jit(rendered_features)
 
 
 def some_of(scene, every):
-    """Every so many of a scene's Gaussians."""
+    """Every `every`-th Gaussian of the scene in a file."""
     return jax.tree.map(lambda a: jnp.asarray(np.asarray(a)[::every]), read_ply(scene)[0])
 
 
 def ahead(distance, K, width, height):
-    """A camera that looks along z, so far before the origin."""
+    """A camera that looks along z, `distance` in front of the origin."""
     pose = np.eye(4, dtype=np.float32)
     pose[2, 3] = distance
     return Camera(jnp.asarray(pose), jnp.asarray(K, jnp.float32), width, height)

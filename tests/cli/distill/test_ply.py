@@ -1,5 +1,5 @@
-"""`gsjax distill` on a PLY file of the built-in scene, whose first frame's masks teach; and that what it
-learned can be asked. What `gsjax query` does else is tested in test_query.py."""
+"""`gsjax distill` on a PLY file of the built-in scene, taught by the masks of its first frame, and queries of
+what it learned. test_query.py tests what else `gsjax query` does."""
 
 import json
 import shutil
@@ -43,7 +43,7 @@ def images(pristine):
 
 @pytest.fixture(scope="module")
 def distilled(pristine, scene, tmp_path_factory):
-    """The field of the classes of the recording's masks."""
+    """A field distilled from the classes of the recording's masks."""
     out = tmp_path_factory.mktemp("fields") / "field"
     steps = ("--preset", "paper", "--distill.iterations", STEPS, *TABLE)
     assert main([str(a) for a in ("distill", scene, "--out", out, *images(pristine), *SMALL, *steps)]) == 0
@@ -52,7 +52,7 @@ def distilled(pristine, scene, tmp_path_factory):
 
 @pytest.fixture
 def field(distilled, tmp_path):
-    """A copy of it to ask and to corrupt."""
+    """A copy of `distilled` to query and to corrupt."""
     return shutil.copytree(distilled, tmp_path / "field")
 
 
@@ -93,7 +93,7 @@ def _told(run):
 @pytest.mark.thorough
 @pytest.mark.parametrize("preset", ["vote", "solve"])
 def test_a_field_without_descent_takes_passes_over_the_views(gsjax, pristine, scene, tmp_path, preset):
-    """Its vectors are one for each class, and name most of what the masks show."""
+    """It has one vector for each class, and they name most of what the masks show."""
     out = tmp_path / "field"
     code, said = gsjax("distill", scene, "--out", out, *images(pristine), "--preset", preset)
     assert code == 0, said
@@ -132,10 +132,10 @@ def test_what_was_distilled_can_be_asked(gsjax, field, pristine):
 def test_resumed_it_is_the_same_field(gsjax, interrupted, pristine, scene, distilled, tmp_path):
     steps = ("--preset", "paper", "--distill.iterations", STEPS, *TABLE)
     told = ("distill", scene, "--out", tmp_path / "again", *images(pristine), *SMALL, *steps)
-    with interrupted(105):  # between two rows
+    with interrupted(105):  # between two rows of the curve
         code, said = gsjax(*told)
     assert code == 130, said
-    assert (tmp_path / "again" / "field.npz").is_file()  # what was learned so far can be asked
+    assert (tmp_path / "again" / "field.npz").is_file()  # what was learned so far can be queried
     assert gsjax("query", tmp_path / "again", "can", "--threshold", 0)[0] == 0
     code, said = gsjax(*told)
     assert code == 2

@@ -1,4 +1,4 @@
-"""The verb `distill`, and the files that its result can be kept in."""
+"""The Python verb `distill`, and the files that keep its ticks and its result."""
 
 import jax
 import jax.numpy as jnp
@@ -22,7 +22,7 @@ SMALL = DistillConfig(iterations=4, channels=8, grid=GRID, contrast_patch=4)
 
 @pytest.fixture(scope="module")
 def shown(pristine):
-    """A scene, and the photographs of it."""
+    """A scene, and photographs of it."""
     sequence = open_sequence(str(pristine)).select(frames=slice(0, 1))
     return jax.tree.map(jnp.asarray, first_picture(pristine)[0]), photographs_of(sequence)
 
@@ -61,7 +61,7 @@ def test_a_scene_and_photographs_make_a_field_that_answers_and_goes_on(shown, tm
 
 @pytest.mark.thorough
 def test_features_on_three_levels_are_learned_together(shown, pristine, tmp_path):
-    """Files in LangSplat's layout: objects one by one, can and carton together, and all of them."""
+    """Files in LangSplat's layout, with levels of single objects, of can and carton together, and of all."""
     scene, photographs = shown
     codes = np.linalg.qr(np.random.default_rng(0).normal(size=(20, 20)))[0].astype(np.float32)
     groups = [list(range(8)), [0, 1, 2, 2, 3, 4, 5, 6], [0, 1, 1, 1, 1, 1, 1, 1]]

@@ -1,6 +1,6 @@
 """`gsjax query` on a field: what it finds, writes and refuses.
 
-The fields are made up, one row a class: that of a distillation is asked in test_ply.py.
+The fields are made up, with one row for each class; test_ply.py queries a distilled one.
 """
 
 import json
@@ -31,7 +31,7 @@ def scene(labelled):
 
 @pytest.fixture(scope="module")
 def closed(pristine, scene, tmp_path_factory):
-    """The field of colours, outlines and names."""
+    """A made-up field of the closed vocabulary: colours, outlines and names."""
     picture = cv2.imread(str(next((pristine / "ims" / "0").iterdir())))[..., ::-1]
     seen = cv2.imread(str(pristine / "seg" / "0" / "000000.png"), cv2.IMREAD_UNCHANGED)
     vectors = ClosedVocabulary(NAMES, sizes=False).embed_objects(
@@ -48,7 +48,7 @@ def closed(pristine, scene, tmp_path_factory):
 
 
 def panels(folder):
-    """Those of overview.png, without what is written in the upper corners."""
+    """The panels of overview.png, without the captions at their top."""
     picture = cv2.imread(str(folder / "overview.png"))
     high, wide = 240, 320
     assert picture.shape[0] == 2 * high
@@ -91,7 +91,7 @@ def test_an_answer_elsewhere_and_without_pictures(gsjax, closed, tmp_path):
 
 @pytest.mark.thorough
 def test_a_text_within_another_finds_what_both_mean(gsjax, field, closed, scene, tmp_path):
-    """In the field of colours and names, the blue things within the can; and within it no ball."""
+    """In the field of colours and names, the blue Gaussians of the can; there is no ball within the can."""
     closed = shutil.copytree(closed, tmp_path / "closed")
     assert gsjax("query", closed, "can")[0] == 0
     cans = found_of(closed)["indices"]
@@ -110,7 +110,7 @@ def test_a_text_within_another_finds_what_both_mean(gsjax, field, closed, scene,
 
 @pytest.mark.thorough
 def test_a_query_is_of_the_level_that_it_fits_best_or_of_a_given_one(gsjax, pristine, scene, tmp_path):
-    """On the smallest level a can is a can; on the largest all things are one, but for the background."""
+    """On the smallest level a can is a can; on the largest all objects but the background are one."""
     book = ClassCodebook(NAMES | {9: "everything"})
     small = np.stack([book.embed_text(name) for name in LABELS.values()])
     large = np.stack([book.embed_text("everything" if label else LABELS[label]) for label in LABELS])
@@ -166,7 +166,7 @@ def test_the_best_few_are_found_whatever_their_scores(gsjax, closed, tmp_path):
     found, told = found_of(closed), told_of(closed)
     assert (told["rule"], told["top"]) == ("the 7 best", 7)
     assert "at least" in said
-    assert len(found["indices"]) == 7  # though more score alike
+    assert len(found["indices"]) == 7  # though more have the same score
     rest = np.delete(found["all_scores"], found["indices"])
     assert np.nanmax(rest) <= found["scores"].min()
     for options, words in (((0,), "found 0"), ((5, "--threshold", 0.5), "found --threshold too")):
@@ -203,7 +203,7 @@ def test_a_text_gives_gaussians_masks_and_scenes(gsjax, field, scene, pristine):
     places = panels(folder)
     assert len(places) == 6
     assert all(place.any() for place in places)
-    # And in a few words.
+    # The summary in the terminal.
     center = ", ".join(f"{x:.3f}" for x in found["means"].mean(0))
     assert f"found 'can': {len(rows):,} of {whole.num:,} Gaussians centre {center} m size" in said
     assert "score above 0.500 (better than each negative)" in said
@@ -212,7 +212,7 @@ def test_a_text_gives_gaussians_masks_and_scenes(gsjax, field, scene, pristine):
 
 
 def test_the_scene_is_read_once_and_drawn_by_one_program(gsjax, field, scene, monkeypatch):
-    """Without something it has as many Gaussians as with it."""
+    """The scene without the object keeps its number of Gaussians, so that one program draws both."""
     drawers, drawer, read = [], field_query.Drawer, []
 
     def kept(*args, **options):
@@ -220,7 +220,7 @@ def test_the_scene_is_read_once_and_drawn_by_one_program(gsjax, field, scene, mo
         return drawers[-1]
 
     monkeypatch.setattr(field_query, "Drawer", kept)
-    # A function of its own: JAX keeps what other tests compiled of the same one.
+    # A new function object: JAX would reuse what other tests compiled for the same one.
     monkeypatch.setattr(drawing, "_draw", partial(drawing._draw))
     for module in ("gsjax.engine.files", "gsjax.engine.distill.scene"):
         monkeypatch.setattr(f"{module}.read_gaussians", lambda file: read.append(file) or read_ply(file))
@@ -258,7 +258,7 @@ def test_negatives_are_what_it_is_held_against(gsjax, field, closed, tmp_path):
 
 
 def test_a_picture_of_a_red_thing_means_red_things(gsjax, closed, scene, tmp_path):
-    """However many things have names: in a picture it has none, and is not the background."""
+    """Whatever the scene has names for: a thing in a picture has none, and is not the background."""
     field = shutil.copytree(closed, tmp_path / "closed")
     assert gsjax("query", field, "red", "--threshold", 0.0)[0] == 0
     by_word = found_of(field)["all_scores"]

@@ -1,4 +1,5 @@
-"""Where `gsjax query` looks for what a field is of, which files it refuses, and what it leaves as it was."""
+"""Where `gsjax query` looks for a field's scene and photographs, which files it refuses, and which files it
+leaves alone."""
 
 import json
 import shutil
@@ -17,7 +18,7 @@ def scene(labelled):
 
 
 def change(field, how):
-    """What field.npz says about itself."""
+    """Changes the metadata in field.npz."""
     told = dict(np.load(field / "field.npz"))
     about = json.loads(str(told["about"]))
     how(about)
@@ -29,7 +30,7 @@ def change(field, how):
 
 @pytest.mark.thorough
 def test_a_scene_is_found_by_what_is_in_it(gsjax, field, scene, tmp_path):
-    """Where it was there is another one now; the run that was moved whole has it in canonical/."""
+    """There is another scene now where it was; the run, which was moved whole, has it in canonical/."""
     run = tmp_path / "run"
     (run / "canonical").mkdir(parents=True)
     moved = shutil.move(field, run / "field")
@@ -43,7 +44,7 @@ def test_a_scene_is_found_by_what_is_in_it(gsjax, field, scene, tmp_path):
     assert "has changed since" not in said
     assert told_of(moved)["scene"] == str(run / "canonical" / "scene.ply")
     np.testing.assert_array_equal(read_ply(moved / "query" / "object.ply")[1].labels, CAN)
-    # Without it the other one is better than nothing, and that is said.
+    # Without it the other scene is taken, with a warning.
     (run / "canonical" / "scene.ply").unlink()
     code, said = gsjax("query", moved, "can", "--camera", 0)
     assert code == 0, said

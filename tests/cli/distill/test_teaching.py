@@ -1,4 +1,4 @@
-"""What photographs teach: the names of their labels, outlines, features of files, and who teaches nothing."""
+"""What photographs teach: names of labels, outlines, features from files; and which teach nothing."""
 
 import warnings
 from dataclasses import replace
@@ -20,7 +20,7 @@ QUIET = Console(quiet=True)
 
 
 def photographs(labels, names=None):
-    """Pictures of noise, with these labels; None where there are none."""
+    """Photographs of noise with these labels; None for a photograph without labels."""
     random, count = np.random.default_rng(0), len(labels)
     pictures = random.integers(0, 256, (count, 12, 16, 3), dtype=np.uint8)
     K = np.array([[16.0, 0, 8], [0, 16.0, 6], [0, 0, 1]])
@@ -55,7 +55,7 @@ def test_held_out_views_are_asked_about_in_the_terms_of_those_that_taught(featur
     if features == "classes":
         code = said.source.encoder().embed_text("object 1")
         np.testing.assert_array_equal(others.codebook[others.ids[0][0, 8]], code / np.linalg.norm(code))
-        assert others.ids[0][0, 4] == -1  # nobody taught what 5 is
+        assert others.ids[0][0, 4] == -1  # what 5 is was not taught
     one_more = taught(photographs([TWO, THREE]), [0], TeacherChoice(features))
     assert one_more.source.names == {1: "background", 2: "foreground"}
     assert one_more.of(1).dimension == one_more.teacher.dimension
@@ -98,7 +98,7 @@ def test_numbers_of_labels_cost_nothing(monkeypatch):
     assert said.source.names == {1: "background", 8: "road", 26004: "car"}
     code = ClassCodebook({1: "car"}).embed_text("car")
     np.testing.assert_allclose(said.teacher.codebook[said.teacher.ids[0][0, 4]], code, atol=1e-6)
-    assert (said.of(1).ids[0] >= 0).sum() == 96  # the background, which alone has a name
+    assert (said.of(1).ids[0] >= 0).sum() == 96  # the background, the only label with a name
     assert counts == [3, 5]
 
 
@@ -114,7 +114,7 @@ def test_weights_are_read_once_however_many_pictures_there_are(tmp_path, monkeyp
 
 
 def test_masks_of_sam_teach_on_all_levels_or_on_one(tmp_path, monkeypatch):
-    """A thing and a part of it, which is on the middle level and, without a smaller one, on the smallest."""
+    """A thing and its part, which is on the middle level and, as nothing is smaller, also on the smallest."""
     weights = tmp_path / "sam"
     weights.mkdir()
     monkeypatch.setattr(field_teacher, "folder_digest", lambda path: "digest")
@@ -165,7 +165,7 @@ def test_masks_of_sam_teach_on_all_levels_or_on_one(tmp_path, monkeypatch):
 
 def test_features_of_files_are_found_by_all_photographs(tmp_path):
     shown, maps = photographs([None] * 3), np.random.default_rng(0).normal(size=(3, 3, 4, 5))
-    np.save(tmp_path / "level_0.npy", maps)  # LERF's: those of all pictures, in order
+    np.save(tmp_path / "level_0.npy", maps)  # LERF's layout: the maps of all pictures, in order
     said = taught(shown, [0, 2], TeacherChoice(str(tmp_path)))
     cosines = np.einsum("hwd,hwd->hw", said.teacher.maps[1], maps[2]) / np.linalg.norm(maps[2], axis=-1)
     np.testing.assert_allclose(cosines, np.linalg.norm(said.teacher.maps[1], axis=-1), rtol=1e-5)

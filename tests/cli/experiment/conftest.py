@@ -11,7 +11,7 @@ from tests.cli.experiment.toys import CONFIG, SCRIPT
 
 @pytest.fixture
 def toy(tmp_path, monkeypatch):
-    """Writes experiments/toy/ in the working directory, which is new; returns its folder."""
+    """Writes experiments/toy/ in a new working directory; returns its folder."""
     monkeypatch.chdir(tmp_path)
     folder = Path("experiments/toy")
     folder.mkdir(parents=True)

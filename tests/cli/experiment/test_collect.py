@@ -1,4 +1,4 @@
-"""Tables and figures, of what was run here and of what is committed."""
+"""Tables and figures, from cells that were run here and from committed results."""
 
 import json
 import re
@@ -31,7 +31,7 @@ def test_cells_that_left_the_grid_leave_the_table(toy, gsjax):
     assert gsjax("run", "toy")[0] == 0
     assert calls() == []
     assert [line[:2] for line in markdown_table(folder)[1:]] == [["640", "exact"], ["320", "exact"]]
-    assert len(cell_files()) == 4  # they are kept, should the grid have them again
+    assert len(cell_files()) == 4  # kept in case the grid has them again
 
 
 def test_committed_results_are_rows_where_there_are_no_cells(toy, gsjax):
@@ -44,7 +44,7 @@ def test_committed_results_are_rows_where_there_are_no_cells(toy, gsjax):
     assert gsjax("table", "toy")[0] == 0
     assert {path: path.read_bytes() for path in folder.glob("results.*")} == before
     assert "4 of 4" in gsjax("list")[1]
-    gsjax("run", "toy", "--only", "size=320")  # what is to be measured is measured here
+    gsjax("run", "toy", "--only", "size=320")  # cells that are asked for are measured here
     assert calls() == ["320 fast 0", "320 exact 0"]
     assert len(results(folder)["rows"]) == 4
 
@@ -110,7 +110,7 @@ def test_machines_are_named_in_the_rows_where_they_differ(toy, gsjax):
 
 
 def test_rows_of_two_versions_are_said_to_be(toy, gsjax):
-    """What experiments share may change between two cells, as gsjax itself may: neither makes them stale."""
+    """Shared code of experiments may change between two cells, as gsjax may: neither makes cells stale."""
     folder = toy()
     gsjax("run", "toy", "--only", "size=320")
     (folder.parent / "shared.py").write_text("WIDTH = 640")

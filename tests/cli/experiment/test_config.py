@@ -1,4 +1,4 @@
-"""Each way in which a config is wrong, and experiments that are not there."""
+"""Each way in which a config can be wrong, and experiments that do not exist."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""Sweeps on a Dask cluster: what is kept is what a run here keeps, also where a worker is killed."""
+"""Sweeps on a Dask cluster: they keep what a local run keeps, even if a worker is killed."""
 
 import json
 import os
@@ -44,7 +44,7 @@ def logged(word: str) -> list[list[str]]:
 
 @pytest.fixture(scope="module")
 def address(tmp_path_factory):
-    """A scheduler and two workers, started as by hand in a new folder; where it is, and the folder."""
+    """Starts a scheduler and two workers, as by hand, in a new folder; yields its address and the folder."""
     folder = tmp_path_factory.mktemp("cluster")
     (folder / "experiments").mkdir()
     there = folder / "scheduler.json"
@@ -69,7 +69,7 @@ def address(tmp_path_factory):
 
 @pytest.fixture
 def beside(address, toy, monkeypatch):
-    """Writes the toy where the workers are; returns how to run it there."""
+    """Enters a new folder for the toy where the workers are; returns the arguments that run it there."""
     where, folder = address
     for left in ("experiments", "runs"):
         shutil.rmtree(folder / left, ignore_errors=True)
@@ -81,7 +81,7 @@ def beside(address, toy, monkeypatch):
 
 
 def kill_once_begun(count: int) -> threading.Thread:
-    """Kills the process that begins the so-manieth cell, while it is at it."""
+    """Starts a thread that kills the process of the `count`-th cell to begin, while that cell runs."""
 
     def wait_and_kill() -> None:
         while len(begun := logged("begun")) < count:
@@ -192,7 +192,7 @@ def test_ctrl_c_keeps_what_is_done_on_a_cluster_too(toy, gsjax):
     while len(logged("begun")) < 2 and going.poll() is None:
         time.sleep(0.02)
     time.sleep(0.3)
-    os.killpg(going.pid, signal.SIGINT)  # as a terminal does it: to all of them
+    os.killpg(going.pid, signal.SIGINT)  # as a terminal does: to the whole process group
     _, err = going.communicate(timeout=60)
     assert going.returncode == 130, err
     assert "stopped: by Ctrl-C after 1 of 3 cells; the same command continues from there" in err
@@ -202,7 +202,7 @@ def test_ctrl_c_keeps_what_is_done_on_a_cluster_too(toy, gsjax):
 
 @pytest.fixture
 def defaults():
-    """What dask-jobqueue takes a job of SLURM to be. It takes Ctrl-C for itself as it is imported."""
+    """dask-jobqueue's defaults for a SLURM job; its import replaces Ctrl-C's handler, which is restored."""
     heard_by = signal.getsignal(signal.SIGINT)
     pytest.importorskip("dask_jobqueue")
     signal.signal(signal.SIGINT, heard_by)

@@ -80,7 +80,7 @@ def test_where_a_module_of_gsjax_or_of_experiments_stands_changes_no_fingerprint
         "import gsjaxlike",
         "import benchmarks",
         "import experiments.shared.recordings as recordings",
-        "from gsjax.metrics.image import psnr as score",  # `as score` of another would run alike
+        "from gsjax.metrics.image import psnr as score",  # another function `as score` would run as well
         "from .gsjax import x",
         "import gsjax; SIZE = 3",
         "SIZE = 3; import gsjax",
@@ -112,7 +112,7 @@ def test_what_stands_beside_experiments_is_not_forgotten(toy):
 
 @pytest.mark.thorough
 def test_a_script_imports_what_is_shared_and_scripts_of_other_folders(toy, gsjax):
-    """By names from the folder that holds the root, also where helpers stand beside neither."""
+    """By names relative to the folder that holds the root, which may hold helpers too."""
     folder = toy(
         "from experiments.shared.factors import FACTOR\nfrom experiments.other.sweep import MORE\n"
         "from beside_root import MOST\n"
@@ -142,7 +142,7 @@ def test_a_script_imports_what_is_shared_and_scripts_of_other_folders(toy, gsjax
 
 
 def test_two_experiments_share_a_script(toy, gsjax):
-    """Its helpers stand beside the script, not beside the config."""
+    """Helpers are found beside the script, not beside the config."""
     folder = toy("from factor import FACTOR\n" + SCRIPT, script="../shared/sweep.py")
     shared = folder.parent / "shared"
     shared.mkdir()
@@ -157,7 +157,7 @@ def test_two_experiments_share_a_script(toy, gsjax):
 
 @pytest.mark.parametrize("name", experiment_names(ROOT))
 def test_every_experiment_of_this_repository_can_be_loaded(name, tmp_path):
-    """Settings that scripts name may be gone or refused, which only a run would tell."""
+    """A script may name settings that are gone or refused, which otherwise only a run would show."""
     try:
         read_experiment(ROOT, name, tmp_path).load()
     except ValueError as error:

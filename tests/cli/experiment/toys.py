@@ -1,4 +1,4 @@
-"""A toy experiment, and what it left in the working directory."""
+"""A toy experiment, and readers of what it leaves in the working directory."""
 
 import json
 from pathlib import Path
@@ -18,7 +18,7 @@ def run(options, seed, folder):
 
 
 def calls() -> list[str]:
-    """The cells that ran since this was asked last."""
+    """The cells that ran since the last call."""
     path = Path("calls.txt")
     lines = path.read_text().splitlines() if path.exists() else []
     path.unlink(missing_ok=True)
@@ -34,12 +34,12 @@ def cell_files() -> list[Path]:
 
 
 def markdown_table(folder: Path) -> list[list[str]]:
-    """Heads and lines of the table in results.md."""
+    """The header and rows of the table in results.md."""
     lines = [line for line in (folder / "results.md").read_text().splitlines() if line.startswith("| ")]
     return [[cell.strip() for cell in line.strip("|").split(" | ")] for line in lines if "---" not in line]
 
 
 def stopping(how: str) -> str:
-    """The script, which in its third cell does something else while the file `stop` is there."""
+    """The script, except that its third cell first runs `how` while the file `stop` exists."""
     stop = f"if options == dict(size=640, mode='fast') and os.path.exists('stop'):\n        {how}\n    return"
     return "import os, signal, sys\n" + SCRIPT.replace("return", stop)

@@ -1,4 +1,4 @@
-"""`gsjax fit` from a folder of photographs to a report; stopped in the middle it goes on to the same bits."""
+"""`gsjax fit` from a folder of photographs to a report; a run that was stopped resumes to the same bits."""
 
 import json
 import os
@@ -34,7 +34,7 @@ QUICK += ("--judge-every", "8", "--test-every", "4", "--fit.growth.begin", "4", 
 
 @pytest.fixture
 def gsjax_fit(photographs, tmp_path, capfd):
-    """Runs `gsjax fit` in this process, into tmp_path/NAME; returns the exit code and what was said."""
+    """Runs `gsjax fit` in this process, into tmp_path/NAME; returns the exit code and its output."""
 
     def call(*options: str, name: str = "run", dataset=photographs) -> tuple[int, str]:
         code = main(["fit", str(dataset), "--out", str(tmp_path / name), *options])
@@ -145,7 +145,7 @@ def test_what_minutes_decided_holds_when_a_run_is_resumed(gsjax_fit, tmp_path, m
 @pytest.mark.thorough
 @pytest.mark.skipif(os.name != "posix", reason="signals")
 def test_ctrl_c_in_the_middle_of_a_step_leaves_what_can_be_resumed(photographs, gsjax_fit, tmp_path):
-    """A step gives away the buffers that it replaces, and most of the time one is being made."""
+    """A step donates the buffers that it replaces, and most of the time a step is running."""
     run = tmp_path / "run"
     long = (*QUICK, "--fit.steps", "100000", "--judge-every", "50")
     command = [sys.executable, "-m", "gsjax.cli", "fit", str(photographs), "--out", str(run), *long]
@@ -273,7 +273,7 @@ def test_it_stops_when_held_out_views_are_seen_as_well_as_asked(gsjax_fit, tmp_p
 
 @pytest.mark.thorough
 def test_it_stops_only_when_all_held_out_views_are(gsjax_fit, tmp_path, monkeypatch):
-    """On the way a few are looked at, which may be easy ones."""
+    """During the fit only some views are evaluated, which may be easy ones."""
     monkeypatch.setattr(
         Evaluation, "__call__", lambda self, now: {"test_psnr": 99.0} if now.step % 8 == 0 else None
     )

@@ -1,4 +1,4 @@
-"""`gsjax eval` gives a fit's own numbers again, and more; what it cannot score it says."""
+"""`gsjax eval` reproduces a fit's own scores and adds others; it says what it cannot score."""
 
 import json
 import shutil
@@ -17,8 +17,8 @@ from gsjax.engine.records import read_record
 
 @pytest.fixture(scope="module")
 def fitted(photographs, tmp_path_factory):
-    """A finished run on photographs of 48x36 pixels, whose first Gaussians are its last, which compiles no
-    step; do not change it."""
+    """A finished run on photographs of 48x36 pixels that ends with its initial Gaussians, so that no step is
+    compiled; do not change it."""
     run = tmp_path_factory.mktemp("fitted") / "run"
     options = ("--fit.cap", "120", "--fit.start.count", "100", "--test-every", "4")
     with pytest.MonkeyPatch.context() as patch:
@@ -29,13 +29,13 @@ def fitted(photographs, tmp_path_factory):
 
 @pytest.fixture
 def run(fitted, tmp_path):
-    """A copy to write into."""
+    """A copy of `fitted` to write into."""
     return shutil.copytree(fitted, tmp_path / "run")
 
 
 @pytest.fixture
 def gsjax_eval(run, capfd):
-    """Runs `gsjax eval` on it; returns the exit code, what was said, and what was written."""
+    """Runs `gsjax eval` on `run`; returns the exit code, its output and the scores that it wrote."""
 
     def call(*options: str, of=run):
         capfd.readouterr()
@@ -50,7 +50,7 @@ def gsjax_eval(run, capfd):
 
 @pytest.fixture(scope="module")
 def weights(tmp_path_factory):
-    """LPIPS of AlexNet whose first layer lets the red channel through, and whose others do nothing."""
+    """Weights for LPIPS with AlexNet whose first layer passes the red channel and whose others do nothing."""
     shapes = {0: (64, 3, 11, 11), 3: (192, 64, 5, 5), 6: (384, 192, 3, 3), 8: (256, 384, 3, 3)}
     shapes |= {10: (256, 256, 3, 3)}
     arrays = {}
@@ -99,7 +99,7 @@ def test_views_that_were_fitted_too(gsjax_eval, run):
     assert len(list((run / "eval" / "renders").iterdir())) == 9
     code, said, found = gsjax_eval("--views", "train")
     assert {row["split"] for row in found["views"]} == {"train"}
-    assert len(list((run / "eval" / "renders").iterdir())) == 6  # what an earlier one left is gone
+    assert len(list((run / "eval" / "renders").iterdir())) == 6  # those of the earlier evaluation are gone
 
 
 def test_lpips_is_there_with_weights_and_said_to_be_absent_without(gsjax_eval, run, weights):
@@ -112,7 +112,7 @@ def test_lpips_is_there_with_weights_and_said_to_be_absent_without(gsjax_eval, r
     assert found["lpips"]["network"] == "AlexNet"
     assert found["lpips"]["weights"] in said
     row = found["views"][0]
-    # Red of every fourth pixel, against one channel that is 1 everywhere.
+    # The red of every fourth pixel, and one channel that is 1 everywhere.
     panel = cv2.imread(str(run / "eval" / row["picture"]))[::7, ::7, 2] / 255
     red = [panel[3:35:4, 48 * i + 3 : 48 * i + 47 : 4] for i in (0, 1)]
     features = [np.stack([4 + (2 * r - 0.97) / 0.458, np.ones_like(r)]) for r in red]
@@ -195,7 +195,7 @@ def test_what_cannot_be_scored_is_said(gsjax_eval, run, tmp_path, weights):
     settings = yaml.safe_load(whole)
     config.write_text("# gsjax run\n" + yaml.safe_dump(settings | {"test_every": 0}))
     assert "the fit held out no photograph; score those it saw by --views train" in gsjax_eval()[1]
-    (run / "metrics.json").unlink()  # that of another command looks otherwise
+    (run / "metrics.json").unlink()  # other commands write a different one
     config.write_text("# gsjax run\n" + yaml.safe_dump({"track": {}, "eval_cameras": []}))
     assert "expected a run of `gsjax fit`, found one of `gsjax track`" in gsjax_eval()[1]
     config.write_text("# gsjax run\nsource: camera:0\n")

@@ -1,4 +1,4 @@
-"""Event files of a fit's curve, read back record by record; a resumed run leaves nothing twice."""
+"""Event files of a fit's curve, read back record by record; a resumed run leaves no value twice."""
 
 import struct
 import sys
@@ -19,7 +19,7 @@ def row(step, test_psnr=None):
 
 
 def events(folder):
-    """Of all files, in the order of their names: a length, its checksum, an event, its checksum."""
+    """The events of all files by name; a record is a length, its checksum, an event and its checksum."""
     from tensorboardX.proto.event_pb2 import Event
 
     for file in sorted((folder / "tensorboard").glob("events.*")):
@@ -31,8 +31,8 @@ def events(folder):
 
 
 def read(folder):
-    """What TensorBoard shows: tag -> {step: value}, and tags of pictures; a start voids what was at its step
-    and after."""
+    """What TensorBoard shows: tag -> {step: value}, and (tag, step, width) of each picture. A session's start
+    voids earlier values of its step and later ones."""
     scalars, pictures = [], []
     for event in events(folder):
         if event.session_log.status == 1:

@@ -1,4 +1,4 @@
-"""`gsjax info` on photographs; on recordings see test_main."""
+"""`gsjax info` on photographs, runs and files of Gaussians; for recordings see test_main."""
 
 import json
 import shutil
@@ -89,7 +89,7 @@ def test_the_split_of_the_data_is_shown_too(photographs, tmp_path, monkeypatch):
 
 
 def test_masks_that_are_not_there_are_not_asked_for(recording, capfd):
-    """`gsjax track --mask-camera` needs one."""
+    """Only a camera with a mask is named, as `gsjax track --mask-camera` needs one."""
     for camera in ("0", "2"):
         (recording / "seg" / camera / "000000.png").unlink()
     assert main(["info", str(recording)]) == 0
@@ -107,7 +107,7 @@ def test_a_recording_is_drawn_by_camera_with_points_of_its_depth(capfd, tmp_path
         np.testing.assert_array_equal(scene.viewmats[indices], sequence.viewmats[:, c])
     points, colors = scene_points(scene)
     assert points.shape == colors.shape
-    on_table = np.abs(points[:, 2]) < 0.002  # which stands at height 0
+    on_table = np.abs(points[:, 2]) < 0.002  # whose top is at height 0
     assert 0.2 < on_table.mean() < 1
     code = main(
         ["info", "simulated:tabletop?frames=2&width=48&height=36", "--picture", str(tmp_path / "a.svg")]

@@ -1,4 +1,4 @@
-"""`gsjax parts` from a built-in scene to a report; stopped in the middle it goes on to the same bits."""
+"""`gsjax parts` from a built-in scene to a report; a run that was stopped resumes to the same bits."""
 
 import json
 from dataclasses import replace
@@ -108,7 +108,7 @@ def test_a_run_that_was_stopped_goes_on_to_the_same_bits(gsjax_parts, tmp_path, 
     given = ("--scene", str(run / "canonical"), "--anchor", str(int(arrays["anchor"])))
 
     def stopped_after(step, name):
-        """Ctrl-C, as soon as that many steps were made."""
+        """Runs until Ctrl-C after `step` steps; returns metrics.json and the output."""
         advance = Drive.__next__
 
         def interrupted(ticks):

@@ -33,7 +33,7 @@ edits:
 
 
 def scene_and_trajectory():
-    """A red part that slides along x, a green one that turns about z, and a grey background."""
+    """A red part that slides along x, a green one that rotates about z, and a grey background."""
     rng = np.random.default_rng(0)
     labels = np.arange(200) % 3
     centers = np.array([[0.0, 0.0, 0.0], [0.1, -0.2, 0.2], [0.1, 0.3, 0.2]])
@@ -56,7 +56,7 @@ def scene_and_trajectory():
 
 
 def write_run(path, *, followed=4, anchor=0, origin=None):
-    """What `gsjax parts` leaves, as far as it is read."""
+    """Writes as much of a run of `gsjax parts` as is read of it; returns its folder."""
     path.mkdir()
     settings = {"dataset": DATASET, "cameras": [0, 1], "eval_cameras": [2], "frames": ":"}
     settings |= {"read": {"images": "images"}, "parts": {"stream": {"blend": "quaternion"}}}
@@ -97,7 +97,7 @@ def test_a_run_is_read_as_it_was_written(run):
     ("anchor", "followed", "kept"), [(1, 2, [1, 2]), (1, 3, [1, 2, 3]), (2, 3, [1, 2, 3])]
 )
 def test_of_a_partial_run_only_what_was_followed_is_taken(tmp_path, anchor, followed, kept):
-    """From the anchor on, then back."""
+    """Frames are followed from the anchor on, then back from it."""
     saved = open_parts_run(write_run(tmp_path / "run", followed=followed, anchor=anchor))
     assert not saved.complete
     np.testing.assert_allclose(saved.layer.trajectory.times, STEP * np.array(kept), rtol=1e-6)
@@ -114,7 +114,7 @@ def test_a_script_is_filmed_and_can_be_given_again(gsjax, run, tmp_path):
     assert str(folder) in said
     assert "fade: drawer (1)" in said
     found = json.loads((folder / "metrics.json").read_text())
-    # The drawer is done after twice its 0.2 s; so many frames are before that, and it itself.
+    # The drawer takes twice its 0.2 s: six steps of 1/15 s, hence seven frames.
     assert (found["frames"], found["fps"], found["camera"], found["complete"]) == (7, 15.0, 2, True)
     assert found["seconds"] == pytest.approx(7 / 15)
     assert found["render_hz"] > 0
@@ -173,7 +173,7 @@ def test_a_film_of_another_length_compiles_nothing(run, caplog):
 
 @pytest.mark.thorough
 def test_edits_without_a_script_from_another_camera(gsjax, run):
-    """The drawer of another run, whose recording need not be there, takes the place of this run's."""
+    """The drawer of another run, whose recording need not exist, replaces this run's."""
     other = write_run(run.parent / "other")
     moved_away(other)
     place = f"composite:parts=drawer,from_run={other},place={{to: [0.1, 0.0, 0.5]}}"
@@ -203,7 +203,7 @@ def test_films_of_ops_alone_are_numbered_on(gsjax, run):
 
 @pytest.mark.slow
 def test_the_camera_films_to_which_the_edits_change_most(gsjax, run):
-    """Each of the cameras sees each of two parts by another size; what is moved away counts."""
+    """Each camera sees each of the two parts at a different size; pixels a part no longer covers count."""
     saved, films_of = open_parts_run(run), {}
     for part in ("drawer", "shut_door"):
         script = parse_script(f"edits: [{{op: fade, parts: {part}, opacity: 0}}]")
@@ -221,7 +221,7 @@ def test_the_camera_films_to_which_the_edits_change_most(gsjax, run):
 
 
 def test_an_edit_that_is_seen_by_what_follows_it_is_not_idle(run):
-    """Alone it lies past the end of the film; what comes later lengthens that, or brings it in."""
+    """Alone it lies past the end of the film; a later edit lengthens the film, or brings it forward."""
     saved = open_parts_run(run)
     for text in (
         "edits: [{op: move, parts: 1, by: [0, 0, 0.1], from: 0.3}, {op: loop, parts: 2, times: 4}]",
@@ -245,7 +245,7 @@ def test_a_film_of_one_moment_has_a_camera(run, script):
 
 @pytest.mark.thorough
 def test_an_edit_near_the_end_is_looked_at(run):
-    """At a third of the way and at two thirds all is as it was."""
+    """At one third and at two thirds of the film nothing has changed yet."""
     saved = open_parts_run(run)
     for text in ("length: 3", "length: 3, fps: 30"):
         early, late = (
@@ -260,7 +260,7 @@ def test_an_edit_near_the_end_is_looked_at(run):
 
 @pytest.mark.thorough
 def test_edits_that_change_nothing_are_said_to(gsjax, run):
-    """And the first held-out camera films them, as all see the same."""
+    """The first held-out camera films them, as no camera sees a change."""
     edits = ["freeze:parts=drawer,from=9", "move:parts=drawer,by=[0,0,0.1]", "scale:parts=1,factor=1"]
     code, said = gsjax("edit", run, *(word for op in edits for word in ("--op", op)))
     assert code == 0, said

@@ -1,4 +1,4 @@
-"""`gsjax edit` with what cannot be done, and on what is no run."""
+"""`gsjax edit` with edits that cannot be done, and on folders that are no sound run."""
 
 import numpy as np
 import pytest

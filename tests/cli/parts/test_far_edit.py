@@ -1,4 +1,4 @@
-"""`gsjax edit` on a run whose data lie far from 0."""
+"""`gsjax edit` on a run whose data lie far from the origin."""
 
 from dataclasses import replace
 
@@ -16,7 +16,7 @@ from tests.cli.parts.test_edit import write_run
 @pytest.mark.thorough
 @pytest.mark.filterwarnings("ignore:.*coordinates reach")
 def test_points_are_in_the_coordinates_of_the_data_also_far_from_0(tmp_path):
-    """Of edits, of the place of another run's parts, and of their own edits."""
+    """The points of edits, the place of another run's parts, and the points of these parts' own edits."""
     text = """
     edits:
       - {op: rotate, parts: [drawer], axis: [0, 0, 1], degrees: 30, about: [%s, 0.2, 0.1]}

@@ -1,4 +1,4 @@
-"""A film of `gsjax edit` leaves as a sequence of files or as a page, and is viewed like a run."""
+"""A film of `gsjax edit` is exported as a sequence of files or as a page, and viewed like a run."""
 
 import json
 import shutil
@@ -15,7 +15,7 @@ from tests.cli.parts.test_edit import SCRIPT, write_run
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory):
-    """A run, and a film of it that lies elsewhere, with its frames."""
+    """The folders of a run and, elsewhere, of a film of it."""
     root = tmp_path_factory.mktemp("film")
     return write_run(root / "run"), root / "film"
 
@@ -32,7 +32,7 @@ def film(gsjax, made):
 
 
 def in_order(gaussians):
-    """Rows by their places: a film to view has what changes first."""
+    """Rows sorted by position, because a film that is viewed has the Gaussians that change first."""
     rows = np.lexsort(np.asarray(gaussians.means).T.round(5))
     return [np.asarray(a)[rows] for a in (gaussians.means, gaussians.opacities, gaussians.sh0)]
 

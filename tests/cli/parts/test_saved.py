@@ -1,4 +1,4 @@
-"""A run of `gsjax parts` whose files are not as they were written: each is refused in words."""
+"""Runs of `gsjax parts` with damaged or inconsistent files: each is refused with a clear error."""
 
 import json
 
@@ -74,7 +74,7 @@ def test_a_file_cut_off(run):
 
 
 def test_a_file_with_flipped_bits(run):
-    """Each byte behind the first header, one in so many: some break the compressed stream itself."""
+    """Every 17th byte after the first header, one at a time; some break the compressed stream itself."""
     sound = (run / "parts.npz").read_bytes()
     for place in range(60, 400, 17):
         broken = bytearray(sound)

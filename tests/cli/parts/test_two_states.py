@@ -1,4 +1,4 @@
-"""`gsjax parts` of two states, each by cameras of its own: from a scene to a report with its joints."""
+"""`gsjax parts` on two states, each seen by its own cameras: from a scene to a report with its joints."""
 
 import json
 

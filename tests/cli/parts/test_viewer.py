@@ -1,4 +1,4 @@
-"""What the viewer is given to edit a run of `gsjax parts`: previews, words, and films as `gsjax edit` has."""
+"""Editing a run of `gsjax parts` in the viewer: previews, messages, and the same films as of `gsjax edit`."""
 
 import json
 
@@ -51,7 +51,7 @@ def assert_the_same_in_any_order(ours, theirs):
 
 
 def test_the_first_frame_is_not_that_of_the_anchor(run):
-    """Parts are stored as they stand in the anchor's frame, which is seldom the first."""
+    """Parts are stored as they are in the anchor frame, which is seldom the first."""
     scene, _ = scene_and_trajectory()
     quats, shifts = np.zeros((4, 3, 4)), np.zeros((4, 3, 3))
     quats[..., 0], shifts[:, 1, 0] = 1, [-0.2, -0.1, 0.0, 0.1]
@@ -98,7 +98,7 @@ def test_a_preview_is_the_film(run, lines):
     for t in range(scene.num_frames):
         now = scene.at(t)
         assert_the_same_in_any_order(now, film_gaussians(film, t))
-        # What is said to stand still does, in all that browsers are sent.
+        # Gaussians that are declared still are so in everything that browsers receive.
         for name in ("means", "quats", "log_scales", "logit_opacities"):
             still = [np.asarray(getattr(g, name))[scene.num_moving :] for g in (first, now)]
             np.testing.assert_array_equal(*still)

@@ -86,7 +86,7 @@ def test_finished_run_is_not_overwritten(finished):
 
 def test_overwriting_clears_the_run_and_nothing_else(finished):
     (finished.path / "poses.npz").touch()
-    for name in ("query", "grasp"):  # what was asked of the old run is no answer for the new one
+    for name in ("query", "grasp"):  # answers from the old run do not hold for the new one
         (finished.path / name).mkdir()
         (finished.path / name / "video.mp4").touch()
     run = RunFolder(finished.path, overwrite=True)

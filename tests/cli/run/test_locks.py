@@ -1,4 +1,4 @@
-"""One writer at a time in a folder, whatever becomes of it."""
+"""One writer at a time in a folder, whatever happens to that writer."""
 
 import fcntl
 import json
@@ -27,7 +27,7 @@ def test_a_second_writer_is_told_who_writes_and_since_when(tmp_path, written):
     since = json.loads((tmp_path / LOCK).read_text())["since"]
     said = refusal(tmp_path)
     assert f"found process {other.pid}, which has been writing there since {since}; wait until" in said
-    assert "remove" not in said  # of a lock that ends with its process
+    assert "remove" not in said  # since the lock ends with its process
     other.communicate("")
     with locked(tmp_path):
         assert json.loads((tmp_path / LOCK).read_text())["pid"] == os.getpid()
@@ -54,7 +54,7 @@ def test_what_a_dead_writer_left_is_taken_over(tmp_path, written, number):
     ids=range(9),
 )
 def test_what_the_file_says_locks_nothing(tmp_path, left):
-    """Another process may have the number by now: the first one of the machine is always there."""
+    """Another process may have its process id by now: process 1, for one, always exists."""
     (tmp_path / LOCK).write_text(left)
     with locked(tmp_path):
         pass
@@ -143,7 +143,7 @@ def test_places_where_nobody_can_write(tmp_path, monkeypatch):
     monkeypatch.setattr(os, "open", read_only)
     with pytest.raises(OSError, match="cannot write into this folder"), locked(tmp_path):
         pass
-    with locked(tmp_path, shared=True):  # who only adds to a run elsewhere need not write into it
+    with locked(tmp_path, shared=True):  # to write elsewhere from a run takes no write access to it
         pass
 
 
@@ -181,6 +181,6 @@ def test_without_locks_of_files_the_writers_that_are_listed_decide(tmp_path, mon
 @pytest.mark.thorough
 def test_without_locks_of_files_one_of_two_that_begin_at_one_instant_is_refused(tmp_path, monkeypatch):
     monkeypatch.setattr(locks, "_flock", lambda *_, **__: None)
-    monkeypatch.setattr(locks.time, "sleep", lambda _: listed(tmp_path))  # the other has listed itself since
+    monkeypatch.setattr(locks.time, "sleep", lambda _: listed(tmp_path))  # the other is listed meanwhile
     assert "found process 1, which" in refusal(tmp_path)
     assert json.loads((tmp_path / LOCK).read_text())["pid"] == 1

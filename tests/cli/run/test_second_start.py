@@ -1,4 +1,4 @@
-"""What is compiled or traced once is found by the next process."""
+"""What one process compiled or traced is reused by the next."""
 
 import json
 import os
@@ -13,7 +13,7 @@ FIT = ("--fit.steps", "6", "--fit.cap", "60", "--fit.start.count", "50", "--fit.
 
 
 def start(tmp_path, name):
-    """The record of a fit in a new process."""
+    """Runs a fit in a new process; returns its record."""
     record, out = tmp_path / f"{name}.json", str(tmp_path / name)
     watched = [sys.executable, "-m", "benchmarks.starts", str(record), str(time())]
     command = [*watched, "fit", SCENE, "--out", out, *FIT, "--fit.growth.every", "2"]
@@ -25,7 +25,7 @@ def start(tmp_path, name):
 
 
 def traces(tmp_path):
-    """The traces that are kept, as files: one that is written again is another."""
+    """The inode of each cached trace, by file name: a trace that is written again has a new one."""
     return {path.name: path.stat().st_ino for path in tmp_path.glob("cache/gsjax/*/traces/*.npz")}
 
 

@@ -25,7 +25,7 @@ CAMERAS = ("--cameras", "0", "1", "--mask-camera", "1", "--eval-cameras", "2")
 
 @pytest.fixture
 def opened(monkeypatch):
-    """(frame, camera) of each mask that is opened, and when tracking had ended, None."""
+    """(frame, camera) of each mask that is opened, and None once tracking has ended."""
     log = []
     mask, follow = Sequence.mask, gsjax.engine.track.loop.follow
 
@@ -51,7 +51,7 @@ def test_a_run_from_end_to_end(pristine, tmp_path, gsjax_track, opened):
     assert "carton" in said
     assert "report.html" in said
 
-    # No mask but the first of the mask's camera was opened before tracking ended.
+    # Before tracking ended, no mask but the first of the mask camera was opened.
     assert opened[: opened.index(None)] == [(0, 1)]
     assert len(opened) > 2
 
@@ -76,13 +76,13 @@ def test_a_run_from_end_to_end(pristine, tmp_path, gsjax_track, opened):
     found = json.loads((run / "metrics.json").read_text())
     assert found["complete"] is True
     assert list(found["objects"]) == ["robot", "carton", "can", "ball", "block"]
-    # The can, which is all that moves in these frames, is ahead of one that was left behind.
+    # The can is all that moves in these frames; it is followed better than by leaving it where it was.
     can = found["objects"]["can"]
     assert can["moved_mm"] > 15
     assert can["centroid_error_mm"] < 0.5 * can["moved_mm"]
     assert found["objects"]["robot"]["centroid_error_mm"] is None
     assert found["objects"]["robot"]["pose"] is None
-    # What stands still has no error in any pose; the can's is about that of its points.
+    # An object that stands still has almost no pose error; the can's is about that of its points.
     block = found["objects"]["block"]["pose"]
     assert block["add_s_mm"] - 1e-9 <= block["add_mm"] < 2
     assert min(block[name] for name in ("add_auc", "add_s_auc", "recall_5cm_5deg")) > 0.97
@@ -126,7 +126,7 @@ def test_ctrl_c_leaves_a_usable_run(pristine, tmp_path, gsjax_track, still, monk
 
     def interrupted(sequence, t):
         if t == 2 and sequence.num_cameras == 2:
-            raise KeyboardInterrupt(*signals)  # a signal itself has no exact time
+            raise KeyboardInterrupt(*signals)  # a real signal would arrive at no exact step
         return frame(sequence, t)
 
     monkeypatch.setattr(Sequence, "frame", interrupted)
@@ -207,9 +207,9 @@ def test_segmented_objects_are_scored_as_what_they_cover(pristine, tmp_path, gsj
 def test_a_run_says_what_was_lost_and_whose_turn_is_not_known(
     pristine, tmp_path, gsjax_track, still, monkeypatch
 ):
-    """The can is lost in updates 1 and 3, the last, and its turn is not known from update 2 on. The ball is
-    lost in update 1; its turn is then known for one more update, and from update 3 on not. How the carton is
-    turned is not known since it was lost, in update 2."""
+    """The can is lost in updates 1 and 3, the last, and its rotation is unknown from update 2 on. The ball is
+    lost in update 1; its rotation is known again in update 2, and unknown from update 3 on. The carton's
+    rotation is unknown since it was lost, in update 2."""
     ids: list[int] = []
 
     def flagged(scene, first, frames, config, **how):

@@ -1,4 +1,4 @@
-"""`gsjax track --masks PICTURE`: objects that a user names, in a recording without masks or with others."""
+"""`gsjax track --masks PICTURE`: objects from the user's own mask, whether the recording has masks or not."""
 
 import json
 import shutil
@@ -27,7 +27,7 @@ def unmasked(pristine, tmp_path):
 @pytest.mark.thorough
 def test_a_picture_names_the_objects(unmasked, tmp_path, gsjax_track, still):
     folder, first = unmasked
-    labels = np.where(first[1] == 3, 7, 0).astype(np.uint8)  # the can alone, by another value
+    labels = np.where(first[1] == 3, 7, 0).astype(np.uint8)  # the can alone, with another value
     write_png(tmp_path / "can.png", labels)
     code, said = gsjax_track(
         folder, "--cameras", "0", "1", "--mask-camera", "1", "--masks", str(tmp_path / "can.png")

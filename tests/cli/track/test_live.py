@@ -1,4 +1,4 @@
-"""`gsjax live` around a tracker that stands still: what is counted, written and said."""
+"""`gsjax live` around a tracker whose objects stand still: what is counted, written and reported."""
 
 import json
 from dataclasses import replace
@@ -35,7 +35,7 @@ def unfitted(frame, mask, camera, config, before_fit):
 
 @pytest.fixture
 def live(tmp_path, capfd, monkeypatch):
-    """Runs `gsjax live` in this process; returns the exit code, what was said, and the run's folder."""
+    """Runs `gsjax live` in this process; returns the exit code, its output and the run's folder."""
     monkeypatch.setattr(engine, "track", standing_still)
     monkeypatch.setattr(engine, "start_scene", unfitted)
 
@@ -62,7 +62,7 @@ def test_a_recording_is_replayed_and_all_frames_are_accounted_for(pristine, live
     assert found["latency_ms"]["median"] > 0
     assert found["memory_mb"]["max"] > 10
     assert "12 offered" in said
-    *followed, last = found["objects"].values()  # the last group is said to be lost in every frame
+    *followed, last = found["objects"].values()  # the last group is reported lost in every frame
     assert found["frames_lost"] == {**dict.fromkeys(followed, 0), last: frames["used"]}
     assert f"{last} in {frames['used']} updates" in said
     with np.load(folder / "trajectory.npz") as stored:
@@ -78,7 +78,8 @@ def test_a_recording_is_replayed_and_all_frames_are_accounted_for(pristine, live
 
 
 def test_a_group_goes_where_it_is_carried_whatever_joins_it():
-    """Its own middle shifts with what joins: by 2 cm here, while it turns by 90 degrees and moves by 1 m."""
+    """The mean of its points shifts when points join: here by 2 cm, before it rotates by 90 degrees and moves
+    by 1 m."""
     log = engine.Log((0, 5), {})
     still, turn = np.zeros((1, 6)), np.array([[1.0, 0.0, 0.0, 0.0, 0.0, np.pi / 2]])
     start, joined, moved = (np.array([[x, 0.0, 0.0]]) for x in (0.1, 0.12, 1.12))
@@ -91,7 +92,7 @@ def test_a_group_goes_where_it_is_carried_whatever_joins_it():
     np.testing.assert_allclose(places[1], places[0], atol=1e-6)
     np.testing.assert_allclose(
         places[2][0, :3], [1.12, -0.02, 0], atol=1e-6
-    )  # 2 cm behind its middle, turned
+    )  # 2 cm off the mean, rotated
     np.testing.assert_allclose(places[2][0, 3:], np.sqrt([0.5, 0, 0, 0.5]), atol=1e-6)
 
 

@@ -1,4 +1,4 @@
-"""A recording as a user makes it of arrays (docs/data.md): names of labels, a mask of the first frame."""
+"""A recording as a user writes it from arrays (docs/data.md): names of labels, a mask of the first frame."""
 
 import json
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""`gsjax query` and `gsjax grasp` on a run of the built-in scene, tracked by standing still."""
+"""`gsjax query` and `gsjax grasp` on a run of the built-in scene, whose tracker leaves all objects still."""
 
 import json
 import re
@@ -24,7 +24,7 @@ from tests.cli.conftest import LABELS, standing_still, unfitted, write_made_fiel
 
 @pytest.fixture(scope="module")
 def tracked(pristine, tmp_path_factory):
-    """A run of four frames of a table on which nothing is moved, held out camera 2."""
+    """A run of four frames in which nothing moves; camera 2 is held out."""
     out = tmp_path_factory.mktemp("runs") / "run"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("gsjax.engine.track.run.start_scene", unfitted)
@@ -36,7 +36,7 @@ def tracked(pristine, tmp_path_factory):
 
 @pytest.fixture
 def run(tracked, tmp_path):
-    """A copy of it to corrupt."""
+    """A copy of `tracked` to corrupt."""
     return shutil.copytree(tracked, tmp_path / "run")
 
 
@@ -90,7 +90,7 @@ def test_a_tracked_run_answers_what_only_its_field_can(gsjax, run, pristine):
     assert code == 0, said
     told = json.loads((run / "query" / "query.json").read_text())
     assert (told["features"], told["threshold"], told["gaussians"]) == ("classes", 0.6, (labels == 3).sum())
-    # It is found in all frames, by the Gaussians that carry the field along.
+    # It is found in all frames, as the field moves along with the Gaussians.
     with np.load(run / "query" / "over_time.npz") as found, np.load(run / "trajectory.npz") as whole:
         np.testing.assert_allclose(found["means"], whole["means"][:, labels == 3], atol=1e-6)
         assert found["frames"].tolist() == [0, 1, 2, 3]
@@ -100,7 +100,7 @@ def test_a_tracked_run_answers_what_only_its_field_can(gsjax, run, pristine):
         true = np.array([(mask == 3).sum() for mask in masks])
         np.testing.assert_allclose(found["pixels"], true, atol=0.5 * true.max())
     assert read_video_frames(run / "query" / "video.mp4").shape == (4, 480, 640, 3)
-    # Without pictures, and without the film, it is found there all the same.
+    # It is found there too without pictures, and without the film.
     for name, less in (("bare", "--no-pictures"), ("still", "--no-film")):
         code, said = gsjax("query", run, "can", "--threshold", 0.6, less, "--out", run / name)
         assert code == 0, said
@@ -108,7 +108,7 @@ def test_a_tracked_run_answers_what_only_its_field_can(gsjax, run, pristine):
         with np.load(run / name / "over_time.npz") as found:
             assert (set(found), found["means"].shape[0]) == ({"frames", "means"}, 4)
         assert not (run / name / "video.mp4").exists()
-    # The viewer asks it in any frame, and saves what was found as it is there.
+    # The viewer queries it in any frame, and saves what was found as it is in that frame.
     with Notes(Console(quiet=True)) as notes:
         scene = open_viewable(run, notes)[0]
     assert notes.all == []
@@ -267,7 +267,7 @@ def test_an_approach_must_have_a_direction(capfd, tracked, approach):
 
 @pytest.mark.thorough
 def test_nothing_at_all_may_be_ignored(gsjax, run):
-    """A list that is empty by itself means all there is; one that is not, none."""
+    """`--ignore` without names means that no object is ignored, not that the default applies."""
     code, said = gsjax("grasp", run, "can", "--samples", "16", "--ignore")
     assert code in (0, 3), said
 

@@ -1,4 +1,4 @@
-"""A run that was stopped goes on where it was, and ends as if it had not been stopped."""
+"""A run that was stopped resumes where it was, and ends as if it had not been stopped."""
 
 import errno
 import json
@@ -22,7 +22,7 @@ OPTIONS = ("--cameras", "0", "1", "--preset", "fast", "--track.start.iterations"
 
 
 def interrupted(after: int):
-    """`track` that is stopped by Ctrl-C after some updates."""
+    """A `track` that Ctrl-C stops after that many updates."""
 
     def call(*arguments, **options):
         for count, update in enumerate(track(*arguments, **options), start=1):
@@ -86,7 +86,7 @@ def test_a_full_disk_is_said_and_tracking_goes_on(pristine, gsjax_track, still, 
 
 
 def test_parts_whose_state_did_not_follow_are_written_again(tmp_path, monkeypatch):
-    """The poses fit on the disk, the larger state does not; or a run is killed between the two."""
+    """The disk has room for the poses but not for the larger state, or a run is killed between the two."""
 
     def tracked_up_to(frames: int):
         rows = [Pose(jnp.full((3, 3), float(t)), jnp.full((3, 4), float(t))) for t in range(frames)]
@@ -114,7 +114,7 @@ def test_parts_whose_state_did_not_follow_are_written_again(tmp_path, monkeypatc
 
 
 def test_a_run_of_another_version_is_refused(monkeypatch, tmp_path):
-    """Which has not saved all that this one has of each update."""
+    """It has not saved all that this version saves of each update."""
     tree = {"scene": None, "run": SimpleNamespace(kept=SimpleNamespace(chosen=None))}
     saved = {"frames": 1, "visible": [], "lost": [], "turn_known": []}
     monkeypatch.setattr(gsjax.engine.track.resume, "load_checkpoint", lambda path: (tree, saved))

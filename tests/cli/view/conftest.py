@@ -40,7 +40,7 @@ def ply(tmp_path) -> Path:
 
 @pytest.fixture
 def fitted(photographs, tmp_path) -> Path:
-    """What a fit of the photographs leaves, but for its pictures."""
+    """What a fit of the photographs leaves, except for its pictures."""
     folder = RunFolder(tmp_path / "fitted")
     folder.write_config(FitOptions(str(photographs), folder.path, fit=FitConfig(antialiased=True)))
     folder.write_metrics({"kind": "fit", "complete": True})
@@ -50,8 +50,8 @@ def fitted(photographs, tmp_path) -> Path:
 
 @pytest.fixture
 def tracked(recording, tmp_path) -> Path:
-    """What tracking leaves, but for its pictures: 12 of 30 Gaussians, of two objects, shift by 1 cm a frame.
-    Camera 2 was held out."""
+    """What tracking leaves, except for its pictures: 12 of 30 Gaussians, of two objects, shift by 1 cm per
+    frame. Camera 2 is held out."""
     gaussians, labels = some(), np.where(np.arange(30) < 12, 1 + np.arange(30) % 2, 0)
     scene = TrackedScene(gaussians, jnp.zeros((12, 3)), jnp.asarray(labels), (0, 2, 3), 12)
     means, quats = gaussians.means[:12], gaussians.quats[:12]
@@ -74,7 +74,7 @@ def notes():
 
 @pytest.fixture
 def view(capfd, monkeypatch):
-    """Runs the command as if Ctrl-C came at once; returns the exit code and what was said, spaces as one."""
+    """Runs the command with an immediate Ctrl-C; returns the exit code and output, whitespace collapsed."""
 
     def interrupted(self):
         raise KeyboardInterrupt
@@ -93,7 +93,7 @@ def view(capfd, monkeypatch):
 
 @pytest.fixture
 def export(capfd):
-    """Runs the command; returns the exit code and what was said, spaces as one."""
+    """Runs the command; returns the exit code and its output, with whitespace collapsed."""
 
     def call(*arguments) -> tuple[int, str]:
         capfd.readouterr()

@@ -144,7 +144,7 @@ def test_what_is_read_in_one_format_is_written_in_another(export, ply, tmp_path)
 
 @pytest.mark.filterwarnings("ignore:.*they are taken relative to the origin")
 def test_a_scene_far_from_0_keeps_its_places(export, tmp_path):
-    """In UTM coordinates, to a .ply and back from it; other formats have no room for these digits."""
+    """In UTM coordinates, to a .ply and back; the precision of other formats does not suffice for them."""
     far, origin = tmp_path / "far.ply", np.array([500_000.0, 5_000_000.0, 300.0])
     write_ply(far, some(), origin=origin)
     assert export(far, tmp_path / "again.ply")[0] == 0
@@ -166,7 +166,7 @@ def test_a_run_far_from_0_keeps_its_places_in_each_frame(export, tracked, tmp_pa
         shutil.copy(tracked / name, far.path)
     with np.load(far.path / "trajectory.npz") as run:
         assert run["poses"].shape == (4, 2, 4, 4)
-        for k in (1, 2):  # the motion of each object, in the world, takes its Gaussians along
+        for k in (1, 2):  # the motion of each object, in the world, moves its Gaussians
             mine = run["means"][:, run["labels"] == k]
             moved = mine[0] @ run["poses"][3, k - 1, :3, :3].T + run["poses"][3, k - 1, :3, 3]
             np.testing.assert_allclose(moved, mine[3], rtol=0, atol=1e-6)
@@ -202,7 +202,7 @@ def test_what_is_refused(export, ply, tmp_path):
 
 
 def test_labels_go_with_a_ply(export, ply, tmp_path):
-    """Those that stand beside its name are somebody's, and are not replaced unasked."""
+    """A file of labels that is there already belongs to the user, and is not replaced unasked."""
     out, beside = tmp_path / "made" / "out.ply", tmp_path / "made" / "out_labels.npz"
     beside.parent.mkdir()
     beside.write_bytes(b"mine")

@@ -1,4 +1,4 @@
-"""`gsjax view` of a scene with a field: what the viewer can be asked, and what is kept of the answers."""
+"""`gsjax view` of a scene with a field: what can be queried in the viewer, and which answers are saved."""
 
 import shutil
 from pathlib import Path
@@ -23,7 +23,7 @@ CODES = np.stack([ClassCodebook(NAMES).embed_text(name) for name in NAMES.values
 
 @pytest.fixture
 def asked(fitted) -> Path:
-    """The field of a fit, whose odd Gaussians are a can."""
+    """A field for the fit, in which odd Gaussians are a can."""
     labels, source = np.arange(30) % 2, Source("classes", NAMES)
     return write_made_field(fitted / "field", fitted / "scene.ply", None, source, labels, CODES)
 
@@ -145,7 +145,7 @@ def test_what_was_tracked_is_asked_in_any_frame(tracked, notes):
 
 
 def test_a_better_field_that_comes_meanwhile_answers(fitted, asked, notes):
-    """As that of the descent after the solution, while one looks."""
+    """Like the one that gradient descent writes after the solution, while the viewer is open."""
     asking = open_viewable(fitted, notes)[0].asking
     before = asking.ask("can", 0).scores
     told = dict(np.load(asked / "field.npz"))
@@ -161,6 +161,6 @@ def test_parts_say_where_their_field_is_asked(tracked, notes):
     field.mkdir()
     (field / "field.npz").touch()
     (tracked / "parts.npz").touch()
-    with pytest.raises(ValueError, match=r"parts\.npz"):  # an empty file: what is said before counts here
+    with pytest.raises(ValueError, match=r"parts\.npz"):  # it is empty; the note before that counts here
         open_viewable(tracked, notes)
     assert any(f"gsjax view {field} shows the scene of its field" in note for note in notes.all)

@@ -14,7 +14,7 @@ from tests.io.scenes_to_write import ROUNDING
 
 
 def later(frame):
-    """Centres of the tracked scene."""
+    """The centres of the tracked scene in a frame."""
     means = np.array(some().means)
     means[:12] += 0.01 * frame
     return means

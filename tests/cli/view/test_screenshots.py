@@ -1,4 +1,4 @@
-"""Screenshots of the viewer: where they are written, and that none is written over another."""
+"""Screenshots of the viewer: where they are written, and that none overwrites another."""
 
 from pathlib import Path
 

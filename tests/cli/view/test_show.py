@@ -11,7 +11,7 @@ from tests.cli.view.conftest import some
 
 
 def about(shown):
-    """What the page in a cell is told."""
+    """The data that is passed to the page in a cell."""
     return json.loads(re.search(r"const about = (\{.*\});", shown.page)[1])
 
 
