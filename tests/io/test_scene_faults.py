@@ -22,20 +22,22 @@ READ_BACK = sorted(ROUNDING)
 
 
 @pytest.mark.parametrize(
-    ("change", "says"),
+    "change",
     [
-        (lambda pairs: pairs[0].__setitem__(1, 1 << 40), "expected arrays of"),
-        (lambda pairs: pairs[0].__setitem__(0, 1 << 60), "damaged|expected"),
-        (lambda pairs: pairs.pop(), "expected arrays of"),
-        (lambda pairs: pairs.extend([[0, 0]] * 200), "expected a table of 205 sizes|expected|found"),
+        lambda pairs: pairs[0].__setitem__(1, 1 << 40),
+        lambda pairs: pairs[0].__setitem__(0, 1 << 60),
+        lambda pairs: pairs.pop(),
     ],
 )
-def test_an_spz_of_version_4_whose_table_lies(tmp_path, change, says):
+def test_an_spz_of_version_4_whose_table_lies(tmp_path, change):
     spz4(make_scene(50), tmp_path / "scene.spz", change)
-    try:
+    with pytest.raises(SceneError, match=r"scene\.spz: expected"):
         read_gaussians(tmp_path / "scene.spz")
-    except SceneError as error:
-        assert "scene.spz: expected" in str(error)  # noqa: PT017 (a table with empty entries may be read)
+
+
+def test_empty_entries_of_the_table_of_an_spz_are_skipped(tmp_path):
+    spz4(make_scene(50), tmp_path / "scene.spz", lambda pairs: pairs.extend([[0, 0]] * 200))
+    assert read_gaussians(tmp_path / "scene.spz")[0].num == 50
 
 
 def refusal(path, data=None) -> str:

@@ -136,10 +136,6 @@ def _with_nan(scene):
     return eqx.tree_at(lambda s: s.gaussians.means, scene, scene.gaussians.means.at[2, 1].set(jnp.nan))
 
 
-def _out_of_range(nodes):
-    return nodes._replace(indices=nodes.indices.at[0, 0].set(99))
-
-
 def _wider(meaning):
     return replace(meaning, codebook=np.eye(2, 4), basis=np.eye(5, 4))
 

@@ -229,7 +229,7 @@ def test_an_edit_that_is_seen_by_what_follows_it_is_not_idle(run):
         "{op: speed, parts: 1, factor: 2}]}",
     ):
         _, doubts = films.edited(parse_script(text), saved)
-        assert not any("nothing is to be seen" in doubt for doubt in doubts), doubts
+        assert not any("no visible effect" in doubt for doubt in doubts), doubts
     _, doubts = films.edited(parse_script("edits: [{op: freeze, parts: 1}, {op: freeze, parts: 1}]"), saved)
     assert doubts == ["no visible effect: edit 2 (freeze)"]
 

@@ -90,9 +90,7 @@ def test_a_group_goes_where_it_is_carried_whatever_joins_it():
     ]
     np.testing.assert_allclose(places[0][0, :3], [0.1, 0, 0], atol=1e-6)
     np.testing.assert_allclose(places[1], places[0], atol=1e-6)
-    np.testing.assert_allclose(
-        places[2][0, :3], [1.12, -0.02, 0], atol=1e-6
-    )  # 2 cm off the mean, rotated
+    np.testing.assert_allclose(places[2][0, :3], [1.12, -0.02, 0], atol=1e-6)  # 2 cm off the mean, rotated
     np.testing.assert_allclose(places[2][0, 3:], np.sqrt([0.5, 0, 0, 0.5]), atol=1e-6)
 
 

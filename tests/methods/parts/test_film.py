@@ -60,8 +60,12 @@ class TestTrimmed:
         only = Layer(layer.scene, edits.ghost(layer.trajectory, [1]))
         before, after = jax.device_get((drawn((only,), 4), drawn(trimmed((only,)), 4)))
         visible = before.opacities >= 1 / 255
-        kept = np.isin(after.means[:, 0].round(4), before.means[visible, 0].round(4))
-        assert kept.sum() == visible.sum()
+        rows = [
+            np.concatenate([g.means, g.quats, g.scales, g.opacities[:, None]], axis=1).round(4)
+            for g in (before, after)
+        ]
+        kept = (rows[1][:, None] == rows[0][visible][None]).all(-1)
+        assert (kept.sum(0) == 1).all()
 
     def test_a_faint_part_keeps_its_gaussians(self):
         """So that dragging an opacity slider causes no recompilation."""

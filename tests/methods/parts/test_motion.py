@@ -81,6 +81,8 @@ def test_pixels_show_what_may_move(boxes, plan, changes):
     shown = changing_views(boxes.gaussians, boxes.cameras, plan, changes, drawn)
     true = boxes.masks(boxes.bodies) > 0
     assert shown[true].mean() > 0.9
+    covered = np.stack([np.asarray(view.alphas[0]) > 0.5 for view in drawn])
+    assert shown[~true & covered].mean() < 0.5  # the boxes pass over some of it
 
 
 def test_what_moves_joins_the_part_that_it_touches(boxes):
@@ -141,7 +143,10 @@ def test_a_plain_plate_that_slides_is_seen_to_move():
     """It has no texture that would distinguish it from a shadow."""
     pictures, depths = np.full((2, 40, 60, 3), 80, np.uint8), np.full((2, 40, 60), 2.0, np.float32)
     pictures[0, 10:30, 5:25] = pictures[1, 10:30, 30:50] = 200
-    assert changed_pixels(pictures, depths)[12:28, 9:21].all()
+    changed = changed_pixels(pictures, depths)
+    assert changed[12:28, 9:21].all()
+    assert not changed[:8].any()
+    assert not changed[:, 52:].any()
 
 
 def changed_pixels(pictures, depths):
