@@ -16,6 +16,7 @@ from gsjax.cli import main
 from gsjax.data import open_sequence, write_panoptic
 from gsjax.data.simulated import tabletop
 from gsjax.engine import progress
+from gsjax.engine.checkpoint import write_field
 from gsjax.engine.distill.scene import SceneOptions
 from gsjax.engine.drive import Tick
 from gsjax.engine.folder import RunFolder, plain
@@ -172,5 +173,5 @@ def write_made_field(
     about = {"file": str(scene), "sha256": digest(scene), "num_gaussians": len(labels)}
     about["photographs"] = photographs
     folder.mkdir(parents=True, exist_ok=True)
-    DistillResult(field, None, source, about).write(folder / "field.npz")
+    write_field(folder / "field.npz", DistillResult(field, None, source, about))
     return folder
