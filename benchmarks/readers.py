@@ -14,6 +14,7 @@ import yaml
 from benchmarks.readers_of_data import CLOUDS, LAYOUTS, PICTURES, SCENES, Arrays, Reader, written
 from gsjax.data.text import decoded
 from gsjax.engine import locks
+from gsjax.engine.checkpoint import write_field
 from gsjax.engine.deform.file import read_deformation, read_metadata, write_deformation
 from gsjax.engine.distill.file import read_field
 from gsjax.engine.folder import SIGNATURE
@@ -118,7 +119,7 @@ def _deformation(root: Path) -> Arrays:
 def _field(root: Path) -> None:
     field = FeatureField(jnp.eye(3), jnp.ones((4, 3)))
     about = {"file": "scene.ply", "sha256": "0", "num_gaussians": 3, "photographs": None}
-    DistillResult(field, None, Source("classes", {1: "tool"}), about).write(root / "field.npz")
+    write_field(root / "field.npz", DistillResult(field, None, Source("classes", {1: "tool"}), about))
 
 
 def _features_of_field(root: Path) -> Arrays:
