@@ -137,8 +137,8 @@ def distill(
         after: a tick of an earlier distillation of the same scene and photographs, to continue from.
 
     Returns:
-        ticks, whose `result` is a `DistillResult`: `query(text)` scores the Gaussians, `write(path)` makes a
-        field.npz for `gsjax query` and `gsjax view`.
+        ticks, whose `result` is a `DistillResult`: `query(text)` scores the Gaussians, and
+        `gsjax.write_field` writes it for `gsjax query` and `gsjax view`.
 
     Raises:
         ValueError: the teacher does not fit the photographs, or as for `gsjax.methods.distill.Distill.start`.
