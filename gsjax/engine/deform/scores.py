@@ -253,7 +253,7 @@ def _means_of_classes(overlap: LabelOverlap, count: int) -> dict[str, float | No
 
 def over_time(pair: list[tuple[np.ndarray, Frame]]) -> dict[str, Any]:
     """The temporal consistency of two neighbouring frames, as rendered and as recorded; empty if pictures
-    are smaller than the windows of the scores.
+    are smaller than the windows of the scores, or if only one of the frames has a mask.
 
     Held-out frames have no held-out neighbours, so each is paired with the next frame (the last frame of a
     recording with the one before it), usually a training frame. Pixels that do not count are taken from the
@@ -264,6 +264,8 @@ def over_time(pair: list[tuple[np.ndarray, Frame]]) -> dict[str, Any]:
     """
     sides = sorted(pair[0][1].images.shape[1:3])
     if sides[0] < _LEAST_SIDE or sides[1] < _LEAST_LONGER_SIDE:
+        return {}
+    if len({frame.masks is None for _, frame in pair}) > 1:  # what counts in the other is unknown
         return {}
     ours = np.stack([_filled(colors, frame) for colors, frame in pair])
     true = np.stack([_photograph(frame) for _, frame in pair])

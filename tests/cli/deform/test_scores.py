@@ -54,6 +54,11 @@ def test_too_small_pictures_have_none():
     assert over_time([(np.zeros((11, 11, 3)), small)] * 2) == {}
 
 
+def test_a_neighbour_without_a_mask_is_not_compared():
+    counts = np.ones((HEIGHT, WIDTH), bool)
+    assert over_time([(picture(), seen(0.0, counts)), (picture(1.0), seen(1.0))]) == {}
+
+
 def test_pixels_are_of_the_class_whose_code_is_nearest():
     codes = jnp.eye(3, 5)
     features = jnp.array([[[0.1, 0.02, 0, 0, 0], [0, 0, 7.0, 0, 1], [0, 0, 0, 0, 0]]])  # the last has none
