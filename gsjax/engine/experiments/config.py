@@ -7,9 +7,8 @@ from dataclasses import MISSING, dataclass, field
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from gsjax.data.files import read_text
+from gsjax.io.parsed import parse_yaml
 
 CONFIG = "config.yaml"
 FIGURES = (".png", ".svg", ".jpg", ".webp")
@@ -57,12 +56,11 @@ def read_config(path: Path, root: Path) -> tuple[Config, tuple[Column, ...], Fig
     Raises:
         ValueError: the file is not YAML, or a key is invalid.
     """
+    text = read_text(path, "YAML")
     try:
-        found = yaml.safe_load(read_text(path, "YAML"))
-    except yaml.YAMLError as error:
-        mark, problem = getattr(error, "problem_mark", None), getattr(error, "problem", None)
-        fault = f"a fault in line {mark.line + 1}: {problem}" if mark else str(error)
-        raise ValueError(f"{path}: expected YAML, found {fault}") from error
+        found = parse_yaml(text)
+    except ValueError as error:
+        raise ValueError(f"{path}: expected YAML, found {error}") from error
     config = _fields(Config, found, f"{path}", ": ")
     for key in ("claim", "source", "script"):
         expect(getattr(config, key).strip(), f"{path}: {key}", "text", "none")

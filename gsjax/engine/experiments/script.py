@@ -3,6 +3,7 @@
 import ast
 import hashlib
 import sys
+import tokenize
 from collections.abc import Callable
 from functools import cache
 from importlib import import_module
@@ -14,6 +15,21 @@ from gsjax.engine.experiments.config import CONFIG, expect
 
 SHARED = "shared"
 """Folder below the root with modules that experiments share."""
+
+
+def read_script(path: Path) -> str:
+    """The source of a script, in the encoding that it declares (default: UTF-8).
+
+    Raises:
+        ValueError: it is in another encoding.
+        OSError: it cannot be read.
+    """
+    try:
+        with tokenize.open(path) as file:
+            return file.read()
+    except (SyntaxError, UnicodeDecodeError) as error:
+        wanted = "a script in UTF-8, or in the encoding that it declares"
+        raise ValueError(f"{path}: expected {wanted}, found {error}") from error
 
 
 def load_script(root: Path, path: Path, text: str, described: bool) -> tuple[Callable, Callable | None]:
@@ -111,7 +127,7 @@ def fingerprint_of(root: Path, path: Path, text: str, version: int) -> str:
         return _only_imports(node, ("gsjax", root.resolve().name))
 
     beside = sorted(other for other in path.parent.glob("*.py") if other.name != path.name)
-    helpers = [_without(other.read_text(encoding="utf-8"), moves) for other in beside]
+    helpers = [_without(read_script(other), moves) for other in beside]
     script = _without(text, lambda node: moves(node) or _is_figure(node))
     return hashlib.sha256("\n".join([str(version), script, *helpers]).encode()).hexdigest()[:16]
 

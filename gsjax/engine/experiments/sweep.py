@@ -22,7 +22,7 @@ from gsjax.engine.experiments.config import (
     read_config,
 )
 from gsjax.engine.experiments.records import RESULTS, committed_rows, read_record
-from gsjax.engine.experiments.script import fingerprint_of, load_script, made_with_of
+from gsjax.engine.experiments.script import fingerprint_of, load_script, made_with_of, read_script
 
 RESERVED = ("seed", "seconds")
 """Names that a row uses besides options and figures, so neither may have them."""
@@ -163,7 +163,7 @@ def read_experiment(root: Path, name: str, out: Path) -> Experiment:
         raise ValueError(f"{root}: no experiment {name!r}; available: {known}")
     path = root / name / CONFIG
     config, columns, figure = read_config(path, root)
-    cells, text = _cells(config, path), (path.parent / config.script).read_text(encoding="utf-8")
+    cells, text = _cells(config, path), read_script(path.parent / config.script)
     return Experiment(name, root, out / name, config, columns, figure, cells, text)
 
 

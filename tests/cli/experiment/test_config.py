@@ -98,12 +98,27 @@ def test_a_bad_config_is_one_sentence(toy, gsjax, changes, says):
     assert says in err
 
 
-@pytest.mark.parametrize("text", ["claim: [", "claim: a: b", "- 1", "", "claim: \x00"])
+@pytest.mark.parametrize(
+    "text",
+    ["claim: [", "claim: a: b", "- 1", "", "claim: \x00", "source: 2024-02-30", "claim: " + 2000 * "["],
+    ids=range(7),
+)
 def test_a_config_that_is_no_mapping(toy, gsjax, text):
     (toy() / "config.yaml").write_text(text)
     code, _, err = gsjax("run", "toy")
     assert code == 2
     assert "experiments/toy/config.yaml: expected " in err
+
+
+@pytest.mark.parametrize("name", ["sweep.py", "helper.py"])
+def test_a_script_is_in_the_encoding_that_it_declares(toy, gsjax, name):
+    path = toy() / name
+    path.write_bytes(SCRIPT.encode() + b"# caf\xe9\n")
+    code, _, err = gsjax("run", "toy")
+    assert code == 2
+    assert f"experiments/toy/{name}: expected a script in UTF-8, or in the encoding" in " ".join(err.split())
+    path.write_bytes(b"# -*- coding: latin-1 -*-\n" + path.read_bytes())
+    assert gsjax("run", "toy")[0] == 0
 
 
 def test_list_shows_the_sound_ones_beside_a_broken_one(toy, gsjax):
