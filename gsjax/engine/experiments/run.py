@@ -174,8 +174,9 @@ def choose(experiment: Experiment, seeds: tuple[int, ...], only: tuple[str, ...]
         key, sign, value = text.partition("=")
         if not sign:
             raise ValueError(f"--only: expected KEY=VALUE, found {text!r}")
-        with contextlib.suppress(ValueError):  # 1e-3 and 0.001 are the same
-            value = in_words(json.loads(value))
+        if value not in [cell.words.get(key) for cell in experiment.cells]:
+            with contextlib.suppress(ValueError):  # 1e-3 and 0.001 are the same
+                value = in_words(json.loads(value))
         wanted.setdefault(key, set()).add(value)
     words = [cell.words for cell in experiment.cells]
     for key, values in wanted.items():

@@ -166,6 +166,12 @@ def test_only(toy, seeds, only, chosen):
     assert len(choose(experiment, seeds, only)) == chosen
 
 
+def test_text_that_looks_like_a_number_can_be_chosen(toy):
+    toy(grid={"version": ["1.10", "1.9"]})
+    experiment = read_experiment(Path("experiments"), "toy", Path("runs"))
+    assert [cell.options["version"] for cell in choose(experiment, (), ("version=1.10",))] == ["1.10"]
+
+
 @pytest.mark.parametrize(
     ("options", "says"),
     [
