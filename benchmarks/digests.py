@@ -111,9 +111,10 @@ def describe_file(path: Path) -> dict[str, Any]:
     settings, only their existence is recorded."""
     if path.suffix in (".npz", ".ply", ".png"):
         arrays = {name: array for name, array in _arrays(path) if name not in _VOLATILE_ARRAYS}
+        texts = {name for name, array in arrays.items() if array.dtype.kind == "U" and array.ndim == 0}
         return {
             "arrays": {
-                name: describe_text(str(array)) if array.dtype.kind == "U" else describe_array(array)
+                name: describe_text(str(array)) if name in texts else describe_array(array)
                 for name, array in arrays.items()
             }
         }

@@ -8,7 +8,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from benchmarks.digests import array_difference, compare, describe_array, describe_run, without_volatile
+from benchmarks.digests import (
+    array_difference,
+    compare,
+    describe_array,
+    describe_file,
+    describe_run,
+    without_volatile,
+)
 from benchmarks.yardstick import CASES, main, print_comparison
 from gsjax.io.ply import write_ply
 from gsjax.scene.gaussians import Gaussians
@@ -75,6 +82,12 @@ def test_a_bit_in_one_value_is_a_difference():
     assert one["sha256"] != another["sha256"]
     gap = np.sqrt(np.mean(np.subtract(one["sketch"], another["sketch"]) ** 2))
     assert gap == pytest.approx(float(other[7]) - float(array[7]), rel=1e-3)
+
+
+def test_names_in_another_order_are_a_difference(tmp_path):
+    for name, names in (("a", ["0/0", "1/0"]), ("b", ["1/0", "0/0"])):
+        np.savez(tmp_path / f"{name}.npz", names=np.array(names))
+    assert describe_file(tmp_path / "a.npz") != describe_file(tmp_path / "b.npz")
 
 
 def test_missing_files_arrays_and_cases_are_named(before):
