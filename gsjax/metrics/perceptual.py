@@ -87,6 +87,7 @@ _VGG16 = _Network(
     least_side=16,
 )
 _NETWORKS = {network.name: network for network in (_ALEXNET, _VGG16)}
+_USED = {name for network in _NETWORKS.values() for name in network.shapes}
 
 
 class LpipsWeights(NamedTuple):
@@ -265,7 +266,7 @@ def _read_safetensors(file: Path) -> dict[str, np.ndarray]:
     header = json.loads(data[8:start])
     arrays = {}
     for name, entry in header.items():
-        if name == "__metadata__":
+        if name not in _USED:  # it may have a type that numpy lacks
             continue
         if entry["dtype"] not in _DTYPES:
             raise ValueError(f"{name}: expected {' or '.join(_DTYPES)}, found {entry['dtype']}")

@@ -205,3 +205,9 @@ def test_a_damaged_safetensors_file_is_named(alexnet, tmp_path):
     write_safetensors(file, {"features.0.weight": np.zeros((64, 3, 3, 3), np.int64)})
     with pytest.raises(ValueError, match=r"features\.0\.weight: expected F64 or F32 or F16, found I64"):
         load_lpips(file)
+
+
+def test_other_arrays_may_have_any_type(alexnet, tmp_path):
+    file = tmp_path / "w.safetensors"
+    write_safetensors(file, alexnet | {"bn.num_batches_tracked": np.zeros(1, np.int64)})
+    assert load_lpips(file).network == "AlexNet"
