@@ -198,7 +198,8 @@ def test_a_damaged_safetensors_file_is_named(alexnet, tmp_path):
     write_safetensors(file, {name: array.astype(np.float16) for name, array in alexnet.items()})
     assert load_lpips(file).network == "AlexNet"
     whole = file.read_bytes()
-    for data in (whole[:-100], whole[:40], b"\xff" * 64, b""):
+    deep = (100_000).to_bytes(8, "little") + b"[" * 100_000
+    for data in (whole[:-100], whole[:40], b"\xff" * 64, b"", deep):
         file.write_bytes(data)
         with pytest.raises(ValueError, match=r"w\.safetensors: expected named arrays"):
             load_lpips(file)
@@ -211,3 +212,14 @@ def test_other_arrays_may_have_any_type(alexnet, tmp_path):
     file = tmp_path / "w.safetensors"
     write_safetensors(file, alexnet | {"bn.num_batches_tracked": np.zeros(1, np.int64)})
     assert load_lpips(file).network == "AlexNet"
+
+
+@pytest.mark.thorough
+def test_a_damaged_npz_is_named(tmp_path):
+    file = tmp_path / "w.npz"
+    np.savez_compressed(file, **{"features.0.weight": np.zeros((64, 3, 11, 11), np.float32)})
+    whole = file.read_bytes()
+    for at in range(len(whole)):
+        file.write_bytes(whole[:at] + bytes([whole[at] ^ 1]) + whole[at + 1 :])
+        with pytest.raises(ValueError, match=r"w\.npz: expected"):
+            load_lpips(file)  # undamaged, too: the heads are missing
