@@ -238,8 +238,9 @@ def _comparable_fits(members: Mapping[str, Record], views: list[str], notes: lis
 def _missing_scores(records: Mapping[str, Record]) -> list[str]:
     """Notes on the fits without MS-SSIM or LPIPS, and on how to get them."""
     judged = [label for label, record in records.items() if _held_out(record)]
-    never = [label for label in judged if records[label].evaluation is None]
-    blind = [label for label in judged if "absent" in (records[label].evaluation or {}).get("lpips", {})]
+    found = {label: records[label].evaluation or {} for label in judged}
+    never = [n for n in judged if all(row["split"] != "held out" for row in found[n].get("views", ()))]
+    blind = [n for n in judged if n not in never and "absent" in found[n]["lpips"]]
     notes = []
     if never:
         words = "gsjax eval RUN adds them (LPIPS with --lpips-weights PATH; see docs/scores.md)"

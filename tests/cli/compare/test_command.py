@@ -193,6 +193,17 @@ def test_what_is_not_alike_is_left_out_and_said(make, gsjax_compare):
     assert "MS-SSIM and LPIPS are absent for d: gsjax eval RUN adds them" in notes
 
 
+def test_a_run_whose_training_views_alone_were_evaluated_is_named(make, gsjax_compare):
+    a, b = (make(name, evaluated=("w", 0.3, 0.2, 0.1)) for name in "ab")
+    file = a / "eval" / "metrics.json"
+    found = json.loads(file.read_text())
+    found["views"] = [row for row in found["views"] if row["split"] == "train"]
+    file.write_text(json.dumps(found))
+    assert "MS-SSIM and LPIPS are absent for a: gsjax eval RUN adds them" in " ".join(
+        gsjax_compare(a, b)[2]["notes"]
+    )
+
+
 @pytest.mark.thorough
 def test_runs_of_the_tracker_are_compared_and_kinds_not_mixed(
     make, gsjax_compare, recording, still, gsjax_track, tmp_path
