@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from gsjax.engine.compare.data import SCORES, data_in_words, data_of
+from gsjax.engine.compare.data import MUST_SHARE, SCORES, data_in_words, data_of
 from gsjax.engine.folder import flattened
 from gsjax.engine.machine import name as machine_name
 from gsjax.engine.records import Kind, Record
@@ -103,7 +103,7 @@ def compare(records: Sequence[Record], same_views: Callable[[list[Record], str],
             comparable = _comparable_fits(members, group.views, notes)
         else:
             scores |= {label: _scores(record) for label, record in members.items()}
-            comparable = {score.key for score in SCORES[kind]}
+            comparable = {score.key for score in SCORES[kind]} - _incomparable(kind, members, scores, notes)
         if len(members) > 1 and len({_machine(record) for record in members.values()} - {None}) > 1:
             notes.append(f"{', '.join(members)}: run on different machines; time is not compared.")
             comparable -= {score.key for score in SCORES[kind] if score.of == "machine"}
@@ -233,6 +233,33 @@ def _comparable_fits(members: Mapping[str, Record], views: list[str], notes: lis
         notes.append(f"{', '.join(members)}: LPIPS is of different weights and not compared.")
         keys -= {"lpips"}
     return keys
+
+
+def _incomparable(
+    kind: Kind, members: Mapping[str, Record], scores: Mapping[str, Mapping[str, Any]], notes: list[str]
+) -> set[str]:
+    """Keys of the scores that these runs cannot be compared by, because their settings differ."""
+    apart: set[str] = set()
+    for names, keys in MUST_SHARE.get(kind, {}).items():
+        judged = [label for label in members if any(scores[label][key] is not None for key in keys)]
+        settings = [_resolved(members[label]) for label in judged]
+        if differing := [n for n in names if len({repr(one.get(n)) for one in settings}) > 1]:
+            options = ", ".join(f"--{name.replace('_', '-')}" for name in differing)
+            known = [
+                s for s in SCORES[kind] if s.key in keys and any(scores[n][s.key] is not None for n in judged)
+            ]
+            heads = ", ".join(score.head for score in known)
+            notes.append(f"{', '.join(judged)}: different {options}; not compared: {heads}.")
+            apart |= {*keys}
+    return apart
+
+
+def _resolved(record: Record) -> dict[str, Any]:
+    """The settings of a run by their options, with the features that "auto" stood for."""
+    settings = flattened(record.config)
+    if settings.get("features") == "auto":
+        settings["features"] = (record.metrics or {}).get("features")
+    return settings
 
 
 def _missing_scores(records: Mapping[str, Record]) -> list[str]:

@@ -19,6 +19,17 @@ SCORES: dict[Kind, tuple[Score, ...]] = {
     "deform": DEFORM,
 }
 """The cards of each command's report."""
+_OF_PIXELS = ("psnr_masked", "ssim", "depth_mm", "psnr_other", "f_psnr", "iou", "tracks_mm")
+_TEACHER = ("features", "masks", "level", "sam", "weights")
+MUST_SHARE: dict[Kind, dict[tuple[str, ...], tuple[str, ...]]] = {
+    "deform": {
+        ("tools", "tool_values"): _OF_PIXELS,
+        _TEACHER: ("f_psnr", "iou"),
+        ("deform.channels",): ("f_psnr",),
+    },
+    "distill": {(*_TEACHER, "snap"): ("cosine",)},
+}
+"""For each command, settings that runs must share, and the scores that cannot be compared otherwise."""
 
 
 def data_of(kind: Kind, found: Metrics) -> tuple[Any, ...]:

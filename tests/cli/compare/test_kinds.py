@@ -33,6 +33,37 @@ def test_scores_of_parts_are_means_over_those_whose_truth_is_known(tmp_path):
     assert found["point_error_mm"] == pytest.approx(20.0)
 
 
+@pytest.mark.parametrize(
+    ("kind", "settings", "says"),
+    [
+        ("deform", {"deform": {"channels": 32}}, "--deform.channels; not compared: f-PSNR."),
+        ("deform", {"features": "clip"}, "--features; not compared: f-PSNR, IoU of classes."),
+        (
+            "deform",
+            {"tools": "leave-out"},
+            "--tools; not compared: PSNR masked, SSIM, depth error, f-PSNR, IoU of classes.",
+        ),
+        ("distill", {"features": "clip"}, "--features; not compared: cosine to the teacher."),
+        ("distill", {"features": "classes"}, None),  # what "auto" stands for here
+    ],
+)
+def test_scores_of_other_pixels_channels_or_teachers_are_not_compared(tmp_path, kind, settings, says):
+    runs = [write_run(tmp_path / "a", kind, 20.0), write_run(tmp_path / "b", kind, 25.0, **settings)]
+    for run, shift in zip(runs, (0.0, 0.1), strict=True):
+        found = json.loads((run / "metrics.json").read_text())
+        scores = found["test"] | ({"f_psnr": 26.0, "iou": 0.5} if kind == "deform" else {})
+        found |= {"features": "classes", "test": {key: value + shift for key, value in scores.items()}}
+        (run / "metrics.json").write_text(json.dumps(found))
+    assert main(["compare", *map(str, runs), "--out", str(tmp_path / "out")]) == 0
+    found = json.loads((tmp_path / "out" / "comparison.json").read_text())
+    heads = {score.head for score in SCORES[kind] if score.key in found["groups"][0]["best"]}
+    if says is None:
+        assert heads == {"cosine to the teacher"}
+    else:
+        assert f"a, b: different {says}" in found["notes"]
+        assert not {head for head in heads if head in says}
+
+
 def test_kinds_are_not_mixed_and_time_means_minutes_of_steps_and_compiling(tmp_path, capfd):
     parts, deform = write_run(tmp_path / "a", "parts", 20.0), write_run(tmp_path / "b", "deform", 20.0)
     assert main(["compare", str(parts), str(deform)]) == 2
