@@ -30,7 +30,7 @@ class LabelOverlap:
     true: dict[int, int] = field(default_factory=dict)
 
     def add(self, predicted: Integer[np.ndarray, "..."], true: Integer[np.ndarray, "..."]) -> None:
-        """Count one image [H, W]. Pixels whose true label is -1 are ignored.
+        """Count one image [H, W]. Pixels whose true label is -1 are ignored; -1 predicts no label.
 
         Raises:
             ValueError: the two differ in shape.
@@ -41,7 +41,7 @@ class LabelOverlap:
         scored = true != IGNORED_LABEL
         predicted, true = predicted[scored], true[scored]
         _count(self.intersections, predicted[predicted == true])
-        _count(self.predicted, predicted)
+        _count(self.predicted, predicted[predicted != IGNORED_LABEL])
         _count(self.true, true)
 
     @property

@@ -64,6 +64,13 @@ def test_unknown_pixels_and_labels_never_seen_score_nothing():
     assert math.isnan(LabelOverlap().mean_iou())
 
 
+def test_unknown_predictions_miss_but_are_no_class_of_their_own():
+    overlap = LabelOverlap()
+    overlap.add(np.array([[1, -1, 2]]), np.array([[1, 1, 2]]))
+    assert overlap.labels == [1, 2]
+    assert overlap.mean_iou() == pytest.approx((0.5 + 1) / 2)
+
+
 def test_masks_and_shapes():
     assert iou_of_masks(np.array([True, True, False]), np.array([False, True, False])) == 0.5
     assert math.isnan(iou_of_masks(np.zeros(3, bool), np.zeros(3, bool)))
