@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from rich.console import Console
+from rich.text import Text
 
 from benchmarks.floors import TILE, Floors, measure_floors
 from benchmarks.growth import draw_growth, write_growth
@@ -165,8 +166,8 @@ def run(options: Options, suite: list[Workload] | None = None) -> int:
             code = int(any(row.verdict in FAILING for row in rows))
     if options.update_baseline and finished:
         write_sorted(path, merged(record, baseline))
-        console.print(f"[bold]baseline[/]  {path}", soft_wrap=True)
-    console.print(f"[bold]results[/]   {out / 'results.md'}", soft_wrap=True)
+        console.print(Text.assemble(("baseline", "bold"), f"  {path}"), soft_wrap=True)
+    console.print(Text.assemble(("results", "bold"), f"   {out / 'results.md'}"), soft_wrap=True)
     return code
 
 
@@ -184,7 +185,7 @@ def _run_all(
                     result = measure(known[name], repeats, say=status.update)
                 except FileNotFoundError as error:
                     found.notes.append(f"{name}: skipped, {error}")
-                    console.print(f"[yellow]{name}: skipped[/], {error}", soft_wrap=True)
+                    console.print(Text.assemble((f"{name}: skipped", "yellow"), f", {error}"), soft_wrap=True)
                     continue
                 rows = result.as_rows()
                 found.rows += rows
@@ -194,7 +195,7 @@ def _run_all(
                 found.sweeps[name] = known[name].sweeps
                 print_rows(console, rows, head=first)
                 for note in result.notes:
-                    console.print(f"[yellow]{note}[/]", soft_wrap=True)
+                    console.print(Text(note, "yellow"), soft_wrap=True)
             else:
                 before = floors or measure_floors()
                 row, floors = measure_step(name, repeats, before)

@@ -128,7 +128,9 @@ def run(options: Options) -> int:
             if now.step == solved < total:
                 write_field(folder.path / NAME, now.result)
                 ask = f"gsjax query {out} {asked_by(teaching.source.kind)}"
-                console.print(f"a first answer is there: {ask}, or gsjax view {out}", soft_wrap=True)
+                console.print(
+                    f"a first answer is there: {ask}, or gsjax view {out}", markup=False, soft_wrap=True
+                )
 
         watch(ticks, progress, schedule, folder, console, budget=budget, evaluate=first_answer)
         steps, result = ticks.run.step, ticks.result

@@ -150,6 +150,13 @@ def test_when_every_cell_fails_nothing_is_collected(toy, gsjax):
     assert not (folder / "results.json").exists()
 
 
+def test_a_folder_in_brackets_is_named_as_it_is(toy, gsjax):
+    toy().parent.rename("[old]")
+    code, out, _ = gsjax("run", "toy", "--root", "[old]")
+    assert code == 0
+    assert "results  [old]/toy/results.html" in out
+
+
 @pytest.mark.parametrize(
     ("seeds", "only", "chosen"),
     [

@@ -23,7 +23,7 @@ from tests.io.scenes_to_write import ROUNDING, assert_alike
 
 @pytest.mark.parametrize("ending", FORMATS)
 def test_a_file_in_every_format(export, ply, ending):
-    out = ply.parent / "made" / f"scene{ending}"
+    out = ply.parent / "[made]" / f"scene{ending}"
     code, said = export(ply, out)
     assert code == 0
     assert f"scene {out}: 30 Gaussians, {FORMATS[ending].name}, " in said
