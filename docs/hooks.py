@@ -46,9 +46,10 @@ def on_page_content(content, page, **_):
     """The page's HTML with MathML in place of LaTeX, and figures where the site will have them."""
 
     def figure(found: re.Match) -> str:
-        if not (_ROOT / found[1]).is_file():
+        if (_ROOT / found[1]).is_file():
+            _shown.add(found[1])
+        else:
             _log.warning(f"{page.file.src_uri}: there is no {found[1]}")
-        _shown.add(found[1])
         return get_relative_url(found[1], page.url)
 
     return _FIGURE.sub(figure, _MARKED.sub(_mathml, content))
