@@ -16,9 +16,10 @@ from rich.live import Live
 from scipy.spatial.transform import Rotation
 
 from gsjax.data.consistency import check_recording
+from gsjax.data.errors import DataError
 from gsjax.data.opencv_cameras import open_camera, snapshots
 from gsjax.data.realsense_camera import open_realsense
-from gsjax.data.stream import Arrival, NewestSnapshots, Snapshot, replay
+from gsjax.data.stream import Arrival, NewestSnapshots, Snapshot, StreamStalled, replay
 from gsjax.engine.drive import Tick
 from gsjax.engine.ending import completion, exit_code
 from gsjax.engine.first_mask import first_mask, label_names, placed, warn_of_missing
@@ -37,7 +38,10 @@ from gsjax.methods.track import PLAN, PRESETS, TrackedScene, start_scene
 from gsjax.perception.segmenters import PlaneOrRegionSegmenter
 from gsjax.scene.frame import Frame
 
-_CAMERAS = {"camera": open_camera, "realsense": open_realsense}
+_CAMERAS = {
+    "camera": lambda number, patience: open_camera(number),
+    "realsense": lambda number, patience: open_realsense(number, patience=patience),
+}
 _MEMORY_EVERY_S = 1.0
 _SHOWN_EVERY = 15  # updates
 CONFIG = PRESETS["fast"]  # how a scene starts; what follows is chosen for the budget
@@ -142,9 +146,11 @@ def _open(options: Options, console: Console, notes: Notes) -> Source:
         number = options.source.removeprefix(f"{kind}:")
         if not number.isdecimal():
             raise ValueError(f"SOURCE: expected {kind}:NUMBER, as in {kind}:0, found {options.source}")
-        camera = _CAMERAS[kind](int(number))
+        camera = _CAMERAS[kind](int(number), options.patience)
         arriving = snapshots([camera])
-        first, drawing, stream = next(arriving).frame, nullcontext(), lambda: arriving
+        if (begins := next(arriving, None)) is None:
+            raise DataError(options.source, "a frame", "none", "Check its connection.")
+        first, drawing, stream = begins.frame, nullcontext(), lambda: arriving
         image, depth = np.asarray(first.images[0]), np.asarray(first.depths)[0]
         labels = PlaneOrRegionSegmenter()((255 * image).astype(np.uint8), depth, camera.K).astype(np.int32)
         recording, mask, index, names = None, None, 0, {}
@@ -304,6 +310,9 @@ def follow(options: Options, source: Source, log: Log, console: Console) -> Base
             yield arrival.snapshot.frame
             if perf_counter() - begun > 60 * options.minutes:
                 return
+        if _camera(options.source):
+            offered = newest.counts.offered
+            raise StreamStalled(f"{options.source}: no frame after the first {offered}; check its connection")
 
     try:
         console.print(MEASURING)

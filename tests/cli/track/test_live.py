@@ -2,14 +2,18 @@
 
 import json
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from rich.console import Console
 
 import gsjax.data.stream
 from gsjax.cli import main
+from gsjax.data.opencv_cameras import RgbdCamera
+from gsjax.data.stream import Snapshot, StreamStalled
 from gsjax.engine.track import live as engine
 from gsjax.io.pictures import write_png
 from gsjax.methods.track import start_scene
@@ -108,6 +112,29 @@ def test_what_cannot_be_followed_is_said(pristine, live, source, options, says):
     code, said, _ = live(pristine if source is None else source, *options)
     assert code == 2
     assert says in " ".join(said.split())
+
+
+def test_a_camera_that_delivers_no_frame_is_named(live, monkeypatch):
+    silent = RgbdCamera(SimpleNamespace(grab=lambda: False), np.eye(3), np.eye(4))
+    monkeypatch.setitem(engine._CAMERAS, "camera", lambda number, patience: silent)
+    code, said, _ = live("camera:0")
+    assert (code, "camera:0: expected a frame, found none" in said) == (2, True)
+
+
+@pytest.mark.parametrize(("source", "ends"), [("camera:0", True), ("recording", False)])
+def test_only_a_recording_may_end_by_itself(monkeypatch, source, ends):
+    def untracked(scene, first, frames, config, **how):
+        for _ in frames:
+            pass
+        yield from ()
+
+    monkeypatch.setattr(engine, "track", untracked)
+    rehearsal, arriving = SimpleNamespace(tick=None), iter([Snapshot(None, 1.0), Snapshot(None, 2.0)])
+    stream = engine.Source(None, None, {}, rehearsal, arriving)
+    log, options = engine.Log((0, 5), {}), engine.Options(source, Path("run"))
+    stopped = engine.follow(options, stream, log, Console(quiet=True))
+    assert log.counts["offered"] == 2
+    assert isinstance(stopped, StreamStalled) == ends, stopped
 
 
 @pytest.mark.thorough
