@@ -92,6 +92,16 @@ def test_a_stalled_stream_raises_an_error():
     never.set()
 
 
+def test_patience_may_be_endless():
+    begun = threading.Event()
+
+    def source():
+        begun.wait(0.05)
+        yield snapshot(0)
+
+    assert len(list(NewestSnapshots(source(), patience=math.inf))) == 1
+
+
 def test_an_exception_of_the_source_is_raised_in_the_consumer():
     def source():
         yield snapshot(0)
@@ -121,6 +131,11 @@ def test_a_replay_keeps_its_rate_whatever_the_processing_time():
         clock[0] += 0.04  # processing time
     assert stamps == [(0, 0.1, 0.1), (1, 0.2, 0.2), (2, 0.3, 0.3), (1, 0.4, 0.4), (0, 0.5, 0.5)]
     np.testing.assert_allclose(naps, [0.1, 0.06, 0.06, 0.06, 0.06], atol=1e-9)
+
+
+def test_a_replay_may_be_endless():
+    shots = replay([FRAME], 1e3, math.inf, sleep=lambda seconds: None)
+    assert [shot.stamp for shot in itertools.islice(shots, 3)] == [0.001, 0.002, 0.003]
 
 
 class FakeCapture:

@@ -4,6 +4,7 @@ from collections.abc import Iterator
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from functools import partial
+from math import isinf
 from pathlib import Path
 from time import perf_counter
 from typing import Annotated, Any, NamedTuple
@@ -125,6 +126,8 @@ def run(options: Options) -> int:
 
 def _check(options: Options) -> None:
     expect_positive(options, "hz", "patience", "budget_ms")
+    if isinf(options.hz):
+        raise ValueError("--hz: expected a finite number of frames per second, found inf")
     if _camera(options.source):
         default = Options(options.source, options.out)
         for name in ("cameras", "mask_camera", "frames", "masks", "scale", "read"):

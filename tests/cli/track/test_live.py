@@ -105,6 +105,7 @@ def test_a_group_goes_where_it_is_carried_whatever_joins_it():
         ("camera:97", (), "replay a folder"),
         ("camera:0", ("--cameras", "1"), "--cameras: applies to recordings"),
         (None, ("--hz", "0"), "--hz: expected more than 0"),
+        (None, ("--hz", "inf"), "--hz: expected a finite number of frames per second, found inf"),
         (None, ("--cameras", "9"), "has no camera 9"),
     ],
 )
