@@ -244,9 +244,7 @@ def test_a_realsense_camera_gives_metres_and_red_green_blue(monkeypatch):
     np.testing.assert_allclose(shots[0].frame.images[0, 0, 0], [0, 0, 1])
 
 
-@pytest.mark.parametrize(
-    ("patience", "milliseconds"), [(0.5, 500), (30.0, 30_000), (math.inf, 2**31 - 1)]
-)
+@pytest.mark.parametrize(("patience", "milliseconds"), [(0.5, 500), (30.0, 30_000), (math.inf, 2**31 - 1)])
 def test_a_realsense_camera_is_waited_for_as_long_as_asked(monkeypatch, patience, milliseconds):
     fake = FakeRealSense(frames=0)
     monkeypatch.setitem(sys.modules, "pyrealsense2", fake)
