@@ -291,7 +291,7 @@ def _note_unscored(
         if scored["gaussians"] == 0:
             notes.add(f"{name}: not tracked, because it is not in the first mask.")
         elif sequence.truth is not None and scored["gaussians_scored"] == 0:
-            posed = name in sequence.truth.names
+            posed = values is not None and scored["label"] in sequence.truth.label_ids
             why = "no Gaussian certainly belongs to it" if posed else "the ground truth has no pose of it"
             notes.add(f"{name}: motion not scored, {why}.")
     if tracking.chosen is not None and not tracking.chosen.fits:
