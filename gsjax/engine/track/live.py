@@ -38,6 +38,7 @@ from gsjax.engine.track.tracking import track
 from gsjax.methods.track import PLAN, PRESETS, TrackedScene, start_scene
 from gsjax.perception.segmenters import PlaneOrRegionSegmenter
 from gsjax.scene.frame import Frame
+from gsjax.scene.origin import in_world
 
 _CAMERAS = {
     "camera": lambda number, patience: open_camera(number),
@@ -83,6 +84,8 @@ class Source(NamedTuple):
         names: name of each mask value.
         rehearsal: compiles the first settings that are measured.
         snapshots: the stream, which begins when it is first iterated over.
+        origin: the point that positions are relative to, [3], in the recording's coordinates; None if they
+            are as in the recording.
     """
 
     first: Frame
@@ -90,6 +93,7 @@ class Source(NamedTuple):
     names: dict[int, str]
     rehearsal: Rehearsal
     snapshots: Iterator[Snapshot]
+    origin: np.ndarray | None = None
 
 
 @releasing_locks()
@@ -119,7 +123,9 @@ def run(options: Options) -> int:
         }
         folder.write_metrics(found)
         if log.rows:
-            folder.write_trajectory(**log.trajectory())
+            moved = log.trajectory()
+            centers = in_world(moved["centers"], source.origin)
+            folder.write_trajectory(**moved | {"centers": centers})
     print_facts(_facts(found) | {"written": str(folder.path)})
     return exit_code(stopped)
 
@@ -176,7 +182,8 @@ def _open(options: Options, console: Console, notes: Notes) -> Source:
         scene = start_scene(first, labels, index, CONFIG, before_fit=rehearsal.begin)
     if recording is not None and mask is not None:
         warn_of_missing(recording, mask, scene.label_ids, notes)
-    return Source(first, scene, names, rehearsal, stream())
+    origin = None if recording is None else recording.tracked.origin
+    return Source(first, scene, names, rehearsal, stream(), origin)
 
 
 def _replayed(recording: Recording, options: Options, console: Console) -> Iterator[Snapshot]:

@@ -12,11 +12,13 @@ from rich.console import Console
 
 import gsjax.data.stream
 from gsjax.cli import main
+from gsjax.data import open_sequence, write_panoptic
 from gsjax.data.opencv_cameras import RgbdCamera
 from gsjax.data.stream import Snapshot, StreamStalled
 from gsjax.engine.track import live as engine
 from gsjax.io.pictures import write_png
 from gsjax.methods.track import start_scene
+from gsjax.scene.origin import about
 from tests.cli.conftest import still_tick
 
 
@@ -79,6 +81,17 @@ def test_a_recording_is_replayed_and_all_frames_are_accounted_for(pristine, live
     code, said, _ = live(pristine, "--minutes", "0.01", "--cameras", "0", "1")
     assert code == 2
     assert "holds a finished run" in said
+
+
+@pytest.mark.thorough
+def test_positions_in_a_recording_far_from_0_are_its_own(pristine, live, tmp_path):
+    table, far = open_sequence(pristine), np.array([5e5, 5e6, 300.0])
+    moved = replace(table, viewmats=about(table.viewmats, -far), truth=None)
+    write_panoptic(moved, tmp_path / "far")
+    code, said, folder = live(tmp_path / "far", "--minutes", "0.01", "--hz", "20", "--cameras", "0")
+    assert code == 0, said
+    with np.load(folder / "trajectory.npz") as stored:
+        assert np.abs(stored["centers"] - far).max() < 1e3
 
 
 def test_a_group_goes_where_it_is_carried_whatever_joins_it():
