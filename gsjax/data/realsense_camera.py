@@ -11,8 +11,8 @@ from gsjax.data.errors import DataError
 from gsjax.data.lens import intrinsics_matrix
 from gsjax.data.opencv_cameras import RgbdCamera
 
-_PATIENCE_MS = 5000
 _MILLIMETRES = 1e3
+_LONGEST_MS = 2**31 - 1
 
 
 class RealSenseCapture:
@@ -23,12 +23,14 @@ class RealSenseCapture:
     Args:
         rs: the module pyrealsense2.
         serial: the camera's serial number.
+        patience: longest wait for a frame, seconds.
 
     Raises:
         RuntimeError: the camera does not start.
     """
 
-    def __init__(self, rs: Any, serial: str):
+    def __init__(self, rs: Any, serial: str, patience: float = 5.0):
+        self._patience_ms = int(min(1e3 * patience, _LONGEST_MS))
         config, self._pipeline = rs.config(), rs.pipeline()
         config.enable_device(serial)
         config.enable_stream(rs.stream.depth, rs.format.z16)
@@ -50,7 +52,7 @@ class RealSenseCapture:
 
     def grab(self) -> bool:
         """Wait for the next frame; False if none comes."""
-        arrived, frames = self._pipeline.try_wait_for_frames(_PATIENCE_MS)
+        arrived, frames = self._pipeline.try_wait_for_frames(self._patience_ms)
         self._frames = self._align.process(frames) if arrived else None
         return bool(arrived)
 
@@ -67,12 +69,15 @@ class RealSenseCapture:
         return True, self._to_millimetres * pixels if is_depth else pixels
 
 
-def open_realsense(index: int, viewmat: Float[np.ndarray, "4 4"] | None = None) -> RgbdCamera:
+def open_realsense(
+    index: int, viewmat: Float[np.ndarray, "4 4"] | None = None, patience: float = 5.0
+) -> RgbdCamera:
     """Open a RealSense camera, with depth registered to colour.
 
     Args:
         index: its number among the connected cameras, from 0.
         viewmat: world to camera, [4,4]; default: the world frame is the camera's own.
+        patience: longest wait for a frame, seconds.
 
     Raises:
         DataError: there is no such camera, or it does not start.
@@ -87,7 +92,8 @@ def open_realsense(index: int, viewmat: Float[np.ndarray, "4 4"] | None = None) 
         devices = list(rs.context().query_devices())
         if index >= len(devices):
             raise DataError(what, "a RealSense camera", f"{len(devices)} that are connected", advice)
-        capture = RealSenseCapture(rs, devices[index].get_info(rs.camera_info.serial_number))
+        serial = devices[index].get_info(rs.camera_info.serial_number)
+        capture = RealSenseCapture(rs, serial, patience)
     except RuntimeError as error:
         raise DataError(what, "a RealSense camera", f"one that does not start ({error})", advice) from None
     return RgbdCamera(capture, capture.K, np.eye(4) if viewmat is None else viewmat)

@@ -4,6 +4,8 @@ A source is any iterator of `Snapshot`s that blocks until one is available: a re
 cameras read through OpenCV, or a user-defined iterator. `NewestSnapshots` reads it in a thread of its own.
 """
 
+import itertools
+import math
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -65,7 +67,7 @@ class NewestSnapshots:
     Args:
         source: the snapshots; an exception that it raises is re-raised in the consumer.
         max_skew: largest allowed time between the cameras of a snapshot, seconds.
-        patience: longest wait for a snapshot, seconds.
+        patience: longest wait for a snapshot, seconds; may be infinite.
 
     Raises:
         StreamStalled: while iterating, if no snapshot arrives within `patience`.
@@ -73,7 +75,8 @@ class NewestSnapshots:
 
     def __init__(self, source: Iterable[Snapshot], *, max_skew: float = 0.02, patience: float = 10.0):
         self.counts = Counts()
-        self._source, self._max_skew, self._patience = source, max_skew, patience
+        self._source, self._max_skew = source, max_skew
+        self._patience = min(patience, threading.TIMEOUT_MAX)  # locks take no more
         self._condition = threading.Condition()
         self._waiting: Arrival | None = None
         self._ended, self._error, self._closed = False, None, False
@@ -153,11 +156,12 @@ def replay(
     Args:
         frames: the frames of a recording.
         hz: frames per second.
-        seconds: duration.
+        seconds: duration; may be infinite.
         now, sleep: the clock.
     """
-    start = now()
-    for count, index in zip(range(1, round(hz * seconds) + 1), back_and_forth(len(frames)), strict=False):
+    start, length = now(), hz * seconds
+    counts = itertools.count(1) if math.isinf(length) else range(1, round(length) + 1)
+    for count, index in zip(counts, back_and_forth(len(frames)), strict=False):
         due = count / hz
         sleep(max(0.0, start + due - now()))
         yield Snapshot(frames[index], due)

@@ -1,5 +1,7 @@
 """The mask of the first frame, which defines the objects to track."""
 
+import re
+from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
@@ -149,8 +151,13 @@ def _check_not_empty(labels: np.ndarray, tracked: Sequence, c: int) -> None:
 
 
 def label_names(recording: Recording, source: str) -> dict[int, str]:
-    """The name of each mask value that has one; only the recording's own do."""
-    return {0: "background"} | (recording.tracked.names_of_labels if source in OWN_MASKS else {})
+    """The name of each mask value that has one; only the recording's own do. Names that differ in case or
+    punctuation at most have the value added, as in "cup (3)", because scores and queries go by name."""
+    own = recording.tracked.names_of_labels if source in OWN_MASKS else {}
+    plain = {value: " ".join(re.findall(r"[^\W_]+", name.lower())) for value, name in own.items()}
+    uses = Counter(plain.values())
+    names = {value: f"{name} ({value})" if uses[plain[value]] > 1 else name for value, name in own.items()}
+    return {0: "background"} | names
 
 
 def warn_of_missing(recording: Recording, mask: FirstMask, scene_ids: tuple[int, ...], notes: Notes) -> None:

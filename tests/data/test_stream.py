@@ -1,6 +1,7 @@
 """Live streams of frames: the newest frame is delivered, and all others are counted."""
 
 import itertools
+import math
 import sys
 import threading
 from types import ModuleType, SimpleNamespace
@@ -91,6 +92,16 @@ def test_a_stalled_stream_raises_an_error():
     never.set()
 
 
+def test_patience_may_be_endless():
+    begun = threading.Event()
+
+    def source():
+        begun.wait(0.05)
+        yield snapshot(0)
+
+    assert len(list(NewestSnapshots(source(), patience=math.inf))) == 1
+
+
 def test_an_exception_of_the_source_is_raised_in_the_consumer():
     def source():
         yield snapshot(0)
@@ -120,6 +131,11 @@ def test_a_replay_keeps_its_rate_whatever_the_processing_time():
         clock[0] += 0.04  # processing time
     assert stamps == [(0, 0.1, 0.1), (1, 0.2, 0.2), (2, 0.3, 0.3), (1, 0.4, 0.4), (0, 0.5, 0.5)]
     np.testing.assert_allclose(naps, [0.1, 0.06, 0.06, 0.06, 0.06], atol=1e-9)
+
+
+def test_a_replay_may_be_endless():
+    shots = replay([FRAME], 1e3, math.inf, sleep=lambda seconds: None)
+    assert [shot.stamp for shot in itertools.islice(shots, 3)] == [0.001, 0.002, 0.003]
 
 
 class FakeCapture:
@@ -180,7 +196,7 @@ class FakeRealSense(ModuleType):
 
     def __init__(self, frames=2, starts=True, depth=True):
         super().__init__("pyrealsense2")
-        self.left, self.starts, self.depth = frames, starts, depth
+        self.left, self.starts, self.depth, self.waits = frames, starts, depth, []
         self.stream = SimpleNamespace(depth="depth", color="color")
         self.format = SimpleNamespace(z16="z16", bgr8="bgr8")
         self.camera_info = SimpleNamespace(serial_number="serial number")
@@ -206,6 +222,7 @@ class FakeRealSense(ModuleType):
         )
 
     def try_wait_for_frames(self, milliseconds):
+        self.waits.append(milliseconds)
         self.left -= 1
         return self.left >= 0, {}
 
@@ -225,6 +242,14 @@ def test_a_realsense_camera_gives_metres_and_red_green_blue(monkeypatch):
     assert len(shots) == 2
     np.testing.assert_allclose(shots[0].frame.depths, np.full((1, 4, 6), 1.5), rtol=1e-6)
     np.testing.assert_allclose(shots[0].frame.images[0, 0, 0], [0, 0, 1])
+
+
+@pytest.mark.parametrize(("patience", "milliseconds"), [(0.5, 500), (30.0, 30_000), (math.inf, 2**31 - 1)])
+def test_a_realsense_camera_is_waited_for_as_long_as_asked(monkeypatch, patience, milliseconds):
+    fake = FakeRealSense(frames=0)
+    monkeypatch.setitem(sys.modules, "pyrealsense2", fake)
+    assert list(snapshots([open_realsense(0, patience=patience)])) == []
+    assert fake.waits == [milliseconds]
 
 
 @pytest.mark.parametrize(

@@ -35,7 +35,6 @@ from gsjax.viz.colors import captioned, label_color
 
 _WRITTEN = ("grasps.npz", "video.mp4", "frame_*.png")
 NO_GRASP = 3  # exit code: no frame has a feasible grasp
-_REACH = 0.35  # metres; what stays farther from the object's centroid is no obstacle
 _FEASIBLE, _INFEASIBLE = (84, 222, 130), (235, 110, 90)
 
 
@@ -154,8 +153,14 @@ def _obstacle_rows(options: Options, saved: SavedRun, answer: Answer, means: np.
     labels = np.asarray(saved.tracking.scene.labels)
     passed = [groups[name] for name in options.ignore if name in groups]
     chosen = ~np.isin(labels, [answer.group, *passed])
-    centers = means[:, answer.rows].mean(axis=1, keepdims=True)
-    near = (np.linalg.norm(means - centers, axis=-1) < _REACH).any(axis=0)
+    own, hand = means[:, answer.rows], options.gripper
+    centers = own.mean(axis=1, keepdims=True)
+    width = max(hand.palm_width, hand.max_width + 2 * hand.finger_thickness)
+    depth = max(hand.palm_depth, hand.finger_depth)
+    extent = math.hypot(hand.finger_height + hand.palm_height + hand.tip, width / 2, depth / 2)
+    # The hand lies within `extent` of the tool's origin, and that within `extent` of the object.
+    reach = np.linalg.norm(own - centers, axis=-1).max() + 2 * extent
+    near = (np.linalg.norm(means - centers, axis=-1) < reach).any(axis=0)
     solid = np.asarray(saved.tracking.scene.gaussians.opacities) > 0.5
     return np.flatnonzero(chosen & near & solid)
 

@@ -4,6 +4,7 @@ from collections.abc import Iterator
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from functools import partial
+from math import isinf
 from pathlib import Path
 from time import perf_counter
 from typing import Annotated, Any, NamedTuple
@@ -16,9 +17,10 @@ from rich.live import Live
 from scipy.spatial.transform import Rotation
 
 from gsjax.data.consistency import check_recording
+from gsjax.data.errors import DataError
 from gsjax.data.opencv_cameras import open_camera, snapshots
 from gsjax.data.realsense_camera import open_realsense
-from gsjax.data.stream import Arrival, NewestSnapshots, Snapshot, replay
+from gsjax.data.stream import Arrival, NewestSnapshots, Snapshot, StreamStalled, replay
 from gsjax.engine.drive import Tick
 from gsjax.engine.ending import completion, exit_code
 from gsjax.engine.first_mask import first_mask, label_names, placed, warn_of_missing
@@ -36,8 +38,12 @@ from gsjax.engine.track.tracking import track
 from gsjax.methods.track import PLAN, PRESETS, TrackedScene, start_scene
 from gsjax.perception.segmenters import PlaneOrRegionSegmenter
 from gsjax.scene.frame import Frame
+from gsjax.scene.origin import in_world
 
-_CAMERAS = {"camera": open_camera, "realsense": open_realsense}
+_CAMERAS = {
+    "camera": lambda number, patience: open_camera(number),
+    "realsense": lambda number, patience: open_realsense(number, patience=patience),
+}
 _MEMORY_EVERY_S = 1.0
 _SHOWN_EVERY = 15  # updates
 CONFIG = PRESETS["fast"]  # how a scene starts; what follows is chosen for the budget
@@ -78,6 +84,8 @@ class Source(NamedTuple):
         names: name of each mask value.
         rehearsal: compiles the first settings that are measured.
         snapshots: the stream, which begins when it is first iterated over.
+        origin: the point that positions are relative to, [3], in the recording's coordinates; None if they
+            are as in the recording.
     """
 
     first: Frame
@@ -85,6 +93,7 @@ class Source(NamedTuple):
     names: dict[int, str]
     rehearsal: Rehearsal
     snapshots: Iterator[Snapshot]
+    origin: np.ndarray | None = None
 
 
 @releasing_locks()
@@ -114,13 +123,17 @@ def run(options: Options) -> int:
         }
         folder.write_metrics(found)
         if log.rows:
-            folder.write_trajectory(**log.trajectory())
+            moved = log.trajectory()
+            centers = in_world(moved["centers"], source.origin)
+            folder.write_trajectory(**moved | {"centers": centers})
     print_facts(_facts(found) | {"written": str(folder.path)})
     return exit_code(stopped)
 
 
 def _check(options: Options) -> None:
     expect_positive(options, "hz", "patience", "budget_ms")
+    if isinf(options.hz):
+        raise ValueError("--hz: expected a finite number of frames per second, found inf")
     if _camera(options.source):
         default = Options(options.source, options.out)
         for name in ("cameras", "mask_camera", "frames", "masks", "scale", "read"):
@@ -142,9 +155,11 @@ def _open(options: Options, console: Console, notes: Notes) -> Source:
         number = options.source.removeprefix(f"{kind}:")
         if not number.isdecimal():
             raise ValueError(f"SOURCE: expected {kind}:NUMBER, as in {kind}:0, found {options.source}")
-        camera = _CAMERAS[kind](int(number))
+        camera = _CAMERAS[kind](int(number), options.patience)
         arriving = snapshots([camera])
-        first, drawing, stream = next(arriving).frame, nullcontext(), lambda: arriving
+        if (begins := next(arriving, None)) is None:
+            raise DataError(options.source, "a frame", "none", "Check its connection.")
+        first, drawing, stream = begins.frame, nullcontext(), lambda: arriving
         image, depth = np.asarray(first.images[0]), np.asarray(first.depths)[0]
         labels = PlaneOrRegionSegmenter()((255 * image).astype(np.uint8), depth, camera.K).astype(np.int32)
         recording, mask, index, names = None, None, 0, {}
@@ -167,7 +182,8 @@ def _open(options: Options, console: Console, notes: Notes) -> Source:
         scene = start_scene(first, labels, index, CONFIG, before_fit=rehearsal.begin)
     if recording is not None and mask is not None:
         warn_of_missing(recording, mask, scene.label_ids, notes)
-    return Source(first, scene, names, rehearsal, stream())
+    origin = None if recording is None else recording.tracked.origin
+    return Source(first, scene, names, rehearsal, stream(), origin)
 
 
 def _replayed(recording: Recording, options: Options, console: Console) -> Iterator[Snapshot]:
@@ -304,6 +320,9 @@ def follow(options: Options, source: Source, log: Log, console: Console) -> Base
             yield arrival.snapshot.frame
             if perf_counter() - begun > 60 * options.minutes:
                 return
+        if _camera(options.source):
+            offered = newest.counts.offered
+            raise StreamStalled(f"{options.source}: no frame after the first {offered}; check its connection")
 
     try:
         console.print(MEASURING)

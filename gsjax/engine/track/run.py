@@ -291,7 +291,7 @@ def _note_unscored(
         if scored["gaussians"] == 0:
             notes.add(f"{name}: not tracked, because it is not in the first mask.")
         elif sequence.truth is not None and scored["gaussians_scored"] == 0:
-            posed = name in sequence.truth.names
+            posed = values is not None and scored["label"] in sequence.truth.label_ids
             why = "no Gaussian certainly belongs to it" if posed else "the ground truth has no pose of it"
             notes.add(f"{name}: motion not scored, {why}.")
     if tracking.chosen is not None and not tracking.chosen.fits:
@@ -313,7 +313,8 @@ def _note_lost(
     """Note when each object was lost, its rotation unknown, in doubt at the end, or seen by no camera."""
     groups = labels_of_groups(tracking, values)[1:]
     unseen = (~np.asarray(tracking.visible, bool).reshape(len(tracking.visible), len(groups))).sum(axis=0)
-    labels = sorted({*groups.tolist()} - {0})
+    labels = sorted({*groups.tolist()})
+    names = {0: "a segment that the recording's masks count as background"} | names
     for label in labels:
         lost = 1 + np.flatnonzero(lost_over_frames(tracking, values, label))
         to_the_end = len(lost) > 0 and lost[-1] == tracking.num_frames - 1
@@ -326,17 +327,17 @@ def _note_lost(
         if unknown is not None and (not to_the_end or unknown < begins[-1]):
             why = "it was lost then" if unknown in lost else "other rotations agree as well"
             notes.say(f"{names[label]}: its rotation is unknown from frame {unknown} on: {why}.")
-        agrees = found["objects"][names[label]]["agrees_last"]
+        agrees = found["objects"][names[label]]["agrees_last"] if label else None
         if agrees is not None and agrees < DOUBTFUL and not to_the_end:
             notes.say(
                 f"{names[label]}: at the end, only {agrees:.0%} of its visible part, or of one of its rigid "
                 "parts, agrees with the images; it shows other sides, or is not where it is drawn."
             )
-    for label in sorted({*groups.tolist()}):
+    for label in labels:
         frames = unseen[groups == label].max()
         if frames:
-            name = names.get(label, f"object {label}")
             unseen_in = counted(int(frames), "frame")
             notes.add(
-                f"{name}: no camera saw it, or one of its rigid parts, in {unseen_in}; it was not moved then."
+                f"{names[label]}: no camera saw it, or one of its rigid parts, in {unseen_in}; it was not "
+                "moved then."
             )

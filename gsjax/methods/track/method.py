@@ -95,15 +95,20 @@ class Track:
 def matching_reduction(scene: TrackedScene, frame: Frame, config: TrackConfig) -> int:
     """Factor by which images of all cameras shrink for matching, so that the second largest object fits the
     template: the largest is usually a robot, far larger than what it handles. On the host."""
+    if not config.matching:
+        return 1
     frame, _ = prepared(frame, config)
     groups = np.asarray(scene.labels)[: scene.num_moving]
     means = np.asarray(scene.gaussians.means, np.float64)[: scene.num_moving]
     sizes = []
     for viewmat, K in zip(np.asarray(frame.cameras.viewmat), np.asarray(frame.cameras.K), strict=True):
         local = means @ viewmat[:3, :3].T + viewmat[:3, 3]
-        pixels = K[0, 0] * local[:, :2] / np.maximum(local[:, 2:], 1e-3)
+        pixels = K[0, 0] * local[:, :2] / np.maximum(local[:, 2:], 1e-3) + K[:2, 2]
+        pixels = np.clip(pixels, 0, (frame.cameras.width, frame.cameras.height))
+        seen = local[:, 2] > frame.cameras.near
         there = [k for k in range(1, scene.num_objects + 1) if (groups == k).any()]  # no empty slots
-        sizes.append([np.ptp(pixels[groups == k], axis=0).max() for k in there])
+        visible = [pixels[seen & (groups == k)] for k in there]
+        sizes.append([np.ptp(places, axis=0).max() if len(places) else 0.0 for places in visible])
     largest = np.sort(np.max(sizes, axis=0))
     size = largest[-2] if len(largest) > 1 else largest[-1]
     return max(1, int(np.ceil(size / config.match.patch)))

@@ -7,14 +7,20 @@ import subprocess
 import sys
 import time
 from dataclasses import replace
+from types import SimpleNamespace
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
 import yaml
+from rich.console import Console
 
 import gsjax.engine.track.loop
 from gsjax.data import Sequence
+from gsjax.engine.messages import Notes
 from gsjax.engine.recording import parse_frames
+from gsjax.engine.track.loop import Tracking
+from gsjax.engine.track.run import _note_lost
 from gsjax.io.ply import read_ply
 from gsjax.io.video import read_video_frames
 
@@ -259,6 +265,19 @@ def test_a_run_says_what_was_lost_and_whose_turn_is_not_known(
         frames, of = np.nonzero(~stored["turn_known"])
         unknown = {(t, objects[k]) for t, k in zip(frames, of, strict=True)}
         assert unknown == {(1, BALL), (3, BALL), (2, CAN), (3, CAN), (2, CARTON), (3, CARTON)}
+
+
+def test_what_the_masks_count_as_background_has_that_name_when_it_is_lost():
+    no, yes = np.array([False]), np.array([True])
+    flags = {"lost": [no, yes], "visible": [yes, no], "turn_known": [yes, yes], "agrees": [np.ones(1)] * 2}
+    tracking = Mock(spec=Tracking, num_frames=3, scene=SimpleNamespace(label_ids=(0, 4)), **flags)
+    notes = Notes(Console(quiet=True))
+    _note_lost({"objects": {}}, tracking, np.array([0, 0]), {}, notes)
+    name = "a segment that the recording's masks count as background"
+    assert notes.all == [
+        f"{name}: lost in 1 frame, between 2 and the end.",
+        f"{name}: no camera saw it, or one of its rigid parts, in 1 frame; it was not moved then.",
+    ]
 
 
 def test_finished_run_is_kept_unless_asked(pristine, tmp_path, gsjax_track, still):

@@ -2,17 +2,23 @@
 
 import json
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from rich.console import Console
 
 import gsjax.data.stream
 from gsjax.cli import main
+from gsjax.data import open_sequence, write_panoptic
+from gsjax.data.opencv_cameras import RgbdCamera
+from gsjax.data.stream import Snapshot, StreamStalled
 from gsjax.engine.track import live as engine
 from gsjax.io.pictures import write_png
 from gsjax.methods.track import start_scene
+from gsjax.scene.origin import about
 from tests.cli.conftest import still_tick
 
 
@@ -77,6 +83,17 @@ def test_a_recording_is_replayed_and_all_frames_are_accounted_for(pristine, live
     assert "holds a finished run" in said
 
 
+@pytest.mark.thorough
+def test_positions_in_a_recording_far_from_0_are_its_own(pristine, live, tmp_path):
+    table, far = open_sequence(pristine), np.array([5e5, 5e6, 300.0])
+    moved = replace(table, viewmats=about(table.viewmats, -far), truth=None)
+    write_panoptic(moved, tmp_path / "far")
+    code, said, folder = live(tmp_path / "far", "--minutes", "0.01", "--hz", "20", "--cameras", "0")
+    assert code == 0, said
+    with np.load(folder / "trajectory.npz") as stored:
+        assert np.abs(stored["centers"] - far).max() < 1e3
+
+
 def test_a_group_goes_where_it_is_carried_whatever_joins_it():
     """The mean of its points shifts when points join: here by 2 cm, before it rotates by 90 degrees and moves
     by 1 m."""
@@ -101,6 +118,7 @@ def test_a_group_goes_where_it_is_carried_whatever_joins_it():
         ("camera:97", (), "replay a folder"),
         ("camera:0", ("--cameras", "1"), "--cameras: applies to recordings"),
         (None, ("--hz", "0"), "--hz: expected more than 0"),
+        (None, ("--hz", "inf"), "--hz: expected a finite number of frames per second, found inf"),
         (None, ("--cameras", "9"), "has no camera 9"),
     ],
 )
@@ -108,6 +126,29 @@ def test_what_cannot_be_followed_is_said(pristine, live, source, options, says):
     code, said, _ = live(pristine if source is None else source, *options)
     assert code == 2
     assert says in " ".join(said.split())
+
+
+def test_a_camera_that_delivers_no_frame_is_named(live, monkeypatch):
+    silent = RgbdCamera(SimpleNamespace(grab=lambda: False), np.eye(3), np.eye(4))
+    monkeypatch.setitem(engine._CAMERAS, "camera", lambda number, patience: silent)
+    code, said, _ = live("camera:0")
+    assert (code, "camera:0: expected a frame, found none" in said) == (2, True)
+
+
+@pytest.mark.parametrize(("source", "ends"), [("camera:0", True), ("recording", False)])
+def test_only_a_recording_may_end_by_itself(monkeypatch, source, ends):
+    def untracked(scene, first, frames, config, **how):
+        for _ in frames:
+            pass
+        yield from ()
+
+    monkeypatch.setattr(engine, "track", untracked)
+    rehearsal, arriving = SimpleNamespace(tick=None), iter([Snapshot(None, 1.0), Snapshot(None, 2.0)])
+    stream = engine.Source(None, None, {}, rehearsal, arriving)
+    log, options = engine.Log((0, 5), {}), engine.Options(source, Path("run"))
+    stopped = engine.follow(options, stream, log, Console(quiet=True))
+    assert log.counts["offered"] == 2
+    assert isinstance(stopped, StreamStalled) == ends, stopped
 
 
 @pytest.mark.thorough

@@ -8,6 +8,9 @@ import pytest
 
 import gsjax.engine.track.loop
 from gsjax.data import open_sequence, write_panoptic
+from gsjax.data.simulated import tabletop
+from gsjax.engine.first_mask import label_names
+from gsjax.engine.recording import Recording
 
 CARTON, CAN, BALL = 2, 3, 4
 
@@ -53,3 +56,26 @@ def test_what_is_not_seen_agrees_with_nothing(own, tmp_path, gsjax_track, still,
     assert shares["object 4"] == (None, None)
     assert shares["object 2"] == (pytest.approx(0.9), pytest.approx(0.9))
     assert not any("agrees" in note for note in found["notes"])
+
+
+def test_names_that_several_objects_have_are_told_apart_by_the_mask_value():
+    given = {2: "cup", 3: "milk carton", 4: "Cup", 5: "cup_1", 6: "cup 1"}
+    table = replace(tabletop(frames=1, width=8, height=6), truth=None, label_names=given)
+    names = label_names(Recording(table, table, 1), "files")
+    expected = {2: "cup (2)", 3: "milk carton", 4: "Cup (4)", 5: "cup_1 (5)", 6: "cup 1 (6)"}
+    assert names == {0: "background"} | expected
+
+
+@pytest.mark.thorough
+def test_each_of_two_objects_of_one_name_has_its_scores(pristine, tmp_path, gsjax_track, still):
+    table, folder = open_sequence(pristine), tmp_path / "twins"
+    names = tuple("cup" if label in (CAN, BALL) else f"thing {label}" for label in table.truth.label_ids)
+    write_panoptic(replace(table, truth=replace(table.truth, names=names)), folder)
+    code, said = gsjax_track(folder, "--cameras", "0", "1", "--mask-camera", "1", "--eval-cameras", "2")
+    assert code == 0, said
+    found = json.loads((tmp_path / "run" / "metrics.json").read_text())
+    assert {f"cup ({CAN})": CAN, f"cup ({BALL})": BALL}.items() <= {
+        name: scored["label"] for name, scored in found["objects"].items()
+    }.items()
+    for scores in (found["iou"], found["iou_held_out"], found["over_frames"]["centroid_error_mm"]):
+        assert {f"cup ({CAN})", f"cup ({BALL})"} <= scores.keys()

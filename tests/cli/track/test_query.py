@@ -3,6 +3,8 @@
 import json
 import re
 import shutil
+from types import SimpleNamespace
+from unittest.mock import Mock
 
 import cv2
 import numpy as np
@@ -13,7 +15,9 @@ from rich.console import Console
 from gsjax.cli import main
 from gsjax.engine.messages import Notes
 from gsjax.engine.teaching.source import Source
-from gsjax.engine.track.grasp import draw_grasp
+from gsjax.engine.track.grasp import Options, _obstacle_rows, draw_grasp
+from gsjax.engine.track.query import Answer
+from gsjax.engine.track.saved import SavedRun
 from gsjax.engine.viewables import open_viewable
 from gsjax.io.ply import read_ply
 from gsjax.io.video import read_video_frames
@@ -287,3 +291,14 @@ def test_a_grasp_is_drawn_where_it_is():
     for nowhere in (-pose, np.full((4, 4), np.nan)):  # behind the camera; nothing found
         drawn = draw_grasp(picture, grasp._replace(pose=nowhere), Gripper(), np.eye(4), K)
         np.testing.assert_array_equal(drawn[30:], picture[30:])
+
+
+def test_what_is_beside_the_end_of_a_long_object_is_an_obstacle(tmp_path):
+    """A bar of 80 cm, a point 3 cm beside its end, and one 1 m away from there."""
+    bar = [[x, 0.0, 0.0] for x in np.linspace(-0.4, 0.4, 41)]
+    means = np.array([[*bar, [0.4, 0.03, 0.0], [1.4, 0.03, 0.0]]])
+    gaussians = SimpleNamespace(opacities=np.ones(43))
+    tracking = SimpleNamespace(scene=SimpleNamespace(labels=np.array([1] * 41 + [0, 0]), gaussians=gaussians))
+    saved = Mock(spec=SavedRun, names={1: "bar"}, tracking=tracking)
+    answer = Answer(1, "bar", {}, 0.0, 0.0, np.arange(41))
+    assert _obstacle_rows(Options(tmp_path, "bar"), saved, answer, means).tolist() == [41]

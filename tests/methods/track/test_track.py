@@ -318,9 +318,18 @@ def test_one_object_larger_than_its_template_is_reduced(started, table, slots):
         int(labels.sum()),
     )
     scene = with_slots(alone, slots) if slots else alone
-    config = replace(TrackConfig(), match=MatchConfig(patch=8))
+    config = TrackConfig(matching=True, coarseness=1, match=MatchConfig(patch=8))
     reductions = [matching_reduction(one, frames[0], config) for one in (scene, alone)]
     assert reductions[0] == reductions[1] > 1
+    assert matching_reduction(scene, frames[0], replace(config, matching=False)) == 1
+
+
+@pytest.mark.thorough
+def test_what_is_behind_a_camera_does_not_reduce_the_pictures(started, table):
+    _, frames, _ = table()
+    behind = jnp.diag(jnp.array([-1.0, 1.0, -1.0, 1.0])) @ frames[0].cameras.viewmat
+    turned = eqx.tree_at(lambda f: f.cameras.viewmat, frames[0], behind)
+    assert matching_reduction(started, turned, TrackConfig(matching=True, coarseness=1)) == 1
 
 
 @pytest.mark.slow
