@@ -29,6 +29,7 @@ from gsjax.engine.options import Common, Overwriting
 from gsjax.engine.terminal import print_facts
 from gsjax.io.atomic import write_json
 from gsjax.io.brief import shortened
+from gsjax.io.parsed import parse_json
 
 REPORT = "poses.json"
 """The results, in the folder that is written; it also marks the folder as written by gsjax."""
@@ -84,7 +85,8 @@ def run(options: Options) -> int:
             )
             _write(options, placed, names, work, folder, in_place)
         photographs = read_colmap(options.out)  # makes sure that it can be read
-        found = _found(options, placed, len(names), perf_counter() - begun) | {"notes": notes.all}
+        found = _found(options, placed, len(names), perf_counter() - begun)
+        found |= {"copied": not in_place, "notes": notes.all}
         write_json(options.out / REPORT, found)
         if reference is not None:
             found["compared"] = compare(photographs, reference)
@@ -140,8 +142,22 @@ def _check_out(out: Path, in_place: bool, overwrite: bool) -> None:
             f"{out}: expected a folder without images and sparse, found {' and '.join(own)} that gsjax "
             "poses did not write; name another folder"
         )
+    if "images" in own and not _has_copies(out):
+        raise FileExistsError(
+            f"{out / 'images'}: expected copies made by gsjax poses (copied in {REPORT}), found other "
+            "photographs; name another folder, or move them"
+        )
     if not overwrite:
         raise FileExistsError(f"{out}: found the result of an earlier gsjax poses; --overwrite replaces it")
+
+
+def _has_copies(out: Path) -> bool:
+    """Whether gsjax copied the photographs in images/; where the report does not say so, they are the
+    user's."""
+    try:
+        return parse_json((out / REPORT).read_text(encoding="utf-8")).get("copied") is True
+    except (ValueError, AttributeError):
+        return False
 
 
 def _write(
@@ -156,7 +172,8 @@ def _write(
         for name in names:
             (images / name).parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(folder / name, images / name)
-    write_json(options.out / REPORT, {"complete": False})  # marks the folder, whatever happens from here on
+    mark = {"complete": False, "copied": not in_place}
+    write_json(options.out / REPORT, mark)  # marks the folder, whatever happens from here on
     for new, old in ((images, options.out / "images"), (sparse, options.out / "sparse")):
         if new.exists():
             if old.exists():
