@@ -66,6 +66,11 @@ def run(options: Options) -> int:
             f"--out {options.out}: the photographs themselves are there; name another folder, or move them "
             f"to {options.out / 'images'} and give that"
         )
+    if not of_video and options.images.resolve() in options.out.resolve().parents:
+        raise ValueError(
+            f"--out {options.out}: expected a folder outside {options.images}, found one among the "
+            "photographs, where the copies would be taken for more of them; name another folder"
+        )
     lock(options.out)
     _check_out(options.out, in_place, options.overwrite)
     with Notes(console) as notes:

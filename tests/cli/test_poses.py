@@ -229,6 +229,15 @@ def test_photographs_that_were_used_in_place_are_never_replaced(unplaced, say, t
     assert contents(out / "images") == others
 
 
+def test_a_folder_among_the_photographs_is_refused(unplaced, say, tmp_path):
+    """Copies that an earlier run put there would be found with the photographs."""
+    squares(tmp_path / "photos", 0)
+    code, said = say(tmp_path / "photos", "--out", tmp_path / "photos/new/out")
+    assert code == 2
+    assert "new/out: expected a folder outside" in said
+    assert not (tmp_path / "photos/new").exists()
+
+
 def test_names_that_are_not_in_the_other_dataset(say, tmp_path, photographs):
     code, said = say(
         photographs, "--out", tmp_path / "out", "--compare", "simulated:tabletop?frames=2&width=32&height=24"
