@@ -3,6 +3,7 @@
 import os
 import shutil
 import tempfile
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import partial
@@ -46,7 +47,7 @@ class Options(Common, Overwriting):
     stills: int = 100
     """Number of pictures to take from a video: the sharpest in each of as many equal intervals."""
     compare: str | None = None
-    """A dataset with poses of the same photographs (matched by file name), to compare the result with."""
+    """A dataset with poses of the same photographs (matched by name), to compare the result with."""
     place: Annotated[MotionConfig, tyro.conf.arg(name="")] = field(default_factory=MotionConfig)
     """Settings of the reconstruction."""
 
@@ -125,15 +126,25 @@ def compare(photographs: Photographs, reference: Photographs) -> dict[str, Any]:
 
 
 def _in_both(names: Sequence[str], reference: Photographs) -> list[tuple[int, int]]:
-    """Pairs of indices of the photographs that both have, matched by file name."""
-    known = {Path(name).name: i for i, name in enumerate(reference.names)}
-    both = [(i, known[Path(name).name]) for i, name in enumerate(names) if Path(name).name in known]
+    """Pairs of indices of the photographs that both have, matched by name, or else by a file name that occurs
+    once in each."""
+    known = {name: i for i, name in enumerate(reference.names)}
+    ours, theirs = _by_unique_file_name(names), _by_unique_file_name(reference.names)
+    pairs = {ours[name]: theirs[name] for name in ours.keys() & theirs.keys()}
+    pairs |= {i: known[name] for i, name in enumerate(names) if name in known}
+    both = sorted(pairs.items())
     if len(both) < 3:
         raise ValueError(
             f"--compare: expected poses of three of these photographs or more in {reference.name}, found "
             f"{len(both)} of the same name; it has {shortened(reference.names, 5)}"
         )
     return both
+
+
+def _by_unique_file_name(names: Sequence[str]) -> dict[str, int]:
+    files = [Path(name).name for name in names]
+    counts = Counter(files)
+    return {file: i for i, file in enumerate(files) if counts[file] == 1}
 
 
 def _check_out(out: Path, in_place: bool, overwrite: bool) -> None:

@@ -3,6 +3,7 @@
 import json
 import shutil
 import sys
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -236,6 +237,21 @@ def test_a_folder_among_the_photographs_is_refused(unplaced, say, tmp_path):
     assert code == 2
     assert "new/out: expected a folder outside" in said
     assert not (tmp_path / "photos/new").exists()
+
+
+def test_names_that_repeat_in_subfolders_are_told_apart():
+    names = tuple(f"{side}/{i}.png" for side in ("left", "right") for i in range(3))
+    rig = replace(
+        open_photographs("simulated:tabletop?frames=6&width=32&height=24").select(range(6)), names=names
+    )
+    assert poses._in_both(names, rig) == [(i, i) for i in range(6)]
+    assert poses._in_both([f"images/{i}.png" for i in (2, 1, 0)], rig.select(range(3))) == [
+        (0, 2),
+        (1, 1),
+        (2, 0),
+    ]
+    with pytest.raises(ValueError, match="found 0 of the same name"):
+        poses._in_both([f"{i}.png" for i in range(3)], rig)
 
 
 def test_names_that_are_not_in_the_other_dataset(say, tmp_path, photographs):
