@@ -219,7 +219,7 @@ class RunFolder:
                 f"{self.path}: expected a new folder, an empty one or one of a run (whose config.yml begins "
                 f"with {SIGNATURE!r}), found other files; name another folder"
             )
-        if is_finished(self.path) and not overwrite:
+        if not overwrite and is_finished(self.path):
             nothing = ", of which nothing is left to resume" if resume else ""
             raise FileExistsError(
                 f"{self.path}: holds a finished run{nothing}; name another folder, or replace it with "

@@ -96,6 +96,15 @@ def test_overwriting_clears_the_run_and_nothing_else(finished):
     assert not is_finished(run.path)
 
 
+@pytest.mark.parametrize("text", ["", "{", "[]"])
+def test_a_run_with_damaged_scores_can_be_replaced_as_the_message_says(finished, text):
+    finished.metrics.write_text(text)
+    with pytest.raises(ValueError, match="replace the run with --overwrite"):
+        RunFolder(finished.path)
+    RunFolder(finished.path, overwrite=True).write_config(Config())
+    assert contents(finished) == ["config.yml", "my notes.txt"]
+
+
 def test_unfinished_run_is_replaced_where_it_left_nothing_to_resume(finished):
     for name in ("report.html", "metrics.json", "trajectory.npz", "scene.ply"):
         (finished.path / name).unlink()
