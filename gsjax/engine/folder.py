@@ -261,9 +261,11 @@ class RunFolder:
             TypeError: `config` is not a dataclass instance.
         """
         text = yaml.safe_dump(plain(dataclasses.asdict(config)), sort_keys=False, allow_unicode=True)
-        for name in _WRITTEN if self._stale else ():
+        # config.yml is replaced and not removed: without it, a removal that is stopped would leave no run.
+        stale = [name for name in _WRITTEN if name != self.config.name] if self._stale else []
+        for name in stale:
             for entry in self.path.glob(name):
-                shutil.rmtree(entry) if entry.is_dir() else entry.unlink()
+                shutil.rmtree(entry) if entry.is_dir() and not entry.is_symlink() else entry.unlink()
         self._stale = False
         try:
             self.path.mkdir(parents=True, exist_ok=True)
