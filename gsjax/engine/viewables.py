@@ -240,9 +240,9 @@ def _of_track(path: Path, notes: Notes, now: Locations) -> Viewable:
     shots, times, saved = None, None, None
     try:
         saved = open_run(path)
-    except ValueError as error:
+    except (ValueError, OSError) as error:  # an OSError if it is not scored yet
         tracking, origin = read_tracking(path)  # an error if that is damaged too
-        notes.warn(f"its recording is not shown: {error}")
+        notes.warn(f"its recording is not shown: {describe(error)}")
     else:
         tracking, names = saved.tracking, saved.names
         recording = saved.recording.judged

@@ -99,6 +99,13 @@ def test_a_tracked_scene_whose_recording_is_gone_still_moves(tracked, recording,
     assert scene.name_of(0) == "object 1"
 
 
+def test_a_tracked_run_without_scores_yet_is_shown(tracked, notes):
+    (tracked / "metrics.json").unlink()
+    scene, _ = open_viewable(tracked, notes)
+    assert (scene.num_frames, scene.shots) == (4, None)
+    assert any("found no metrics.json" in note for note in notes.all)
+
+
 def test_a_damaged_trajectory_is_said(tracked, view):
     (tracked / "trajectory.npz").write_bytes(b"half of it")
     code, said = view(tracked)
