@@ -11,6 +11,7 @@ import numpy as np
 import tyro
 from rich.console import Console
 from rich.progress import track
+from rich.text import Text
 
 from gsjax.engine.messages import Notes, counted, reason, stage
 from gsjax.engine.options import Common
@@ -170,4 +171,5 @@ def _warn(notes: Notes, out: Path, written: Format, left_out: tuple[str, ...]) -
 
 
 def _tell(out: Path, text: str) -> None:
-    Console(highlight=False).print(f"[bold]scene[/]  {out}: {text}", soft_wrap=True)
+    line = Text.assemble(("scene", "bold"), f"  {out}: {text}")
+    Console(highlight=False).print(line, soft_wrap=True)

@@ -66,7 +66,8 @@ def collect(experiment: Experiment, figure: Callable | None, debug: bool) -> int
         grid.add_row(*map(Text, line))
     console = stdout()
     console.print(grid, *(Text(note, "dim") for note in notes), sep="\n")
-    console.print(f"[bold]results[/]  {experiment.folder / 'results.html'}", soft_wrap=True)
+    page = str(experiment.folder / "results.html")
+    console.print(Text.assemble(("results", "bold"), "  ", page), soft_wrap=True)
     if failed:
         say_error(f"{experiment.script}: {failed}")
     return 1 if failed else 0

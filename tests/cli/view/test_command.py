@@ -20,6 +20,7 @@ from gsjax.engine.distill.saved import Locations
 from gsjax.engine.viewables import open_viewable
 from gsjax.io.ply import read_ply, write_ply
 from gsjax.methods.parts import gaussians_at, moment
+from gsjax.viz.viewer import open_viewer
 from tests.cli.parts.test_edit import scene_and_trajectory
 from tests.cli.parts.test_edit import write_run as write_parts_run
 from tests.cli.view.conftest import some
@@ -247,6 +248,16 @@ def test_it_says_where_and_what_and_ends_by_ctrl_c(view, ply):
     assert "the browser gets the 10 most opaque of 30 Gaussians" in said
     assert "everyone" not in said
     assert "viser" not in said
+
+
+def test_the_address_is_printed_whole(view, ply, monkeypatch):
+    def elsewhere(*arguments, **options):
+        viewer = open_viewer(*arguments, **options)
+        viewer.url = "http://[fd00::1]:8080"
+        return viewer
+
+    monkeypatch.setattr("gsjax.cli.view.open_viewer", elsewhere)
+    assert "view http://[fd00::1]:8080 " in view(ply, "--port", "0")[1]
 
 
 def test_a_port_in_use(view, ply, monkeypatch):
