@@ -13,6 +13,7 @@ from rich.console import Console
 from gsjax.cli import main
 from gsjax.engine.messages import Notes
 from gsjax.engine.teaching.source import Source
+from gsjax.engine.track import query
 from gsjax.engine.track.grasp import draw_grasp
 from gsjax.engine.viewables import open_viewable
 from gsjax.io.ply import read_ply
@@ -287,3 +288,8 @@ def test_a_grasp_is_drawn_where_it_is():
     for nowhere in (-pose, np.full((4, 4), np.nan)):  # behind the camera; nothing found
         drawn = draw_grasp(picture, grasp._replace(pose=nowhere), Gripper(), np.eye(4), K)
         np.testing.assert_array_equal(drawn[30:], picture[30:])
+
+
+def test_brackets_in_the_name_of_an_object_are_printed(capsys):
+    query._print_scores({"can[red]": 0.5}, "can[red]")
+    assert "can[red]" in capsys.readouterr().out
