@@ -18,6 +18,7 @@ from plyfile import PlyData, PlyElement
 import gsjax
 from gsjax.engine.distill.saved import Locations
 from gsjax.engine.viewables import open_viewable
+from gsjax.io.atomic import write_npz
 from gsjax.io.ply import read_ply, write_ply
 from gsjax.methods.parts import gaussians_at, moment
 from gsjax.viz.viewer import open_viewer
@@ -52,6 +53,14 @@ def test_a_fit_whose_photographs_are_gone_is_shown_without(fitted, notes):
     assert scene.shots is None
     assert scene.antialiased
     assert any("its photographs are not shown: /nowhere/at/all" in note for note in notes.all)
+
+
+def test_photographs_of_a_fit_stand_where_it_moved_them(fitted, notes):
+    given = open_viewable(fitted, notes)[0].shots
+    refined = given.viewmats[0].copy()
+    refined[:, :3, 3] += 0.01
+    write_npz(fitted / "cameras.npz", {"names": np.array(given.names), "viewmats": refined})
+    np.testing.assert_allclose(open_viewable(fitted, notes)[0].shots.viewmats[0], refined)
 
 
 def test_photographs_of_a_fit_that_moved(fitted, photographs, notes):
