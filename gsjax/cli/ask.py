@@ -8,6 +8,7 @@ from typing import Annotated, Any
 import tyro
 from rich.console import Console
 from rich.table import Table
+from rich.text import Text
 
 from gsjax.engine.deform.file import read_deformation, warn_of_partial
 from gsjax.engine.folder import DEFORMATION
@@ -105,7 +106,7 @@ def _list(result: DeformResult) -> None:
     """Prints what can be asked."""
     console = Console(highlight=False)
     frames = result.timeline.frame_ids
-    console.print(f"X and Y are of: [bold]{', '.join(result.names)}[/]", soft_wrap=True)
+    console.print(Text.assemble("X and Y are of: ", (", ".join(result.names), "bold")), soft_wrap=True)
     console.print(f"F and G are frames: [bold]{frames.min()} to {frames.max()}[/]\n", soft_wrap=True)
     table = Table("type", "question", "answer", box=None, padding=(0, 3, 0, 0))
     for kind in QUESTIONS:

@@ -83,8 +83,8 @@ def run(options: Options) -> int:
             return track(frames, "rendering", asked, console=console, transient=True)
 
         found = write_film(folder, script, film, saved, camera, notes, watch=watch, ply=options.ply)
-    asked, stopped = len(film[0].trajectory.times), not found["complete"]
-    part = f" of {asked} (stopped by Ctrl-C)" if stopped else ""
+    asked, stopped = len(film[0].trajectory.times), found["stopped"]
+    part = f" of {asked} (stopped by {stopped})" if stopped else ""
     pace = f"; rendered at {found['render_hz']:.1f} a second" if found["render_hz"] else ""
     frames = counted(found["frames"], "frame")
     print(f"{found['seconds']:.2f} s, {frames}{part}, seen by camera {camera}{pace}")

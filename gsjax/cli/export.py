@@ -13,6 +13,7 @@ from rich.console import Console
 from rich.progress import track
 from rich.text import Text
 
+from gsjax.engine.folder import is_of_run
 from gsjax.engine.messages import Notes, counted, reason, stage
 from gsjax.engine.options import Common
 from gsjax.engine.recording import parse_frames
@@ -154,6 +155,8 @@ def _check(options: Options, out: Path) -> None:
         )
     if out.exists() and out.resolve() in files_of(options.path):
         raise FileExistsError(f"{out}: expected another file than the one that is read; name another OUT")
+    if is_of_run(out):
+        raise FileExistsError(f"{out}: expected another file than one that a run wrote; name another OUT")
     for file in (out, labels_beside(out)) if "labels" in format_of(out).options else (out,):
         if file.exists() and not options.overwrite:
             raise FileExistsError(

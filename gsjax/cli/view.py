@@ -10,6 +10,7 @@ from typing import Annotated
 import numpy as np
 import tyro
 from rich.console import Console
+from rich.text import Text
 
 from gsjax.engine.distill.saved import Locations
 from gsjax.engine.messages import Notes, stage
@@ -99,7 +100,8 @@ def _announce(options: Options, scene: Viewable, viewer: Viewer, notes: Notes) -
         )
     console = Console(highlight=False)
     console.print(f"[bold]scene[/]   {', '.join(_facts(scene))}", soft_wrap=True)
-    console.print(f"[bold]view[/]    {viewer.url}   (Ctrl-C ends it)", soft_wrap=True)
+    address = Text.assemble(("view", "bold"), f"    {viewer.url}   (Ctrl-C ends it)")
+    console.print(address, soft_wrap=True)
 
 
 def _facts(scene: Viewable) -> list[str]:

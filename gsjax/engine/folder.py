@@ -219,7 +219,7 @@ class RunFolder:
                 f"{self.path}: expected a new folder, an empty one or one of a run (whose config.yml begins "
                 f"with {SIGNATURE!r}), found other files; name another folder"
             )
-        if is_finished(self.path) and not overwrite:
+        if not overwrite and is_finished(self.path):
             nothing = ", of which nothing is left to resume" if resume else ""
             raise FileExistsError(
                 f"{self.path}: holds a finished run{nothing}; name another folder, or replace it with "
@@ -261,9 +261,11 @@ class RunFolder:
             TypeError: `config` is not a dataclass instance.
         """
         text = yaml.safe_dump(plain(dataclasses.asdict(config)), sort_keys=False, allow_unicode=True)
-        for name in _WRITTEN if self._stale else ():
+        # config.yml is replaced and not removed: without it, a removal that is stopped would leave no run.
+        stale = [name for name in _WRITTEN if name != self.config.name] if self._stale else []
+        for name in stale:
             for entry in self.path.glob(name):
-                shutil.rmtree(entry) if entry.is_dir() else entry.unlink()
+                shutil.rmtree(entry) if entry.is_dir() and not entry.is_symlink() else entry.unlink()
         self._stale = False
         try:
             self.path.mkdir(parents=True, exist_ok=True)

@@ -25,10 +25,10 @@ _PACKAGE = Path(__file__).parents[1]
 def stage(console: Console, words: str) -> Iterator[None]:
     """Announce work that takes a while: a spinner in a terminal, a line in a log."""
     if console.is_terminal:
-        with console.status(words):
+        with console.status(Text(words)):
             yield
     else:
-        console.print(words, soft_wrap=True)
+        console.print(Text(words), soft_wrap=True)
         yield
 
 

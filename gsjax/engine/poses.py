@@ -3,6 +3,7 @@
 import os
 import shutil
 import tempfile
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import partial
@@ -29,6 +30,7 @@ from gsjax.engine.options import Common, Overwriting
 from gsjax.engine.terminal import print_facts
 from gsjax.io.atomic import write_json
 from gsjax.io.brief import shortened
+from gsjax.io.parsed import parse_json
 
 REPORT = "poses.json"
 """The results, in the folder that is written; it also marks the folder as written by gsjax."""
@@ -45,7 +47,7 @@ class Options(Common, Overwriting):
     stills: int = 100
     """Number of pictures to take from a video: the sharpest in each of as many equal intervals."""
     compare: str | None = None
-    """A dataset with poses of the same photographs (matched by file name), to compare the result with."""
+    """A dataset with poses of the same photographs (matched by name), to compare the result with."""
     place: Annotated[MotionConfig, tyro.conf.arg(name="")] = field(default_factory=MotionConfig)
     """Settings of the reconstruction."""
 
@@ -64,6 +66,11 @@ def run(options: Options) -> int:
         raise ValueError(
             f"--out {options.out}: the photographs themselves are there; name another folder, or move them "
             f"to {options.out / 'images'} and give that"
+        )
+    if not of_video and options.images.resolve() in options.out.resolve().parents:
+        raise ValueError(
+            f"--out {options.out}: expected a folder outside {options.images}, found one among the "
+            "photographs, where the copies would be taken for more of them; name another folder"
         )
     lock(options.out)
     _check_out(options.out, in_place, options.overwrite)
@@ -84,7 +91,8 @@ def run(options: Options) -> int:
             )
             _write(options, placed, names, work, folder, in_place)
         photographs = read_colmap(options.out)  # makes sure that it can be read
-        found = _found(options, placed, len(names), perf_counter() - begun) | {"notes": notes.all}
+        found = _found(options, placed, len(names), perf_counter() - begun)
+        found |= {"copied": not in_place, "notes": notes.all}
         write_json(options.out / REPORT, found)
         if reference is not None:
             found["compared"] = compare(photographs, reference)
@@ -118,15 +126,25 @@ def compare(photographs: Photographs, reference: Photographs) -> dict[str, Any]:
 
 
 def _in_both(names: Sequence[str], reference: Photographs) -> list[tuple[int, int]]:
-    """Pairs of indices of the photographs that both have, matched by file name."""
-    known = {Path(name).name: i for i, name in enumerate(reference.names)}
-    both = [(i, known[Path(name).name]) for i, name in enumerate(names) if Path(name).name in known]
+    """Pairs of indices of the photographs that both have, matched by name, or else by a file name that occurs
+    once in each."""
+    known = {name: i for i, name in enumerate(reference.names)}
+    ours, theirs = _by_unique_file_name(names), _by_unique_file_name(reference.names)
+    pairs = {ours[name]: theirs[name] for name in ours.keys() & theirs.keys()}
+    pairs |= {i: known[name] for i, name in enumerate(names) if name in known}
+    both = sorted(pairs.items())
     if len(both) < 3:
         raise ValueError(
             f"--compare: expected poses of three of these photographs or more in {reference.name}, found "
             f"{len(both)} of the same name; it has {shortened(reference.names, 5)}"
         )
     return both
+
+
+def _by_unique_file_name(names: Sequence[str]) -> dict[str, int]:
+    files = [Path(name).name for name in names]
+    counts = Counter(files)
+    return {file: i for i, file in enumerate(files) if counts[file] == 1}
 
 
 def _check_out(out: Path, in_place: bool, overwrite: bool) -> None:
@@ -140,8 +158,22 @@ def _check_out(out: Path, in_place: bool, overwrite: bool) -> None:
             f"{out}: expected a folder without images and sparse, found {' and '.join(own)} that gsjax "
             "poses did not write; name another folder"
         )
+    if "images" in own and not _has_copies(out):
+        raise FileExistsError(
+            f"{out / 'images'}: expected copies made by gsjax poses (copied in {REPORT}), found other "
+            "photographs; name another folder, or move them"
+        )
     if not overwrite:
         raise FileExistsError(f"{out}: found the result of an earlier gsjax poses; --overwrite replaces it")
+
+
+def _has_copies(out: Path) -> bool:
+    """Whether gsjax copied the photographs in images/; where the report does not say so, they are the
+    user's."""
+    try:
+        return parse_json((out / REPORT).read_text(encoding="utf-8")).get("copied") is True
+    except (ValueError, AttributeError):
+        return False
 
 
 def _write(
@@ -156,7 +188,8 @@ def _write(
         for name in names:
             (images / name).parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(folder / name, images / name)
-    write_json(options.out / REPORT, {"complete": False})  # marks the folder, whatever happens from here on
+    mark = {"complete": False, "copied": not in_place}
+    write_json(options.out / REPORT, mark)  # marks the folder, whatever happens from here on
     for new, old in ((images, options.out / "images"), (sparse, options.out / "sparse")):
         if new.exists():
             if old.exists():

@@ -123,6 +123,7 @@ class Selection:
         scores: of all Gaussians.
         threshold: score above which they are selected, within `place`.
         selected: whether each Gaussian is.
+        best: the highest score, within `place`.
         seconds: time that it took to score all Gaussians.
         place: the selection that they must lie within; None for anywhere.
     """
@@ -133,6 +134,7 @@ class Selection:
     scores: Float[np.ndarray, "n"]
     threshold: Threshold
     selected: Bool[np.ndarray, "n"]
+    best: float
     seconds: float
     place: "Selection | None" = None
 
@@ -238,9 +240,8 @@ def select(run: Queryable, question: Question, frame: int, prompt: Prompt | None
     begun = perf_counter()
     scores, seconds = np.asarray(score()), perf_counter() - begun
     inside = np.isfinite(scores)
-    place = None
-    if question.within is not None:
-        place = _place(run, question, frame)
+    place = None if question.within is None else _place(run, question, frame)
+    if place is not None:
         inside &= place.selected
     if question.top is None:
         threshold = prompt.threshold(scores[inside], question.threshold)
@@ -250,7 +251,8 @@ def select(run: Queryable, question: Question, frame: int, prompt: Prompt | None
         selected = np.zeros(len(scores), bool)
         selected[best] = True
         threshold = Threshold(float(scores[best].min(initial=np.inf)), f"the {question.top} best")
-    return Selection(question, frame, prompt, scores, threshold, selected, seconds, place)
+    highest = float(scores[inside].max(initial=-np.inf))
+    return Selection(question, frame, prompt, scores, threshold, selected, highest, seconds, place)
 
 
 def _place(run: Queryable, question: Question, frame: int) -> Selection:
@@ -314,7 +316,7 @@ def answer(
             "rule": found.threshold.rule,
             "gaussians": len(means),
             "of": len(selected),
-            "best_score": float(found.scores.max()),
+            "best_score": found.best,
             "center": means.mean(axis=0),
             "frame": None if run.frame_ids is None else int(run.frame_ids[frame]),
             "at_last": None if run.frame_ids is None else _at_last(run, selected),
@@ -351,16 +353,15 @@ def _check_count(run: Queryable, found: Selection, notes: Notes) -> None:
     selected, threshold, words = found.selected, found.threshold, found.question.words
     if not selected.any() and not math.isfinite(threshold.value):
         raise ValueError(
-            f"{words} fits all Gaussians alike, with a score of {found.scores.max():.3f}, so none can be "
+            f"{words} fits all Gaussians alike, with a score of {found.best:.3f}, so none can be "
             "told from the others; take --threshold, --top or --negatives"
         )
     if not selected.any():
         where = "" if run.frame_ids is None else f" in frame {run.frame_ids[found.frame]}"
-        place = found.scores if found.place is None else found.scores[found.place.selected]
-        within, best = "" if found.place is None else "there ", float(place.max())
+        within = "" if found.place is None else "there "
         raise ValueError(
-            f"{words} matches nothing in this scene{where}: the best score {within}is {best:.3f}, and more "
-            f"than {threshold.value:.5g} is required ({threshold.rule}); try a lower --threshold"
+            f"{words} matches nothing in this scene{where}: the best score {within}is {found.best:.3f}, and "
+            f"more than {threshold.value:.5g} is required ({threshold.rule}); try a lower --threshold"
         )
     if selected.all():
         notes.warn(

@@ -56,7 +56,7 @@ def write_report(path: str | Path, summary: Summary) -> None:
         + "\n<footer>Written by gsjax.</footer>\n</main>\n</body>\n</html>\n"
     )
     with atomic_write(path) as temporary:
-        temporary.write_text(page, encoding="utf-8")
+        temporary.write_text(page, encoding="utf-8", errors="replace")  # a path may not be UTF-8
 
 
 def _text(value: Any) -> str:

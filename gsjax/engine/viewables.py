@@ -18,6 +18,7 @@ from gsjax.engine.distill.file import NAME
 from gsjax.engine.distill.over_time import OverTime, if_same_size
 from gsjax.engine.distill.query import QueryableField
 from gsjax.engine.distill.saved import UNMOVED, FieldRun, Locations, field_of, open_field_run
+from gsjax.engine.distill.scene import with_learned_poses
 from gsjax.engine.files import read_drawable, read_frames, reopen
 from gsjax.engine.folder import DEFORMATION, SCRIPT, expect_run, is_run
 from gsjax.engine.messages import Notes, describe
@@ -183,7 +184,8 @@ def _of_fit(path: Path, notes: Notes, now: Locations, shown: bool) -> Viewable:
         shots, photographs = None, None
         try:
             if shown:
-                photographs = relative_to_origin(photographs_of_run(settings, now.images), origin)
+                photographs = with_learned_poses(photographs_of_run(settings, now.images), path)
+                photographs = relative_to_origin(photographs, origin)
                 shots = _shots_of(photographs)
         except (ValueError, OSError) as error:
             notes.warn(f"its photographs are not shown: {describe(error)}")
@@ -240,9 +242,9 @@ def _of_track(path: Path, notes: Notes, now: Locations) -> Viewable:
     shots, times, saved = None, None, None
     try:
         saved = open_run(path)
-    except ValueError as error:
+    except (ValueError, OSError) as error:  # an OSError if it is not scored yet
         tracking, origin = read_tracking(path)  # an error if that is damaged too
-        notes.warn(f"its recording is not shown: {error}")
+        notes.warn(f"its recording is not shown: {describe(error)}")
     else:
         tracking, names = saved.tracking, saved.names
         recording = saved.recording.judged

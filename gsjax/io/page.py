@@ -95,7 +95,7 @@ def write_page(
         motion=base64.b64encode(moved).decode(),
     )
     with atomic_write(path) as temporary:
-        temporary.write_text(text, encoding="utf-8")
+        temporary.write_text(text, encoding="utf-8", errors="replace")  # the title may not be UTF-8
 
 
 def _packed(film: Film) -> tuple[np.ndarray, dict[str, Any] | None, bytes]:

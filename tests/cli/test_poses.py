@@ -3,6 +3,8 @@
 import json
 import shutil
 import sys
+from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,6 +13,8 @@ from PIL import Image
 from gsjax.cli import main
 from gsjax.data import open_photographs
 from gsjax.data.alignment import align_cameras
+from gsjax.data.structure_from_motion import SfmResult
+from gsjax.engine import poses
 from gsjax.io.video import VideoWriter
 from tests.data import dots, room
 
@@ -181,6 +185,73 @@ def test_what_stands_in_the_way_is_not_replaced(say, tmp_path, photographs):
     (tmp_path / "theirs/poses.json").touch()
     assert "--overwrite replaces it" in say(photographs, "--out", tmp_path / "theirs")[1]
     assert "expected a folder, found a file" in say(photographs, "--out", tmp_path / "theirs/poses.json")[1]
+
+
+@pytest.fixture
+def unplaced(monkeypatch):
+    """Skips COLMAP: `gsjax poses` only checks its folders, copies the photographs, and writes an empty
+    model."""
+    model = SimpleNamespace(
+        cameras={1: SimpleNamespace(width=4, height=4, params=[1.0, 2.0, 2.0])},
+        write_binary=lambda folder: None,
+        num_points3D=lambda: 0,
+        compute_mean_track_length=lambda: 0.0,
+    )
+    result = SfmResult(model, (), (), (), {"a.png": 1}, 0, 0.0, {})
+    monkeypatch.setattr(poses, "reconstruct_cameras", lambda *a, **k: result)
+    monkeypatch.setattr(poses, "read_colmap", lambda folder: None)
+
+
+def squares(folder, shade):
+    """Writes three photographs; returns their contents."""
+    for i in range(3):
+        dots.save(folder / f"{i}.png", np.full((4, 4, 3), shade, np.uint8))
+    return contents(folder)
+
+
+def contents(folder):
+    return {path.name: path.read_bytes() for path in folder.iterdir()}
+
+
+def test_photographs_that_were_used_in_place_are_never_replaced(unplaced, say, tmp_path):
+    mine = tmp_path / "mine/images"
+    before, others = squares(mine, 0), squares(tmp_path / "others", 200)
+    for more in ((), ("--overwrite",)):
+        assert say(mine, "--out", mine.parent, *more)[0] == 0
+    for more in (("--overwrite",), ()):
+        code, said = say(tmp_path / "others", "--out", mine.parent, *more)
+        assert contents(mine) == before
+        assert code == 2
+        assert "images: expected copies made by gsjax poses (copied in poses.json), found other" in said
+    out = tmp_path / "out"
+    squares(tmp_path / "first", 100)
+    assert say(tmp_path / "first", "--out", out)[0] == 0
+    assert say(tmp_path / "others", "--out", out, "--overwrite")[0] == 0
+    assert contents(out / "images") == others
+
+
+def test_a_folder_among_the_photographs_is_refused(unplaced, say, tmp_path):
+    """Copies that an earlier run put there would be found with the photographs."""
+    squares(tmp_path / "photos", 0)
+    code, said = say(tmp_path / "photos", "--out", tmp_path / "photos/new/out")
+    assert code == 2
+    assert "new/out: expected a folder outside" in said
+    assert not (tmp_path / "photos/new").exists()
+
+
+def test_names_that_repeat_in_subfolders_are_told_apart():
+    names = tuple(f"{side}/{i}.png" for side in ("left", "right") for i in range(3))
+    rig = replace(
+        open_photographs("simulated:tabletop?frames=6&width=32&height=24").select(range(6)), names=names
+    )
+    assert poses._in_both(names, rig) == [(i, i) for i in range(6)]
+    assert poses._in_both([f"images/{i}.png" for i in (2, 1, 0)], rig.select(range(3))) == [
+        (0, 2),
+        (1, 1),
+        (2, 0),
+    ]
+    with pytest.raises(ValueError, match="found 0 of the same name"):
+        poses._in_both([f"{i}.png" for i in range(3)], rig)
 
 
 def test_names_that_are_not_in_the_other_dataset(say, tmp_path, photographs):

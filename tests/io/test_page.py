@@ -4,6 +4,7 @@ browser are skipped without Chromium (`apt install chromium`)."""
 import base64
 import html
 import json
+import os
 import re
 import shutil
 import subprocess
@@ -134,6 +135,12 @@ def test_one_gaussian_that_moves(tmp_path):
     motion, steps = motion_in(tmp_path / "scene.html")
     for frame in range(3):
         np.testing.assert_allclose(places_of(motion, steps[frame]), film.at(frame).means[:1], atol=1e-4)
+
+
+def test_a_name_that_is_not_utf_8_is_shown_as_far_as_it_is(tmp_path):
+    path = tmp_path / os.fsdecode(b"donn\xe9es.html")
+    write_gaussians(path, make_scene(2))
+    assert "<title>donn?es</title>" in path.read_text(encoding="utf-8")
 
 
 def test_what_cannot_be_played_is_refused(tmp_path, monkeypatch):

@@ -9,6 +9,7 @@ from typing import Any, Literal
 
 import jax
 from rich.console import Console
+from rich.text import Text
 
 from gsjax.engine.budget import Budget, note_if_few
 from gsjax.engine.checkpoint import write_field
@@ -128,9 +129,8 @@ def run(options: Options) -> int:
             if now.step == solved < total:
                 write_field(folder.path / NAME, now.result)
                 ask = f"gsjax query {out} {asked_by(teaching.source.kind)}"
-                console.print(
-                    f"a first answer is there: {ask}, or gsjax view {out}", markup=False, soft_wrap=True
-                )
+                words = f"a first answer is there: {ask}, or gsjax view {out}"
+                console.print(Text(words), soft_wrap=True)
 
         watch(ticks, progress, schedule, folder, console, budget=budget, evaluate=first_answer)
         steps, result = ticks.run.step, ticks.result

@@ -129,9 +129,25 @@ def scene_of_run(path: Path, images: str | None = None, read_scene: Read | None 
         indices, count = list(range(first.num_cameras)), recording.tracked.num_cameras
         return FieldScene(file, gaussians, photographs_of(first), indices[:count], indices[count:])
     photographs = photographs_of_run(record.config, images)
-    photographs = relative_to_origin(_as_learned(photographs, path / "cameras.npz"), report.origin)
+    photographs = relative_to_origin(with_learned_poses(photographs, path), report.origin)
     mode = "antialiased" if record.config["fit"].get("antialiased") else "classic"
     return FieldScene(file, gaussians, photographs, *_split(photographs, record.config["test_every"]), mode)
+
+
+def with_learned_poses(photographs: Photographs, path: Path) -> Photographs:
+    """The photographs with the poses that the fit in a folder refined, if it did.
+
+    Raises:
+        ValueError: cameras.npz is not as the fit wrote it.
+    """
+    file = path / "cameras.npz"
+    if not file.is_file():
+        return photographs
+    arrays = read_arrays(file, ("names", "viewmats"), _AGAIN)
+    found = dict(zip(arrays["names"].tolist(), arrays["viewmats"], strict=True))
+    posed = zip(photographs.names, photographs.viewmats, strict=True)
+    viewmats = [about(found[name], photographs.origin) if name in found else given for name, given in posed]
+    return replace(photographs, viewmats=np.stack(viewmats).astype(np.float64))
 
 
 def scene_of_file(
@@ -178,14 +194,3 @@ def _split(photographs: Photographs, every: int) -> tuple[list[int], list[int]]:
 def _read(file: Path) -> Read:
     gaussians, report = read_gaussians(file)
     return jax.tree.map(jnp.asarray, gaussians), report
-
-
-def _as_learned(photographs: Photographs, file: Path) -> Photographs:
-    """The photographs with the poses that the fit refined, if it did."""
-    if not file.is_file():
-        return photographs
-    arrays = read_arrays(file, ("names", "viewmats"), _AGAIN)
-    found = dict(zip(arrays["names"].tolist(), arrays["viewmats"], strict=True))
-    posed = zip(photographs.names, photographs.viewmats, strict=True)
-    viewmats = [about(found[name], photographs.origin) if name in found else given for name, given in posed]
-    return replace(photographs, viewmats=np.stack(viewmats).astype(np.float64))

@@ -95,7 +95,7 @@ def list_experiments(options: List) -> int:
         counts = ", ".join(f"{n} {word}" for n, word in ((failed, "failed"), (stale, "stale")) if n)
         when = max((r["finished"][:16].replace("T", " ") for r in records), default="–")
         grid.add_row(*map(Text, (name, experiment.config.claim.strip(), done, counts, when)))
-    stdout().print(grid if names else f"{options.root} has no NAME/config.yaml")
+    stdout().print(grid if names else Text(f"{options.root} has no NAME/config.yaml"))
     return 2 if broken else 0
 
 

@@ -202,7 +202,7 @@ def write_film(
     sequence, origin = saved.recording.judged, saved.recording.judged.origin
     view = sequence.camera(0, sequence.camera_ids.index(camera))
     fps = script.fps or 1 / float(np.median(np.diff(saved.recording.tracked.times)))
-    seconds, stopped = [], False
+    seconds, stopped = [], None
     with VideoWriter(folder / VIDEO, fps) as video:
         try:
             for shot in watch(shots(film, view, saved), len(film[0].trajectory.times)):
@@ -211,15 +211,16 @@ def write_film(
                 video.write(shot.image)
                 seconds.append(shot.seconds)
         except KeyboardInterrupt as interrupt:
-            stopped = True
-            after = f"after {counted(len(seconds), 'frame')} by {reason(interrupt)}"
+            stopped = reason(interrupt)
+            after = f"after {counted(len(seconds), 'frame')} by {stopped}"
             notes.add(f"This film is not complete: it was stopped {after}.")
     warm = [each for each in seconds if each is not None]
     found = {
         "kind": "edit",
         "dataset": sequence.name,
         "run": str(saved.path.absolute()),
-        "complete": not stopped,
+        "complete": stopped is None,
+        "stopped": stopped,
         "camera": camera,
         "frames": len(seconds),
         "fps": round(fps, 6),

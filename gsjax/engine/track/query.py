@@ -12,6 +12,7 @@ from jaxtyping import Int
 from rich.console import Console
 from rich.progress import track
 from rich.table import Table
+from rich.text import Text
 
 from gsjax.engine.folder import OF_QUERY, replaced_folder
 from gsjax.engine.messages import Notes
@@ -199,5 +200,5 @@ def _print_scores(scores: dict[str, float], best: str) -> None:
     table.add_column("object")
     table.add_column("cosine", justify="right")
     for name, score in _ranked(scores):
-        table.add_row(name, f"{score:.3f}", style="bold green" if name == best else None)
+        table.add_row(Text(name), f"{score:.3f}", style="bold green" if name == best else None)
     Console(highlight=False).print(table)

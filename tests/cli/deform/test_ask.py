@@ -102,10 +102,12 @@ def test_a_scene_that_began_on_a_plane_has_no_millimetres(gsjax, tmp_path):
         assert float(deep[1]) == pytest.approx(per_cent, abs=2)
 
 
-def test_without_a_question_it_says_what_can_be_asked(gsjax, scene):
+def test_without_a_question_it_says_what_can_be_asked(gsjax, scene, tmp_path):
     code, said = gsjax("ask", scene)
     assert code == 0
     assert "X and Y are of: tissue, tool F and G are frames: 5 to 7" in said
+    said = gsjax("ask", written(tmp_path / "run", names=("tissue", "tool[left]")))[1]
+    assert "X and Y are of: tissue, tool[left] F" in said
     assert all(kind.name in said for kind in QUESTIONS)
 
 

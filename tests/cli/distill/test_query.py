@@ -106,6 +106,9 @@ def test_a_text_within_another_finds_what_both_mean(gsjax, field, closed, scene,
     code, said = gsjax("query", field, "ball", "--within", "can")
     assert code == 2
     assert "'ball' within 'can' matches nothing in this scene" in said
+    assert gsjax("query", field, "ball", "--within", "can", "--top", "5")[0] == 0
+    best = json.loads((field / "query" / "query.json").read_text())["best_score"]
+    assert best == pytest.approx(found_of(field)["scores"].max(), abs=1e-5)  # not that of the ball
 
 
 @pytest.mark.thorough

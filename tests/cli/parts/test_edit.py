@@ -283,17 +283,18 @@ def test_an_earlier_film_is_replaced_when_asked(gsjax, run, tmp_path):
     assert {path.name for path in out.iterdir()} == {"edit.yaml", "metrics.json", "video.mp4", "mine.txt"}
 
 
-def test_a_film_that_is_stopped_can_be_watched(gsjax, run, monkeypatch):
+@pytest.mark.parametrize(("signal", "by"), [((), "Ctrl-C"), (("SIGTERM",), "SIGTERM")])
+def test_a_film_that_is_stopped_can_be_watched(gsjax, run, monkeypatch, signal, by):
     def stopped(*arguments):
         for count, shot in enumerate(shots(*arguments)):
             if count == 2:
-                raise KeyboardInterrupt
+                raise KeyboardInterrupt(*signal)
             yield shot
 
     monkeypatch.setattr(films, "shots", stopped)
     code, said = gsjax("edit", run, "--op", "speed:parts=drawer,factor=2")
     assert code == 130
-    assert "2 frames of 4 (stopped by Ctrl-C)" in said
+    assert f"2 frames of 4 (stopped by {by})" in said
     folder = run / "edit" / "ops"
     assert describe_video(folder / "video.mp4").frames == 2
     found = json.loads((folder / "metrics.json").read_text())

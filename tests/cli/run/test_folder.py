@@ -1,6 +1,7 @@
 import dataclasses
 import enum
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -94,6 +95,35 @@ def test_overwriting_clears_the_run_and_nothing_else(finished):
     run.write_config(Config())
     assert contents(run) == ["config.yml", "my notes.txt"]
     assert not is_finished(run.path)
+
+
+@pytest.mark.parametrize("text", ["", "{", "[]"])
+def test_a_run_with_damaged_scores_can_be_replaced_as_the_message_says(finished, text):
+    finished.metrics.write_text(text)
+    with pytest.raises(ValueError, match="replace the run with --overwrite"):
+        RunFolder(finished.path)
+    RunFolder(finished.path, overwrite=True).write_config(Config())
+    assert contents(finished) == ["config.yml", "my notes.txt"]
+
+
+def test_a_removal_that_was_stopped_can_be_gone_on_with(finished, monkeypatch):
+    def stopped(path):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patched:
+        patched.setattr(shutil, "rmtree", stopped)
+        with pytest.raises(KeyboardInterrupt):
+            RunFolder(finished.path, overwrite=True).write_config(Config())
+    RunFolder(finished.path, overwrite=True).write_config(Config())
+    assert contents(finished) == ["config.yml", "my notes.txt"]
+
+
+def test_of_a_link_only_the_link_is_removed(finished, tmp_path):
+    shutil.move(finished.path / "renders", tmp_path / "large")
+    (finished.path / "renders").symlink_to(tmp_path / "large")
+    RunFolder(finished.path, overwrite=True).write_config(Config())
+    assert not (finished.path / "renders").is_symlink()
+    assert (tmp_path / "large/0/000005.png").is_file()
 
 
 def test_unfinished_run_is_replaced_where_it_left_nothing_to_resume(finished):

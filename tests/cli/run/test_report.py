@@ -1,4 +1,5 @@
 import base64
+import os
 import re
 from html.parser import HTMLParser
 
@@ -176,3 +177,9 @@ def test_the_terminal_shows_what_the_report_does(capsys, tmp_path):
 )
 def test_numbers_read_well(value, text):
     assert format_number(value) == text
+
+
+def test_a_name_that_is_not_utf_8_is_shown_as_far_as_it_is(tmp_path):
+    name = os.fsdecode(b"donn\xe9es")
+    write_report(tmp_path / "report.html", Summary(title=name, hints=[("view", f"gsjax view {name}")]))
+    assert (tmp_path / "report.html").read_text(encoding="utf-8").count("donn?es") == 3

@@ -15,6 +15,7 @@ from rich.console import Console
 from gsjax.cli import main
 from gsjax.engine.messages import Notes
 from gsjax.engine.teaching.source import Source
+from gsjax.engine.track import query
 from gsjax.engine.track.grasp import Options, _obstacle_rows, draw_grasp
 from gsjax.engine.track.query import Answer
 from gsjax.engine.track.saved import SavedRun
@@ -302,3 +303,8 @@ def test_what_is_beside_the_end_of_a_long_object_is_an_obstacle(tmp_path):
     saved = Mock(spec=SavedRun, names={1: "bar"}, tracking=tracking)
     answer = Answer(1, "bar", {}, 0.0, 0.0, np.arange(41))
     assert _obstacle_rows(Options(tmp_path, "bar"), saved, answer, means).tolist() == [41]
+
+
+def test_brackets_in_the_name_of_an_object_are_printed(capsys):
+    query._print_scores({"can[red]": 0.5}, "can[red]")
+    assert "can[red]" in capsys.readouterr().out

@@ -18,8 +18,10 @@ from plyfile import PlyData, PlyElement
 import gsjax
 from gsjax.engine.distill.saved import Locations
 from gsjax.engine.viewables import open_viewable
+from gsjax.io.atomic import write_npz
 from gsjax.io.ply import read_ply, write_ply
 from gsjax.methods.parts import gaussians_at, moment
+from gsjax.viz.viewer import open_viewer
 from tests.cli.parts.test_edit import scene_and_trajectory
 from tests.cli.parts.test_edit import write_run as write_parts_run
 from tests.cli.view.conftest import some
@@ -51,6 +53,14 @@ def test_a_fit_whose_photographs_are_gone_is_shown_without(fitted, notes):
     assert scene.shots is None
     assert scene.antialiased
     assert any("its photographs are not shown: /nowhere/at/all" in note for note in notes.all)
+
+
+def test_photographs_of_a_fit_stand_where_it_moved_them(fitted, notes):
+    given = open_viewable(fitted, notes)[0].shots
+    refined = given.viewmats[0].copy()
+    refined[:, :3, 3] += 0.01
+    write_npz(fitted / "cameras.npz", {"names": np.array(given.names), "viewmats": refined})
+    np.testing.assert_allclose(open_viewable(fitted, notes)[0].shots.viewmats[0], refined)
 
 
 def test_photographs_of_a_fit_that_moved(fitted, photographs, notes):
@@ -97,6 +107,13 @@ def test_a_tracked_scene_whose_recording_is_gone_still_moves(tracked, recording,
     assert scene.times is None
     assert any("its recording is not shown" in note for note in notes.all)
     assert scene.name_of(0) == "object 1"
+
+
+def test_a_tracked_run_without_scores_yet_is_shown(tracked, notes):
+    (tracked / "metrics.json").unlink()
+    scene, _ = open_viewable(tracked, notes)
+    assert (scene.num_frames, scene.shots) == (4, None)
+    assert any("found no metrics.json" in note for note in notes.all)
 
 
 def test_a_damaged_trajectory_is_said(tracked, view):
@@ -240,6 +257,16 @@ def test_it_says_where_and_what_and_ends_by_ctrl_c(view, ply):
     assert "the browser gets the 10 most opaque of 30 Gaussians" in said
     assert "everyone" not in said
     assert "viser" not in said
+
+
+def test_the_address_is_printed_whole(view, ply, monkeypatch):
+    def elsewhere(*arguments, **options):
+        viewer = open_viewer(*arguments, **options)
+        viewer.url = "http://[fd00::1]:8080"
+        return viewer
+
+    monkeypatch.setattr("gsjax.cli.view.open_viewer", elsewhere)
+    assert "view http://[fd00::1]:8080 " in view(ply, "--port", "0")[1]
 
 
 def test_a_port_in_use(view, ply, monkeypatch):

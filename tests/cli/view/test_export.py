@@ -203,6 +203,23 @@ def test_what_is_refused(export, ply, tmp_path):
     assert "expected a file, found a folder" in said
 
 
+def test_brackets_in_a_name_are_printed(export, ply):
+    out = ply.parent / "a[" / "made[final].ply"
+    code, said = export(ply, out)
+    assert code == 0
+    assert f"writing {out}" in said
+    assert f"scene {out}: 30 Gaussians" in said
+    assert export(ply, ply.parent / "a[" / "[/b].ply")[0] == 0
+
+
+def test_a_file_of_a_run_is_not_replaced(export, fitted):
+    before = (fitted / "scene.ply").read_bytes()
+    code, said = export(fitted, fitted / "scene.ply", "--overwrite")
+    assert code == 2
+    assert "scene.ply: expected another file than one that a run wrote" in said
+    assert (fitted / "scene.ply").read_bytes() == before
+
+
 def test_labels_go_with_a_ply(export, ply, tmp_path):
     """A file of labels that is there already belongs to the user, and is not replaced unasked."""
     out, beside = tmp_path / "made" / "out.ply", tmp_path / "made" / "out_labels.npz"
