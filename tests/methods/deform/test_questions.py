@@ -182,6 +182,19 @@ class TestParsing:
         assert parse_question("How far is the tissue from the camera in frame 11?", NAMES).kind == "depth"
         assert parse_question("How far away is the tissue in frame 11?", NAMES).kind == "depth"
 
+    @pytest.mark.parametrize(
+        ("question", "names", "row"),
+        [
+            ("Is there a clamp in frame 5?", ("tissue", "clamps"), 1),
+            ("How many arteries are there in frame 5?", ("tissue", "artery"), 1),
+            ("Is there an artery in frame 5?", ("tissue", "arteries"), 1),
+            ("Are there clips in frame 5?", ("clip", "clips"), 1),
+            ("Is there a clip in frame 5?", ("clips", "clip"), 1),
+        ],
+    )
+    def test_singular_and_plural_are_one_class_unless_both_are_names(self, question, names, row):
+        assert parse_question(question, names).things == (row,)
+
     def test_names_may_be_parts_of_each_other(self):
         names = ("left lobe", "lobe", "lobe of a lung")
         for row, name in enumerate(names):
