@@ -105,6 +105,11 @@ class TestAnswers:
         assert (found.value, found.unit) == (pytest.approx(value, abs=0.6) if unit else value, unit)
         assert found.text.endswith(".")
 
+    def test_whether_they_touch_is_unknown_without_a_distance(self, facts):
+        blind = replace(facts, gaps=np.full_like(facts.gaps, np.nan))
+        found = ask("do the tissue and the needle driver touch in frame 12", blind)
+        assert found == ("Their distance is not known.", None, "")
+
     def test_a_motion_has_its_true_length(self, facts):
         one, other = (made_up(t).points[1] for t in (12 - 10, 13 - 10))
         found = ask("how far does the needle driver move between frames 12 and 13", facts)
