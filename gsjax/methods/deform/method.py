@@ -181,13 +181,14 @@ class Deform:
         gate, graph = (
             config.warmup + round(share * config.iterations) for share in (_GATE_AFTER, config.graph.after)
         )
-        if step == config.warmup and run.params.field is None:
+        if step >= config.warmup and run.params.field is None:
             scene, moving = with_field(config, problem, run.params)
             run = run.having(params=scene, state=jax.jit(self.step.init)(scene), kept=Kept(moving))
         moving, graphs = run.kept
+        # No later, as a field that was added late has moved nothing yet.
         if step == gate and config.moving_share < 1 and moving is None:
             moving = _farthest_moved(run.params, problem.seen, config.moving_share)
-        if step == graph and graphs is None:
+        if step >= graph and graphs is None:
             graphs = _graphs(config, problem, run.params, moving)
         return run.having(kept=Kept(moving, graphs))
 
