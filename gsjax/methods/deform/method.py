@@ -321,7 +321,7 @@ def _check(frames: Sequence[Frame], config: DeformConfig, lesson: Lesson | None)
         raise ValueError(
             "masks: expected pixels that count, found none in any frame; are the masks inverted?"
         )
-    times = [float(frame.time) for frame in frames if frame.time is not None]
+    times = times_of(frames).tolist()
     if config.refine_poses and len(set(times)) < len(times):
         raise ValueError(
             f"refine_poses: expected frames at different times, between which poses are interpolated, found "
