@@ -293,6 +293,12 @@ class TestOfAScene:
         np.testing.assert_allclose(found.shares.sum(), 1, atol=1e-6)
         np.testing.assert_allclose(found.centers[0, 1], (0.4, 0.4, 80), atol=1)
 
+    @pytest.mark.thorough
+    def test_a_single_class_is_all_that_is_drawn(self, wall):
+        found = scene_facts(replace(wall, meaning=Meaning(None, ("tissue",), np.eye(1, 3), np.eye(3))), [0])
+        assert found.gaussians.tolist() == [wall.scene.gaussians.num]
+        np.testing.assert_allclose(found.shares, 1)
+
     def test_without_meaning_there_are_none(self, wall):
         bare = DeformingScene(eqx.tree_at(lambda g: g.features, wall.scene.gaussians, None))
         for result in (replace(wall, meaning=None), replace(wall, scene=bare)):
