@@ -242,7 +242,9 @@ def _counted_names(
 ) -> dict[int, str]:
     """The mask values that count, with their names; notes which are left out."""
     values = sorted({int(v) for mask in masks if mask is not None for v in np.unique(mask)})
-    names = {TISSUE: "tissue"} | sequence.names_of_labels
+    given = sequence.names_of_labels
+    rest = "background" if "tissue" in map(str.lower, given.values()) else "tissue"
+    names = {TISSUE: rest} | given
     called = {value: names.get(value, f"object {value}") for value in values if value >= TISSUE}
     gone = [v for v in called if tools == "leave-out" and _is_tool(v, sequence, tool_values)]
     if gone:

@@ -41,10 +41,12 @@ def with_depth(sequence: Sequence, wanted: Depth, plane: float, notes: Notes) ->
         ValueError: there is no depth of the wanted kind.
     """
     two = sequence.num_cameras > 1
-    if wanted == "data" and not sequence.has_depth:
+    frames = range(sequence.num_frames) if wanted in ("auto", "data") else ()
+    own = any(sequence.depth(t, 0) is not None for t in frames)
+    if wanted == "data" and not own:
         raise ValueError(
-            f"--depth data: {sequence.name} has none; leave it at auto, or put depth of a network beside the "
-            "frames, as EndoNeRF has it (docs/data.md)"
+            f"--depth data: {sequence.name} has none of camera {sequence.camera_ids[0]}; leave it at auto, "
+            "or put depth of a network beside the frames, as EndoNeRF has it (docs/data.md)"
         )
     if wanted == "stereo" and not two:
         raise ValueError(
@@ -56,7 +58,7 @@ def with_depth(sequence: Sequence, wanted: Depth, plane: float, notes: Notes) ->
             f"--depth hull: {sequence.name} is seen from one place; expected a camera that goes around the "
             "scene; leave it at auto"
         )
-    if wanted == "data" or (wanted == "auto" and sequence.has_depth):
+    if own:
         return sequence, "data"
     if wanted == "stereo" or (wanted == "auto" and two):
         return _from_stereo(sequence, notes)

@@ -204,5 +204,8 @@ def short_names(names: Sequence[str]) -> tuple[str, ...]:
         short = [part[0] for part in parts]
         if len(set(short)) == len(short):
             return tuple(short)
-    flat = [str(Path(name).with_suffix("")).replace("/", "_") for name in names]
-    return tuple(flat) if len(set(flat)) == len(flat) else tuple(name.replace("/", "_") for name in names)
+    full = [name.replace("/", "_") for name in names]
+    for short in ([str(Path(name).with_suffix("")).replace("/", "_") for name in names], full):
+        if len(set(short)) == len(short):
+            return tuple(short)
+    return tuple(f"{i}_{name}" for i, name in enumerate(full))

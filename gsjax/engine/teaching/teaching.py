@@ -342,7 +342,9 @@ def _names(views: list[_View], known: Mapping[int, str]) -> dict[int, str]:
     there = sorted({label for view in views for label in view.labels.tolist() if label > 0})
     if there == [1] and not known:
         return {0: "background", 1: "foreground"}
-    return {0: "background"} | {label: known.get(label, f"object {label}") for label in there}
+    names = {label: known.get(label, f"object {label}") for label in there}
+    rest = "unlabelled" if "background" in map(str.lower, names.values()) else "background"
+    return {0: rest} | names
 
 
 def _ids(views: list[list[_View]] | None) -> list[np.ndarray] | None:

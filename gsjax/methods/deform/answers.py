@@ -110,8 +110,10 @@ def _distance(asked: Question, facts: SceneFacts, rows: list[int]) -> Answer:
 
 def _touch(asked: Question, facts: SceneFacts, rows: list[int]) -> Answer:
     value = facts.gaps[rows[0], asked.things[0], asked.things[1]]
+    if (absent := _absent(asked, facts, rows[0])) is not None:
+        return Answer(f"No: {absent}", False)
     if not np.isfinite(value):
-        return Answer(f"No: {_absent(asked, facts, rows[0]) or 'their distance is not known.'}", False)
+        return _unknown(asked, facts, rows[0], "Their distance")
     touch = bool(value < TOUCH)
     return Answer(f"{_yes(touch)}, they are {_length(value, facts)} apart where they are nearest.", touch)
 

@@ -185,7 +185,8 @@ def _drawn(
     drawn = render(now, camera, plan)
     assert drawn.features is not None
     likely = prompt_probabilities(drawn.features[0], codebook)
-    shown = (drawn.alphas[0] > _LEAST_ALPHA) & (likely.max(axis=-1) > likely.min(axis=-1))
+    apart = (likely.shape[-1] == 1) | (likely.max(axis=-1) > likely.min(axis=-1))  # as in `most_likely`
+    shown = (drawn.alphas[0] > _LEAST_ALPHA) & apart
     labels = jnp.where(shown, likely.argmax(axis=-1), -1)
     return (now.means, labels, drawn.depths[0]), drawn.meta._replace(features=None)
 

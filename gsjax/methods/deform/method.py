@@ -181,13 +181,14 @@ class Deform:
         gate, graph = (
             config.warmup + round(share * config.iterations) for share in (_GATE_AFTER, config.graph.after)
         )
-        if step == config.warmup and run.params.field is None:
+        if step >= config.warmup and run.params.field is None:
             scene, moving = with_field(config, problem, run.params)
             run = run.having(params=scene, state=jax.jit(self.step.init)(scene), kept=Kept(moving))
         moving, graphs = run.kept
+        # No later, as a field that was added late has moved nothing yet.
         if step == gate and config.moving_share < 1 and moving is None:
             moving = _farthest_moved(run.params, problem.seen, config.moving_share)
-        if step == graph and graphs is None:
+        if step >= graph and graphs is None:
             graphs = _graphs(config, problem, run.params, moving)
         return run.having(kept=Kept(moving, graphs))
 
@@ -320,7 +321,7 @@ def _check(frames: Sequence[Frame], config: DeformConfig, lesson: Lesson | None)
         raise ValueError(
             "masks: expected pixels that count, found none in any frame; are the masks inverted?"
         )
-    times = [float(frame.time) for frame in frames if frame.time is not None]
+    times = times_of(frames).tolist()
     if config.refine_poses and len(set(times)) < len(times):
         raise ValueError(
             f"refine_poses: expected frames at different times, between which poses are interpolated, found "

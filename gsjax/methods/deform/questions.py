@@ -202,12 +202,16 @@ def plain_words(text: str) -> str:
 
 
 def _thing(words: str, names: Sequence[str]) -> int | None:
-    """The row of the class of this name, also in the plural; None if there is none."""
-    for row, name in enumerate(names):
-        plain = plain_words(name)
-        if words in (plain, f"{plain}s", f"{plain}es"):
-            return row
-    return None
+    """The row of the class of this name, else of its singular or plural; None if there is none."""
+    known = [plain_words(name) for name in names]
+    if words in known:  # "clip" and "clips" may both be names
+        return known.index(words)
+    rows = (row for row, name in enumerate(known) if words in _plurals(name) or name in _plurals(words))
+    return next(rows, None)
+
+
+def _plurals(word: str) -> set[str]:
+    return {f"{word}s", f"{word}es", re.sub("y$", "ies", word)}
 
 
 def _check(kind: QuestionType, text: str, things: Sequence[int | None], frames: tuple[int, ...]) -> None:

@@ -287,16 +287,17 @@ def _after_vote(field: FeatureField, state: SolveState, neighbors, smoothness: f
     belong to none."""
     seen = state.mass > _LEAST
     votes = jnp.where(seen[:, None], state.total / jnp.maximum(state.mass, _LEAST)[:, None], 0.0)
+    votes = _zero_unlabelled(votes, state)
     tie = smoothness * state.mass.sum() / jnp.maximum(seen.sum(), 1)
     found = _spread(votes, seen | _unlabelled(state), neighbors)
-    field = eqx.tree_at(lambda f: f.encoding, field, _zero_unlabelled(found, state))
+    field = eqx.tree_at(lambda f: f.encoding, field, found)
     return field, state._replace(rhs=state.total, tie=tie)
 
 
 def _first_residual(field: FeatureField, state: SolveState, neighbors):
     """After the product with the initial guess: the residual, which gives the first search direction."""
     x = field.encoding
-    residual = state.rhs - state.total - state.tie * _laplacian(x, neighbors)
+    residual = _zero_unlabelled(state.rhs - state.total - state.tie * _laplacian(x, neighbors), state)
     assert state.conjugate is not None
     first = turned(state.conjugate, residual, _preconditioner(state, neighbors))
     return field, state._replace(conjugate=first, loss=_objective(x, residual, state))
@@ -306,9 +307,10 @@ def _cg_step(field: FeatureField, state: SolveState, neighbors):
     """After the product with a search direction: an iteration of conjugate gradients."""
     assert state.conjugate is not None
     product = state.total + state.tie * _laplacian(state.conjugate.direction, neighbors)
+    product = _zero_unlabelled(product, state)  # they are no unknowns: their residual stays zero, too
     scale = _preconditioner(state, neighbors)
     x, after = advanced(field.encoding, state.conjugate, product, scale)
-    field = eqx.tree_at(lambda f: f.encoding, field, _zero_unlabelled(x, state))
+    field = eqx.tree_at(lambda f: f.encoding, field, x)
     return field, state._replace(conjugate=after, loss=_objective(x, after.residual, state))
 
 
@@ -318,7 +320,7 @@ def _unlabelled(state: SolveState) -> Bool[Array, "n"]:
 
 
 def _zero_unlabelled(x: Float[Array, "n r"], state: SolveState) -> Float[Array, "n r"]:
-    """The vectors, zero for unlabelled Gaussians."""
+    """The rows, zero for unlabelled Gaussians, whose vectors are fixed at zero."""
     return jnp.where(_unlabelled(state)[:, None], 0.0, x)
 
 

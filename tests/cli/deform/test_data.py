@@ -45,6 +45,12 @@ def test_tools_are_left_out_by_name_and_other_classes_are_learned():
     assert "instrument-shaft; kept: background-tissue, kidney-parenchyma" in said
 
 
+def test_a_class_may_be_named_tissue():
+    """Label 0 is then the background."""
+    data, _ = read(recording(masked=[0, 2], names={KIDNEY: "Tissue", SHAFT: "instrument-shaft"}))
+    assert data.names == ("background", "Tissue")
+
+
 def test_tools_may_be_named_by_value():
     data, _ = read(recording(), tool_values=(KIDNEY,))
     assert data.names == ("background-tissue", "instrument-shaft")

@@ -95,6 +95,19 @@ def test_what_there_is_is_taken_first():
         with_depth(together, "auto", 1.0, notes)
 
 
+def test_depth_of_another_camera_is_not_that_of_the_training_camera():
+    notes, both = Notes(Console(quiet=True)), open_sequence(EYES)
+    left = replace(both, load_depth=lambda t, c: both.load_depth(t, c) if c == 0 else None)
+    assert with_depth(left.select(cameras=[0, 1]), "auto", 1.0, notes)[1] == "data"
+    assert with_depth(left.select(cameras=[1]), "auto", 1.0, notes)[1] == "plane"
+    for cameras in ([1], [1, 0]):
+        with pytest.raises(ValueError, match=r"--depth data: .* has none of camera 1; leave it at auto"):
+            with_depth(left.select(cameras=cameras), "data", 1.0, notes)
+    # Matching needs the left eye first.
+    swapped = replace(left.select(cameras=[1, 0]), viewmats=both.viewmats)
+    assert with_depth(swapped, "auto", 1.0, notes)[1] == "stereo"
+
+
 @pytest.mark.thorough
 def test_in_python_each_kind_of_warning_is_given_once():
     grey = replace(open_sequence(EYES), load_image=lambda t, c: np.full((80, 96, 3), 9 + c, np.uint8))
@@ -113,7 +126,7 @@ def test_photographs_that_were_placed_are_frames(gsjax, photographs, tmp_path):
     (table / "transforms.json").write_text(json.dumps(told))
     code, said = gsjax("deform", table, "--out", tmp_path / "run", "--frames", "0:3", "--depth", "data")
     assert code == 2
-    assert "--depth data: table has none" in said
+    assert "--depth data: table has none of camera 0" in said
     sequence = sequence_of(open_photographs(table))
     assert (sequence.num_frames, sequence.camera_ids) == (9, (0,))
     np.testing.assert_array_equal(sequence.image(1, 0), open_photographs(table).image(7))
@@ -129,7 +142,7 @@ def test_photographs_that_were_placed_are_frames(gsjax, photographs, tmp_path):
 def test_what_is_not_there_is_named(gsjax, clip, tmp_path):
     code, said = gsjax("deform", clip, "--out", tmp_path / "run", "--depth", "data")
     assert code == 2
-    assert "--depth data: pulled has none; leave it at auto" in said
+    assert "--depth data: pulled has none of camera 0; leave it at auto" in said
     code, said = gsjax("deform", clip, "--out", tmp_path / "run", "--depth", "stereo")
     assert code == 2
     assert "--depth stereo: pulled has one camera, 0; expected a second one to its right" in said

@@ -114,3 +114,4 @@ def test_photographs_have_short_names():
     assert short_names(["3/000000", "12/000000"]) == ("3", "12")
     assert short_names(["images/a.jpg", "images/b.jpg"]) == ("images_a", "images_b")
     assert short_names(["a.png", "a.jpg"]) == ("a.png", "a.jpg")
+    assert short_names(["a/b.png", "a_b.png"]) == ("0_a_b.png", "1_a_b.png")

@@ -58,6 +58,8 @@ def test_held_out_views_are_asked_about_in_the_terms_of_those_that_taught(featur
         assert others.ids[0][0, 4] == -1  # what 5 is was not taught
     one_more = taught(photographs([TWO, THREE]), [0], TeacherChoice(features))
     assert one_more.source.names == {1: "background", 2: "foreground"}
+    named = taught(photographs([THREE], {1: "Background", 2: "cup"}), [0], TeacherChoice(features))
+    assert named.source.names == {1: "unlabelled", 2: "Background", 3: "cup"}
     assert one_more.of(1).dimension == one_more.teacher.dimension
 
 

@@ -163,6 +163,14 @@ class TestLearning:
         assert next(i for i, info in enumerate(infos) if "node" in info) == 8 + 35
 
     @pytest.mark.thorough
+    def test_a_run_continued_past_a_stage_of_its_config_enters_it(self, frames, lesson):
+        """Regression test: with a shorter warm-up than the earlier config's, the scene never deformed."""
+        problem, run = Deform(CONFIG).start(frames, lesson)
+        after = Deform(CONFIG).between(problem, run.having(step=60), 0.8)
+        assert after.params.field is not None
+        assert len(after.kept.graphs) == len(frames)
+
+    @pytest.mark.thorough
     def test_depth_that_is_not_finite_is_unknown(self, frames):
         depths = frames[0].depths.copy()
         depths[0, 10, 10], depths[0, 11, 11] = np.nan, np.inf

@@ -122,6 +122,12 @@ class TestRefining:
         _, run = Deform(replace(CONFIG, refine_poses=False)).start(askew)
         assert run.params.twists is None
 
+    def test_frames_without_a_time_share_one(self, askew):
+        for count in (2, len(askew)):
+            timeless = [replace(frame, time=None) for frame in askew[:count]]
+            with pytest.raises(ValueError, match="refine_poses: expected frames at different times"):
+                Deform(CONFIG).start([*timeless, *askew[count:]])
+
     @pytest.mark.slow
     def test_gradients_are_of_the_frames_own_twist(self, learned):
         problem, run = learned.problem, learned.run

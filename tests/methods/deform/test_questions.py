@@ -105,6 +105,11 @@ class TestAnswers:
         assert (found.value, found.unit) == (pytest.approx(value, abs=0.6) if unit else value, unit)
         assert found.text.endswith(".")
 
+    def test_whether_they_touch_is_unknown_without_a_distance(self, facts):
+        blind = replace(facts, gaps=np.full_like(facts.gaps, np.nan))
+        found = ask("do the tissue and the needle driver touch in frame 12", blind)
+        assert found == ("Their distance is not known.", None, "")
+
     def test_a_motion_has_its_true_length(self, facts):
         one, other = (made_up(t).points[1] for t in (12 - 10, 13 - 10))
         found = ask("how far does the needle driver move between frames 12 and 13", facts)
@@ -181,6 +186,19 @@ class TestParsing:
     def test_the_camera_is_not_a_class(self):
         assert parse_question("How far is the tissue from the camera in frame 11?", NAMES).kind == "depth"
         assert parse_question("How far away is the tissue in frame 11?", NAMES).kind == "depth"
+
+    @pytest.mark.parametrize(
+        ("question", "names", "row"),
+        [
+            ("Is there a clamp in frame 5?", ("tissue", "clamps"), 1),
+            ("How many arteries are there in frame 5?", ("tissue", "artery"), 1),
+            ("Is there an artery in frame 5?", ("tissue", "arteries"), 1),
+            ("Are there clips in frame 5?", ("clip", "clips"), 1),
+            ("Is there a clip in frame 5?", ("clips", "clip"), 1),
+        ],
+    )
+    def test_singular_and_plural_are_one_class_unless_both_are_names(self, question, names, row):
+        assert parse_question(question, names).things == (row,)
 
     def test_names_may_be_parts_of_each_other(self):
         names = ("left lobe", "lobe", "lobe of a lung")
@@ -274,6 +292,12 @@ class TestOfAScene:
         assert 81 <= found.shares[0, 1] * WIDTH * HEIGHT <= 11**2  # at most a pixel wider on each side
         np.testing.assert_allclose(found.shares.sum(), 1, atol=1e-6)
         np.testing.assert_allclose(found.centers[0, 1], (0.4, 0.4, 80), atol=1)
+
+    @pytest.mark.thorough
+    def test_a_single_class_is_all_that_is_drawn(self, wall):
+        found = scene_facts(replace(wall, meaning=Meaning(None, ("tissue",), np.eye(1, 3), np.eye(3))), [0])
+        assert found.gaussians.tolist() == [wall.scene.gaussians.num]
+        np.testing.assert_allclose(found.shares, 1)
 
     def test_without_meaning_there_are_none(self, wall):
         bare = DeformingScene(eqx.tree_at(lambda g: g.features, wall.scene.gaussians, None))

@@ -20,7 +20,9 @@ from gsjax.methods.distill import (
     teacher_of_objects,
     with_maps,
 )
-from gsjax.methods.distill.solve import basis_of
+from gsjax.methods.distill.field import FeatureField
+from gsjax.methods.distill.solve import SolveState, _after_vote, _cg_step, _first_residual, basis_of
+from gsjax.optim.conjugate_gradients import Conjugate
 from gsjax.scene.feature_grid import FeatureGrid, FeatureGridConfig
 from tests.methods.distill.two_balls import BOOK, DIMENSION, HEIGHT, WIDTH, cameras, painted, two_balls
 
@@ -110,6 +112,42 @@ def test_what_is_seen_and_in_no_mask_is_nothing(scene, preset):
     cosines = np.asarray(ticks.result.cosines(BOOK[1:2]))[:, 0]
     assert (cosines[labels == 1] > 0.99).all()
     assert (cosines[labels == 2] == 0).mean() > 0.8  # except at the outline of the first
+
+
+def small_state(A, b, shown):
+    """The state after the first pass over the pixels: the votes' sums, and a system without smoothness."""
+    zeros, zero, one = jnp.zeros_like(b), jnp.float32(0), jnp.float32(1)
+    begun, mass = Conjugate(zeros, zeros, zeros[0]), jnp.asarray(A.sum(1))
+    return SolveState(jnp.asarray(b), zeros, mass, jnp.asarray(shown), zero, begun, zero, one, zero)
+
+
+def test_what_is_beside_nothing_does_not_take_its_stray_vector():
+    """The second Gaussian has no mask but for a stray pixel; the third is in no pixel, beside both."""
+    mass, b = np.diag([1, 0.01, 0]).astype(np.float32), np.float32([[1, 0], [0, 0.01], [0, 0]])
+    state = small_state(mass, b, np.float32([1, 1, 0]))
+    field = FeatureField(jnp.zeros((3, 2)), jnp.eye(2))
+    field, _ = _after_vote(field, state, jnp.array([[1], [0], [1]]), 0.0)
+    np.testing.assert_array_equal(field.encoding, [[1, 0], [0, 0], [0, 0]])
+
+
+@pytest.mark.thorough
+def test_conjugate_gradients_keep_nothing_at_zero():
+    """They reach the least squares of the other Gaussians, and the loss is that of the solution."""
+    W = np.random.default_rng(0).uniform(size=(8, 5)).astype(np.float32) / 5
+    W[:, 4] *= 0.02
+    A, b = W.T @ W, W.T @ np.random.default_rng(1).uniform(size=(8, 2)).astype(np.float32)
+    neighbors = jnp.zeros((5, 1), jnp.int32)
+    shown = np.float32([1, 1, 1, 1, 100]) * A.sum(1)
+    field = FeatureField(jnp.zeros((5, 2)), jnp.eye(2))
+    field, state = _after_vote(field, small_state(A, b, shown), neighbors, 0.0)
+    for turn in range(1, 12):
+        x = field.encoding if turn == 1 else state.conjugate.direction
+        step = _first_residual if turn == 1 else _cg_step
+        field, state = step(field, state._replace(total=jnp.asarray(A) @ x), neighbors)
+        x = np.asarray(field.encoding)
+        np.testing.assert_allclose(state.loss, np.sum(x * (A @ x - 2 * b)), rtol=1e-4)
+    np.testing.assert_allclose(x[:4], np.linalg.solve(A[:4, :4], b[:4]), rtol=1e-2)
+    np.testing.assert_array_equal(x[4], 0)
 
 
 @pytest.mark.thorough
