@@ -155,14 +155,16 @@ def new_folder(parent: Path, name: str) -> Path:
 
     Raises:
         ValueError: the name is not valid for a folder.
+        OSError: no folder can be made in `parent`.
     """
     if not _NAME.fullmatch(name):
         raise ValueError(
             f"film name: expected letters, digits, spaces and any of . _ - after the first, found {name!r}"
         )
+    parent.mkdir(parents=True, exist_ok=True)
     for folder in chain([parent / name], (parent / f"{name}_{number}" for number in count(2))):
         with suppress(FileExistsError):
-            folder.mkdir(parents=True)
+            folder.mkdir()
             return folder
     raise AssertionError
 

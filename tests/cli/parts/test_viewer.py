@@ -210,6 +210,13 @@ def test_a_film_lies_in_the_run(run, name):
     assert not (run / "edit").exists()
 
 
+def test_where_no_folder_can_be_made_no_other_name_is_tried(run):
+    """The link leads to a disk that is gone."""
+    (run / "edit").symlink_to(run / "gone")
+    with pytest.raises(FileExistsError):
+        new_folder(run / "edit", "ops")
+
+
 def test_edits_that_cannot_be_done_leave_no_folder(run):
     with pytest.raises(ValueError, match="did you mean"):
         opened(run).editing.save(["freeze:parts=drawr"], "film", "camera 0", always)
