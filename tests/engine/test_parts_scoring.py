@@ -1,16 +1,58 @@
-"""A warning names parts that move farther than the scene is wide."""
+"""Parts against true joints, on the two parts of `test_edit`; and a warning of parts that move too far."""
 
 import io
+from dataclasses import replace
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from rich.console import Console
 
+from gsjax.data import open_sequence
+from gsjax.data.objects import Truth
 from gsjax.engine.messages import Notes
-from gsjax.engine.parts.scoring import warn_of_runaways
-from gsjax.methods.parts import PartScene
+from gsjax.engine.parts.scoring import part_rows, score_parts, warn_of_runaways
+from gsjax.engine.recording import Recording
+from gsjax.geometry.joints import Joint
+from gsjax.methods.parts import PartScene, PartsResult
 from gsjax.scene.initialize import gaussians_from_points
+from tests.cli.parts.test_edit import DATASET, scene_and_trajectory
+
+X = np.array([1.0, 0.0, 0.0])
+SLIDE = Joint("prismatic", X, np.zeros(3), np.array([0.0, 0.05, 0.1, 0.15]))  # that of part 1
+SHUT = replace(SLIDE, values=np.zeros(4))
+
+
+def truth_of(**joints):
+    """The truth of objects with these joints, by name."""
+    motions = np.stack([joint.motions() for joint in joints.values()], axis=1)
+    return Truth(tuple(joints), np.arange(1, len(joints) + 1), motions, joints=tuple(joints.values()))
+
+
+def scored(scene, trajectory, truth, anchor=0):
+    """The scores of a recording without masks and depth, and the row of part 1."""
+    joints = PartsResult(scene, trajectory, np.ones(4, bool), anchor, 1e-3, "quaternion").joints()
+    rows = part_rows(scene, trajectory, joints)
+    sequence = replace(open_sequence(DATASET), load_mask=None, load_depth=None, truth=truth)
+    recording, notes = Recording(sequence, sequence, 4), Notes(Console(quiet=True))
+    found = score_parts(scene, trajectory, joints, rows, recording, anchor, "quaternion", notes)
+    return found, rows[0]
+
+
+@pytest.mark.parametrize(("absent", "anchor"), [([2, 3], 0), ([0, 1], 3)])
+def test_the_joint_of_a_part_that_is_absent_from_some_frames_is_scored(absent, anchor):
+    scene, trajectory = scene_and_trajectory()
+    shown = np.ones((4, 3), np.float32)
+    shown[absent, 1] = 0
+    trajectory = eqx.tree_at(lambda t: t.opacities, trajectory, shown)
+    shifts = np.array(trajectory.poses.translations)
+    shifts -= shifts[anchor]
+    trajectory = eqx.tree_at(lambda t: t.poses.translations, trajectory, shifts)
+    _, row = scored(scene, trajectory, truth_of(drawer=SLIDE), anchor)
+    assert row["true_name"] == "drawer"
+    assert row["axis_deg"] < 0.1
+    assert row["value_mm"] < 0.1
 
 
 @pytest.mark.parametrize("moved_mm", [900.0, 5000.0])
