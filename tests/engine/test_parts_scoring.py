@@ -4,6 +4,7 @@ import io
 from dataclasses import replace
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -15,7 +16,8 @@ from gsjax.engine.messages import Notes
 from gsjax.engine.parts.scoring import part_rows, score_parts, warn_of_runaways
 from gsjax.engine.recording import Recording
 from gsjax.geometry.joints import Joint
-from gsjax.methods.parts import PartScene, PartsResult
+from gsjax.methods.parts import PartScene, PartsResult, motions_in_world
+from gsjax.scene.handles import HandlePose
 from gsjax.scene.initialize import gaussians_from_points
 from tests.cli.parts.test_edit import DATASET, scene_and_trajectory
 
@@ -53,6 +55,25 @@ def test_the_joint_of_a_part_that_is_absent_from_some_frames_is_scored(absent, a
     assert row["true_name"] == "drawer"
     assert row["axis_deg"] < 0.1
     assert row["value_mm"] < 0.1
+
+
+def test_the_error_of_points_is_their_distance_from_where_they_truly_are():
+    """Part 1 slides by 40 cm, and in the last frame it is also found turned by 2 degrees about its handle."""
+    scene, trajectory = scene_and_trajectory()
+    far = replace(SLIDE, values=np.array([0.0, 0.1, 0.2, 0.4]))
+    quats, shifts = map(np.array, jax.tree.leaves(trajectory.poses))
+    quats[3, 1] = np.cos(np.radians(1)), 0, 0, np.sin(np.radians(1))
+    shifts[:, 1, 0] = far.values
+    trajectory = eqx.tree_at(lambda t: t.poses, trajectory, HandlePose(*map(jnp.asarray, (quats, shifts))))
+    _, row = scored(scene, trajectory, truth_of(drawer=far))
+    points = np.asarray(scene.gaussians.means, np.float64)[np.asarray(scene.labels) == 1]
+    found, true = (
+        points @ motion[:3, :3].T + motion[:3, 3]
+        for motion in (motions_in_world(scene, trajectory)[3, 1], far.motions()[3])
+    )
+    assert row["point_error_mm"] == pytest.approx(
+        1000 * np.linalg.norm(found - true, axis=1).mean(), rel=1e-4
+    )
 
 
 @pytest.mark.parametrize("moved_mm", [900.0, 5000.0])

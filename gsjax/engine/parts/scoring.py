@@ -183,9 +183,8 @@ def _score_joints(
         left = {k: way for k, way in ways.items() if truth.names[k] not in found}
         if not len(points) or not left:
             continue
-        off = {
-            k: _farthest_mm(way @ np.linalg.inv(motions[:, row["part"]]), points) for k, way in left.items()
-        }
+        back = np.linalg.inv(motions[:, row["part"]])  # rigid: |motion x - way x| = |x - back way x|
+        off = {k: _farthest_mm(back @ way, points) for k, way in left.items()}
         best = min(off, key=off.__getitem__)
         if off[best] < 0.5 * row["moved_mm"]:
             found.add(truth.names[best])
