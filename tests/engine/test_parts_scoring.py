@@ -76,6 +76,11 @@ def test_the_error_of_points_is_their_distance_from_where_they_truly_are():
     )
 
 
+def test_an_object_that_does_not_move_is_not_missed():
+    found, _ = scored(*scene_and_trajectory(), truth_of(door=SHUT, drawer=SLIDE))
+    assert found == {"true_parts": 1, "missed": []}
+
+
 @pytest.mark.parametrize("moved_mm", [900.0, 5000.0])
 def test_a_part_that_moves_farther_than_the_scene_is_wide_is_warned_of(moved_mm):
     means = np.random.default_rng(0).uniform(size=(500, 3))  # in a cube of one metre, but for two

@@ -177,6 +177,10 @@ def _score_joints(
     means, labels = np.asarray(scene.gaussians.means, np.float64), np.asarray(scene.labels)
     motions, there = motions_in_world(scene, trajectory), np.asarray(trajectory.opacities) > 0
     ways = {k: relative_motion(truth.poses[:, k], anchor) for k in range(len(truth.names))}
+    still = [truth.names[k] for k, way in ways.items() if _farthest_mm(way, means) <= _STILL_MM]
+    if still:
+        notes.add(f"Counted as background, because they do not move: {', '.join(still)}.")
+    ways = {k: way for k, way in ways.items() if truth.names[k] not in still}
     found: set[str] = set()
     for row in sorted(rows, key=lambda row: -row["gaussians"]):
         points = means[labels == row["part"]]
@@ -191,10 +195,10 @@ def _score_joints(
             row |= {"true_name": truth.names[best], "point_error_mm": off[best]}
             shown = there[:, row["part"]]
             _score_joint(row, joints[row["part"]], truth.joints[best], points, anchor, shown)
-    missed = [name for name in truth.names if name not in found]
+    missed = [truth.names[k] for k in ways if truth.names[k] not in found]
     if missed:
         notes.warn(f"moving objects that no part was found for: {', '.join(missed)}")
-    return {"true_parts": len(truth.names), "missed": missed}
+    return {"true_parts": len(ways), "missed": missed}
 
 
 def _tracks(scene: PartScene, trajectory: Trajectory, blend: Blend) -> Float[np.ndarray, "T N 3"]:
