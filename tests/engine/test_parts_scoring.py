@@ -1,7 +1,9 @@
-"""Parts against true joints, on the two parts of `test_edit`; and a warning of parts that move too far."""
+"""Parts against true joints, on the two parts of `test_edit`; and warnings of parts that are doubtful."""
 
 import io
 from dataclasses import replace
+from pathlib import Path
+from unittest.mock import Mock
 
 import equinox as eqx
 import jax
@@ -13,10 +15,11 @@ from rich.console import Console
 from gsjax.data import open_sequence
 from gsjax.data.objects import Truth
 from gsjax.engine.messages import Notes
+from gsjax.engine.parts.run import Options, _warn_if_doubtful
 from gsjax.engine.parts.scoring import part_rows, score_parts, warn_of_runaways
 from gsjax.engine.recording import Recording
 from gsjax.geometry.joints import Joint
-from gsjax.methods.parts import PartScene, PartsResult, motions_in_world
+from gsjax.methods.parts import DiscoverConfig, PartScene, PartsConfig, PartsResult, Start, motions_in_world
 from gsjax.scene.handles import HandlePose
 from gsjax.scene.initialize import gaussians_from_points
 from tests.cli.parts.test_edit import DATASET, scene_and_trajectory
@@ -96,3 +99,13 @@ def test_a_part_that_moves_farther_than_the_scene_is_wide_is_warned_of(moved_mm)
         warn_of_runaways(rows, scene, notes)
         assert len(notes.all) == (moved_mm > 2000)
         assert all("2 (38 Gaussians)" in one for one in notes.all)
+
+
+def test_pieces_are_not_said_to_be_left_out_where_none_may_be():
+    """Three pieces remain whether three changed, or more."""
+    start = Mock(spec=Start, masks=np.array([[[1, 2, 3]]]))
+    parts = PartsConfig(discover=DiscoverConfig(most_parts=3))
+    with Notes(Console(file=io.StringIO())) as notes:
+        _warn_if_doubtful(start, 0.1, Options("data", Path("run"), parts=parts), notes)
+        (said,) = [one for one in notes.all if "--parts.discover.most-parts 3" in one]
+    assert "smaller ones, if any, were left out" in said
