@@ -144,7 +144,8 @@ def scene_and_trajectory(
 ) -> tuple[PartScene, Trajectory]:
     """The scene with its parts, with all Gaussians in their given order, and the trajectory of the parts.
 
-    Handles without Gaussians are left out; the others are moved to the centroids of their parts.
+    Handles without Gaussians are left out; the others are moved to the centroids of their parts. The times of
+    the trajectory begin at 0.
 
     Args:
         discovery: the discovery.
@@ -168,7 +169,8 @@ def scene_and_trajectory(
     scene = PartScene(*jax.device_put((gaussians, full, after)))
     absent, dtype = discovery.absent, poses.quats.dtype
     shown = None if absent is None else jnp.asarray(~absent[:, kept], dtype)
-    return scene, trajectory_of(jax.device_put(np.asarray(times, dtype)), poses, shown)
+    since = np.asarray(times, np.float64) - times[0]  # float32 cannot tell times of day apart
+    return scene, trajectory_of(jax.device_put(since.astype(dtype)), poses, shown)
 
 
 @jax.jit
