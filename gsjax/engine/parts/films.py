@@ -30,7 +30,7 @@ from gsjax.methods.parts.entries import relative
 from gsjax.methods.parts.film import Film, Layer, film_gaussians
 from gsjax.methods.parts.limits import Beyond, beyond_captured, describe_beyond
 from gsjax.methods.parts.operation import Edit
-from gsjax.methods.parts.operations import label
+from gsjax.methods.parts.operations import Composite, label
 from gsjax.methods.parts.timeline import LENGTHS, ROUND, LoadScene, Script, apply, parse_script, to_yaml
 from gsjax.methods.parts.trajectory import Trajectory
 from gsjax.optim.compiler import host_options
@@ -200,7 +200,8 @@ def write_film(
         (folder / name).unlink(missing_ok=True)
     shutil.rmtree(folder / _PLY, ignore_errors=True)
     with atomic_write(folder / SCRIPT) as temporary:
-        temporary.write_text(to_yaml(script), encoding="utf-8")
+        again = replace(script, edits=_from_anywhere(script.edits))
+        temporary.write_text(to_yaml(again), encoding="utf-8")
     sequence, origin = saved.recording.judged, saved.recording.judged.origin
     view = sequence.camera(0, sequence.camera_ids.index(camera))
     fps = script.fps or 1 / float(np.median(np.diff(saved.recording.tracked.times)))
@@ -233,6 +234,16 @@ def write_film(
     }
     write_json(folder / _METRICS, found)
     return found
+
+
+def _from_anywhere(edits: tuple[Edit, ...]) -> tuple[Edit, ...]:
+    """The edits with absolute paths of other runs, so that they can be read from any working directory."""
+    return tuple(
+        replace(edit, from_run=str(Path(edit.from_run).absolute()), edits=_from_anywhere(edit.edits))
+        if isinstance(edit, Composite)
+        else edit
+        for edit in edits
+    )
 
 
 def frames_of(
