@@ -328,6 +328,7 @@ def test_a_partial_run_is_said(gsjax, tmp_path):
 
 
 def test_without_edits_it_says_which_parts_there_are(gsjax, run):
+    (run / "video_2.mp4").touch()
     code, said = gsjax("edit", run)
     assert code == 0
     assert "Parts" in said
@@ -335,3 +336,10 @@ def test_without_edits_it_says_which_parts_there_are(gsjax, run):
     assert f"where {run}/video_2.mp4, and those of other cameras" in said
     assert f'gsjax edit {run} --op "speed:parts=1,factor=2"' in said
     assert not (run / "edit").exists()
+
+
+def test_without_edits_it_names_no_video_that_a_stopped_run_did_not_make(gsjax, tmp_path):
+    code, said = gsjax("edit", write_run(tmp_path / "run", followed=2, anchor=1))
+    assert code == 0
+    assert "Drawer" in said
+    assert "video_" not in said
