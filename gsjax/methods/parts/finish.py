@@ -83,8 +83,10 @@ def prune_parts(
 
 
 def cut_weights(weights: Float[np.ndarray, "M P"], alive: Bool[np.ndarray, "P"]) -> Float[np.ndarray, "M P"]:
-    """The weights without those below 2 %, which only tie parts to each other; rows sum to 1."""
-    kept = np.where((weights < _LEAST_WEIGHT) | ~alive, 0.0, weights)
+    """The weights without those below 2 %, which only tie parts to each other, but with the largest of each
+    row; rows sum to 1."""
+    least = np.minimum(_LEAST_WEIGHT, weights.max(-1, keepdims=True))
+    kept = np.where((weights < least) | ~alive, 0.0, weights)
     return (kept / kept.sum(-1, keepdims=True)).astype(weights.dtype)
 
 
