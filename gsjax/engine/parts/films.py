@@ -236,16 +236,6 @@ def write_film(
     return found
 
 
-def _from_anywhere(edits: tuple[Edit, ...]) -> tuple[Edit, ...]:
-    """The edits with absolute paths of other runs, so that they can be read from any working directory."""
-    return tuple(
-        replace(edit, from_run=str(Path(edit.from_run).absolute()), edits=_from_anywhere(edit.edits))
-        if isinstance(edit, Composite)
-        else edit
-        for edit in edits
-    )
-
-
 def frames_of(
     film: Film, blend: Blend, order: Int[np.ndarray, "n"] | None = None
 ) -> Callable[[int], Gaussians]:
@@ -294,6 +284,16 @@ def shots(film: Film, camera: Camera, saved: PartsRun) -> Iterator[Shot]:
         drawn, plan = render_with_room(gaussians, cameras, plan)
         image = np.clip(np.asarray(drawn.colors[0]), 0, 1)
         yield Shot(image, gaussians, perf_counter() - begun if plan is before else None)
+
+
+def _from_anywhere(edits: tuple[Edit, ...]) -> tuple[Edit, ...]:
+    """The edits with absolute paths of other runs, so that they can be read from any working directory."""
+    return tuple(
+        replace(edit, from_run=str(Path(edit.from_run).absolute()), edits=_from_anywhere(edit.edits))
+        if isinstance(edit, Composite)
+        else edit
+        for edit in edits
+    )
 
 
 def _beyond(recorded: Layer, now: Trajectory) -> Beyond:
