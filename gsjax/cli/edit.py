@@ -99,7 +99,9 @@ def _list_parts(run: Path) -> int:
         saved = open_parts_run(run)
     found = parse_json((run / "metrics.json").read_text(encoding="utf-8"))
     print_table(table_of_parts(found))
-    print(f"where   {run / f'video_{saved.camera(None)}.mp4'}, and those of other cameras, in these colours")
+    video = run / f"video_{saved.camera(None)}.mp4"
+    if video.is_file():  # a run that was stopped has none
+        print(f"where   {video}, and those of other cameras, in these colours")
     if found["parts"]:
         print(f"edit    {example_edit(shlex.quote(str(run)), found)}")
     return 0

@@ -30,7 +30,7 @@ from gsjax.methods.parts.entries import relative
 from gsjax.methods.parts.film import Film, Layer, film_gaussians
 from gsjax.methods.parts.limits import Beyond, beyond_captured, describe_beyond
 from gsjax.methods.parts.operation import Edit
-from gsjax.methods.parts.operations import label
+from gsjax.methods.parts.operations import Composite, label
 from gsjax.methods.parts.timeline import LENGTHS, ROUND, LoadScene, Script, apply, parse_script, to_yaml
 from gsjax.methods.parts.trajectory import Trajectory
 from gsjax.optim.compiler import host_options
@@ -155,14 +155,16 @@ def new_folder(parent: Path, name: str) -> Path:
 
     Raises:
         ValueError: the name is not valid for a folder.
+        OSError: no folder can be made in `parent`.
     """
     if not _NAME.fullmatch(name):
         raise ValueError(
             f"film name: expected letters, digits, spaces and any of . _ - after the first, found {name!r}"
         )
+    parent.mkdir(parents=True, exist_ok=True)
     for folder in chain([parent / name], (parent / f"{name}_{number}" for number in count(2))):
         with suppress(FileExistsError):
-            folder.mkdir(parents=True)
+            folder.mkdir()
             return folder
     raise AssertionError
 
@@ -198,7 +200,8 @@ def write_film(
         (folder / name).unlink(missing_ok=True)
     shutil.rmtree(folder / _PLY, ignore_errors=True)
     with atomic_write(folder / SCRIPT) as temporary:
-        temporary.write_text(to_yaml(script), encoding="utf-8")
+        again = replace(script, edits=_from_anywhere(script.edits))
+        temporary.write_text(to_yaml(again), encoding="utf-8")
     sequence, origin = saved.recording.judged, saved.recording.judged.origin
     view = sequence.camera(0, sequence.camera_ids.index(camera))
     fps = script.fps or 1 / float(np.median(np.diff(saved.recording.tracked.times)))
@@ -282,6 +285,16 @@ def shots(film: Film, camera: Camera, saved: PartsRun) -> Iterator[Shot]:
         drawn, plan = render_with_room(gaussians, cameras, plan)
         image = np.clip(np.asarray(drawn.colors[0]), 0, 1)
         yield Shot(image, gaussians, perf_counter() - begun if plan is before else None)
+
+
+def _from_anywhere(edits: tuple[Edit, ...]) -> tuple[Edit, ...]:
+    """The edits with absolute paths of other runs, so that they can be read from any working directory."""
+    return tuple(
+        replace(edit, from_run=str(Path(edit.from_run).absolute()), edits=_from_anywhere(edit.edits))
+        if isinstance(edit, Composite)
+        else edit
+        for edit in edits
+    )
 
 
 def _beyond(recorded: Layer, now: Trajectory) -> Beyond:

@@ -57,7 +57,7 @@ def write_outputs(
         why = reason(stopped).rstrip(".")
         notes.add(f"This run is not complete: it was stopped after {counted(len(frames), 'frame')} by {why}.")
     origin = recording.tracked.origin
-    write_parts(folder.path / "parts.npz", scene, trajectory, found.anchor, origin)
+    write_parts(folder.path / "parts.npz", scene, trajectory, found.anchor, origin, recording.tracked.times)
     write_scene(folder.scene, scene.gaussians, np.asarray(scene.labels), origin=origin)
     joints, scores = found.joints(), Scores(None, None)
     if complete:
@@ -136,6 +136,7 @@ def write_parts(
     trajectory: Trajectory,
     anchor: int,
     origin: Float[np.ndarray, "3"] | None = None,
+    times: Float[np.ndarray, "T"] | None = None,
 ) -> None:
     """Write parts.npz. At time t, a point x with weights w is at sum_p w_p (R_p (x - c_p) + c_p + t_p); part
     0 is the background, which does not move. All in metres, seconds and the world's axes.
@@ -149,6 +150,7 @@ def write_parts(
         scene, trajectory: the parts and their motion.
         anchor: index of the canonical frame.
         origin: what positions are relative to; it is added back.
+        times: times of the frames in the data, float64 seconds (default: those of the trajectory, from 0).
     """
     arrays = {
         "anchor": np.array(anchor),
@@ -158,7 +160,7 @@ def write_parts(
         "centres": in_world(np.asarray(scene.centers), origin),
         "R": quats_to_matrices(trajectory.poses.quats),
         "t": trajectory.poses.translations,
-        "times": trajectory.times,
+        "times": trajectory.times if times is None else times,
     }
     if not (np.asarray(trajectory.opacities) == 1).all():
         arrays["opacities"] = trajectory.opacities

@@ -232,7 +232,8 @@ def _warn_if_doubtful(start: Start, moved: float, options: Options, notes: Notes
         )
     if pieces >= options.parts.discover.most_parts:
         notes.warn(
-            f"more pieces changed than --parts.discover.most-parts {pieces}; the smallest were left out"
+            f"as many pieces changed as --parts.discover.most-parts {pieces} allows; smaller ones, if any, "
+            "were left out"
         )
     seen = [(start.masks == piece).any((1, 2)).sum() for piece in range(1, pieces + 1)]
     alone = sum(count == 1 for count in seen)

@@ -135,7 +135,8 @@ def _read(path: Path) -> tuple[Layer, dict[str, int], bool, Float[np.ndarray, "3
     arrays["centres"] = relative_to(arrays["centres"], origin)
     # The other frames hold the poses of the anchor.
     done = np.sort([anchor, *order_of_frames(frames, anchor)[: followed - 1]])
-    R, t, times = (jnp.asarray(arrays[name][done], float) for name in ("R", "t", "times"))
+    since = arrays["times"] - arrays["times"][0]  # float32 cannot tell times of day apart
+    R, t, times = (jnp.asarray(array[done], float) for array in (arrays["R"], arrays["t"], since))
     weights, centers = (jnp.asarray(arrays[name], float) for name in ("weights", "centres"))
     poses = HandlePose(jaxlie.SO3.from_matrix(R).wxyz, t)
     names = {name: part for name, part in names.items() if part < parts}
@@ -159,6 +160,12 @@ def _arrays(file: Path) -> dict[str, np.ndarray]:
     frames = check_arrays(file, arrays, _ARRAYS | there, _AGAIN)["T"]
     if there and not ((arrays["opacities"] >= 0) & (arrays["opacities"] <= 1)).all():
         raise ValueError(f"{file}: opacities: expected numbers from 0 to 1, found others; {_AGAIN}")
+    times = arrays["times"] = arrays["times"].astype(np.float64)
+    late = np.flatnonzero(np.diff(times) <= 0)
+    if len(late):
+        k = int(late[0]) + 1
+        found = f"{times[k]} in frame {k} after {times[k - 1]}"
+        raise ValueError(f"{file}: times: expected seconds that increase, found {found}; {_AGAIN}")
     anchor = arrays["anchor"]
     if anchor.dtype.kind not in "iu" or not 0 <= anchor < frames:
         expected = f"the index of one of {frames} frames, 0 to {frames - 1}"

@@ -1,10 +1,11 @@
 """Scores of the parts found: how they moved, and how they and their joints compare with ground truth."""
 
+from dataclasses import replace
 from typing import Any
 
 import jax
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from gsjax.data.objects import Truth
 from gsjax.engine.messages import Notes
@@ -121,7 +122,7 @@ def score_parts(
     if still:
         notes.add(f"Counted as background, because they do not move: {', '.join(still)}.")
     known = np.where(np.isin(labels, [-1, *moving]), labels, BACKGROUND)
-    found = np.asarray(scene.labels)
+    found, there = np.asarray(scene.labels), np.asarray(trajectory.opacities) > 0
     match = match_parts(found, known)
     names = dict(zip(poses, truth.names, strict=True))
     joint_of = dict(zip(poses, truth.joints or [None] * len(poses), strict=True))
@@ -134,7 +135,7 @@ def score_parts(
         row = rows[part - 1]
         row |= {"true_name": names[label], "iou": match.ious[label], **motion_metrics(scores[label])}
         row["moved_mm"] = scores[label].moved_mm
-        _score_joint(row, joints[part], joint_of[label], means[found == part], anchor)
+        _score_joint(row, joints[part], joint_of[label], means[found == part], anchor, there[:, part])
     missed = [names[label] for label in moving if label not in pairs]
     if missed:
         notes.warn(f"moving objects that no part was found for: {', '.join(missed)}")
@@ -151,10 +152,13 @@ def _score_joint(
     joint: Joint | None,
     points: Float[np.ndarray, "n 3"],
     anchor: int,
+    there: Bool[np.ndarray, "T"],
 ) -> None:
-    """Add the errors of a part's joint to its row, if there is a true joint to compare it with."""
+    """Add the errors of a part's joint to its row, if there is a true joint to compare it with; over the
+    frames in which the part is `there`, to which its joint was fitted."""
     if joint is not None and fitted.joint is not None:
-        row |= joint_error(fitted.joint, joint, points.mean(0), anchor)._asdict()
+        true = replace(joint, values=joint.values[there])
+        row |= joint_error(fitted.joint, true, points.mean(0), int(there[:anchor].sum()))._asdict()
         row["value"] = row["value_deg"] if joint.kind == "revolute" else row["value_mm"]
 
 
@@ -171,26 +175,30 @@ def _score_joints(
     true motion most similar to its own, if the two differ by less than half of how far the part moved."""
     notes.add("Each part is compared with the true joint that moves it most alike; there are no masks.")
     means, labels = np.asarray(scene.gaussians.means, np.float64), np.asarray(scene.labels)
-    motions = motions_in_world(scene, trajectory)
+    motions, there = motions_in_world(scene, trajectory), np.asarray(trajectory.opacities) > 0
     ways = {k: relative_motion(truth.poses[:, k], anchor) for k in range(len(truth.names))}
+    still = [truth.names[k] for k, way in ways.items() if _farthest_mm(way, means) <= _STILL_MM]
+    if still:
+        notes.add(f"Counted as background, because they do not move: {', '.join(still)}.")
+    ways = {k: way for k, way in ways.items() if truth.names[k] not in still}
     found: set[str] = set()
     for row in sorted(rows, key=lambda row: -row["gaussians"]):
         points = means[labels == row["part"]]
         left = {k: way for k, way in ways.items() if truth.names[k] not in found}
         if not len(points) or not left:
             continue
-        off = {
-            k: _farthest_mm(way @ np.linalg.inv(motions[:, row["part"]]), points) for k, way in left.items()
-        }
+        back = np.linalg.inv(motions[:, row["part"]])  # rigid: |motion x - way x| = |x - back way x|
+        off = {k: _farthest_mm(back @ way, points) for k, way in left.items()}
         best = min(off, key=off.__getitem__)
         if off[best] < 0.5 * row["moved_mm"]:
             found.add(truth.names[best])
             row |= {"true_name": truth.names[best], "point_error_mm": off[best]}
-            _score_joint(row, joints[row["part"]], truth.joints[best], points, anchor)
-    missed = [name for name in truth.names if name not in found]
+            shown = there[:, row["part"]]
+            _score_joint(row, joints[row["part"]], truth.joints[best], points, anchor, shown)
+    missed = [truth.names[k] for k in ways if truth.names[k] not in found]
     if missed:
         notes.warn(f"moving objects that no part was found for: {', '.join(missed)}")
-    return {"true_parts": len(truth.names), "missed": missed}
+    return {"true_parts": len(ways), "missed": missed}
 
 
 def _tracks(scene: PartScene, trajectory: Trajectory, blend: Blend) -> Float[np.ndarray, "T N 3"]:

@@ -66,7 +66,8 @@ def editing_of(saved: PartsRun, filmed: Filmed) -> Editing:
     cameras = camera_names(saved.recording)
     first = saved.camera(None)
     called = {part: name for name, part in {"background": BACKGROUND, **saved.names}.items()}
-    parts = {f"{called[part]} ({part})": called[part] for part in sorted(called, key=lambda p: (p == 0, p))}
+    ordered = sorted(called, key=lambda part: (part == BACKGROUND, part))
+    parts = {f"{called[part]} ({part})": _word_for(part, called[part]) for part in ordered}
 
     def preview(lines: Sequence[str]) -> Preview:
         film, doubts = edited(script_of(lines), saved)
@@ -111,6 +112,14 @@ def camera_names(recording: Recording) -> dict[str, int]:
     """Ids of the cameras of a recording, by name."""
     held_out = recording.held_out
     return {f"camera {c}" + (" (held out)" if c in held_out else ""): c for c in recording.judged.camera_ids}
+
+
+def _word_for(part: int, name: str) -> str:
+    """The name of a part in a line of edits; its number, if a line would read the name as something else."""
+    try:
+        return name if parse_op(f"freeze:parts={name}").parts == (name,) else str(part)
+    except ValueError:
+        return str(part)
 
 
 def _moves(layer: Layer) -> Bool[np.ndarray, "n"]:

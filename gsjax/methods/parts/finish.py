@@ -83,8 +83,10 @@ def prune_parts(
 
 
 def cut_weights(weights: Float[np.ndarray, "M P"], alive: Bool[np.ndarray, "P"]) -> Float[np.ndarray, "M P"]:
-    """The weights without those below 2 %, which only tie parts to each other; rows sum to 1."""
-    kept = np.where((weights < _LEAST_WEIGHT) | ~alive, 0.0, weights)
+    """The weights without those below 2 %, which only tie parts to each other, but with the largest of each
+    row; rows sum to 1."""
+    least = np.minimum(_LEAST_WEIGHT, weights.max(-1, keepdims=True))
+    kept = np.where((weights < least) | ~alive, 0.0, weights)
     return (kept / kept.sum(-1, keepdims=True)).astype(weights.dtype)
 
 
@@ -144,7 +146,8 @@ def scene_and_trajectory(
 ) -> tuple[PartScene, Trajectory]:
     """The scene with its parts, with all Gaussians in their given order, and the trajectory of the parts.
 
-    Handles without Gaussians are left out; the others are moved to the centroids of their parts.
+    Handles without Gaussians are left out; the others are moved to the centroids of their parts. The times of
+    the trajectory begin at 0.
 
     Args:
         discovery: the discovery.
@@ -168,7 +171,8 @@ def scene_and_trajectory(
     scene = PartScene(*jax.device_put((gaussians, full, after)))
     absent, dtype = discovery.absent, poses.quats.dtype
     shown = None if absent is None else jnp.asarray(~absent[:, kept], dtype)
-    return scene, trajectory_of(jax.device_put(np.asarray(times, dtype)), poses, shown)
+    since = np.asarray(times, np.float64) - times[0]  # float32 cannot tell times of day apart
+    return scene, trajectory_of(jax.device_put(since.astype(dtype)), poses, shown)
 
 
 @jax.jit

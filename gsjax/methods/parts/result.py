@@ -24,7 +24,7 @@ class PartsResult(NamedTuple):
 
     Attributes:
         scene: the canonical Gaussians in their given order, and the weights of P parts, the background first.
-        trajectory: poses of the parts at T frames; at rest in frames that were not found yet.
+        trajectory: poses of the parts at T frames, with times from 0; at rest in frames not yet found.
         done: the frames that were found.
         anchor: the canonical frame.
         pixel: width of a pixel of the pictures used for tracking, at the moving parts, metres; taken as the

@@ -2,19 +2,22 @@
 
 import json
 from dataclasses import replace
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 import yaml
+from rich.console import Console
 
 from gsjax.data.video import describe_video
 from gsjax.engine.files import write_scene
+from gsjax.engine.messages import Notes
 from gsjax.engine.parts import films
 from gsjax.engine.parts.films import shots
 from gsjax.engine.parts.outputs import write_parts
-from gsjax.engine.parts.saved import open_parts_run
+from gsjax.engine.parts.saved import open_parts_run, read_parts
 from gsjax.io.ply import read_ply
 from gsjax.io.video import read_video_frames
 from gsjax.methods.parts import PartScene, gaussians_at, moment, trajectory_of
@@ -190,6 +193,22 @@ def test_edits_without_a_script_from_another_camera(gsjax, run):
     np.testing.assert_allclose(there, np.asarray(scene.gaussians.means)[drawer] + shift, atol=1e-5)
 
 
+def test_a_film_with_parts_of_another_run_is_made_again_from_anywhere(run, tmp_path, monkeypatch):
+    """Its script finds the other run, also one within a composite, from another working directory."""
+    write_run(tmp_path / "other")
+    within = "[{op: composite, parts: 1, from_run: other}, {op: freeze, parts: 1}]"
+    script = parse_script(f"edits: [{{op: composite, parts: 1, from_run: other, edits: {within}}}]")
+    saved, notes = open_parts_run(run), Notes(Console(quiet=True))
+    monkeypatch.chdir(tmp_path)
+    folder, film = films.new_folder(run / "edit", "ops"), (saved.layer,)
+    films.write_film(folder, script, film, saved, 2, notes, watch=lambda frames, count: ())
+    monkeypatch.chdir(run)
+    (again,) = films.read_film(Path("edit/ops"))[0].edits
+    for edit in (again, again.edits[0]):
+        assert read_parts(edit.from_run)[1] == saved.names
+    assert again.edits[1] == script.edits[0].edits[1]
+
+
 @pytest.mark.thorough
 def test_films_of_ops_alone_are_numbered_on(gsjax, run):
     once = ("edit", run, "--op", "freeze:parts=all")
@@ -310,6 +329,7 @@ def test_a_partial_run_is_said(gsjax, tmp_path):
 
 
 def test_without_edits_it_says_which_parts_there_are(gsjax, run):
+    (run / "video_2.mp4").touch()
     code, said = gsjax("edit", run)
     assert code == 0
     assert "Parts" in said
@@ -317,3 +337,10 @@ def test_without_edits_it_says_which_parts_there_are(gsjax, run):
     assert f"where {run}/video_2.mp4, and those of other cameras" in said
     assert f'gsjax edit {run} --op "speed:parts=1,factor=2"' in said
     assert not (run / "edit").exists()
+
+
+def test_without_edits_it_names_no_video_that_a_stopped_run_did_not_make(gsjax, tmp_path):
+    code, said = gsjax("edit", write_run(tmp_path / "run", followed=2, anchor=1))
+    assert code == 0
+    assert "Drawer" in said
+    assert "video_" not in said

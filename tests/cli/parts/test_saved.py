@@ -5,8 +5,9 @@ import json
 import numpy as np
 import pytest
 
+from gsjax.engine.parts.outputs import write_parts
 from gsjax.engine.parts.saved import blend_of, read_parts
-from tests.cli.parts.test_edit import write_run
+from tests.cli.parts.test_edit import STEP, scene_and_trajectory, write_run
 
 AGAIN = "; run gsjax parts again with this version of gsjax, or name another folder"
 
@@ -49,6 +50,7 @@ def with_nan(array):
         ("centres", lambda c: c[:, :2], "centres: expected the shape [3,3], found [3,2]"),
         ("times", lambda t: t.astype(str), "times: expected numbers, found <U"),
         ("times", lambda t: t[:0], "times: expected the shape [T], found [0]"),
+        ("times", np.zeros_like, "times: expected seconds that increase, found 0.0 in frame 1 after 0.0"),
         ("anchor", lambda a: 77, "anchor: expected the index of one of 4 frames, 0 to 3, found 77"),
         ("anchor", lambda a: -1, "anchor: expected the index of one of 4 frames, 0 to 3, found -1"),
         ("anchor", lambda a: 0.5, "anchor: expected the index of one of 4 frames, 0 to 3, found 0.5"),
@@ -132,3 +134,12 @@ def test_parts_that_are_not_there_are_read_again(run):
     assert said_of(run) == "parts.npz: opacities: expected numbers from 0 to 1, found others"
     np.savez(run / "parts.npz", **arrays, opacities=shown[:2])
     assert said_of(run) == "parts.npz: opacities: expected the shape [4,3], found [2,3]"
+
+
+def test_times_of_day_are_kept(run):
+    """float32 would have the same time for all of them."""
+    times = 1.7e9 + STEP * np.arange(4)
+    write_parts(run / "parts.npz", *scene_and_trajectory(), 0, times=times)
+    np.testing.assert_array_equal(np.load(run / "parts.npz")["times"], times)
+    layer, *_ = read_parts(run)
+    np.testing.assert_allclose(layer.trajectory.times, STEP * np.arange(4), atol=1e-6)

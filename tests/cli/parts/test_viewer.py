@@ -79,6 +79,16 @@ def test_what_is_offered(run):
     assert editing.begin("speed", "drawer") == "speed:parts=drawer,factor=2"
 
 
+@pytest.mark.parametrize("name", ["1", "on", "a,b"])
+def test_a_part_whose_name_reads_as_something_else_is_offered_by_its_number(run, name):
+    """`parts=1` is part 1, whatever the name of part 2."""
+    found = json.loads((run / "metrics.json").read_text())
+    found["parts"][1]["true_name"] = name
+    (run / "metrics.json").write_text(json.dumps(found))
+    parts = opened(run).editing.parts
+    assert (parts["drawer (1)"], parts[f"{name} (2)"]) == ("drawer", "2")
+
+
 @pytest.mark.thorough
 @pytest.mark.parametrize(
     "lines",
@@ -208,6 +218,13 @@ def test_a_film_lies_in_the_run(run, name):
     with pytest.raises(ValueError, match="film name: expected letters"):
         opened(run).editing.save(["freeze:parts=all"], name, "camera 0", always)
     assert not (run / "edit").exists()
+
+
+def test_where_no_folder_can_be_made_no_other_name_is_tried(run):
+    """The link leads to a disk that is gone."""
+    (run / "edit").symlink_to(run / "gone")
+    with pytest.raises(FileExistsError):
+        new_folder(run / "edit", "ops")
 
 
 def test_edits_that_cannot_be_done_leave_no_folder(run):

@@ -208,6 +208,13 @@ def test_in_the_end_weights_that_only_tie_parts_together_are_cut(halves):
     np.testing.assert_allclose(cut_weights(cut, alive), cut, atol=1e-6)
 
 
+def test_of_many_small_weights_the_largest_is_kept():
+    weights = np.full((1, 60), 0.9 / 59, np.float32)
+    weights[0, 7] = 0.018
+    cut = cut_weights(weights / weights.sum(), np.ones(60, bool))
+    np.testing.assert_array_equal(cut[0], np.arange(60) == 7)
+
+
 @pytest.mark.slow
 def test_parts_that_are_touched(halves):
     parts, weights = halves.parts, halves.weights

@@ -37,7 +37,7 @@ def sequence(boxes):
         camera_ids=(5, 6, HELD_OUT),
         width=boxes.cameras.width,
         height=boxes.cameras.height,
-        times=boxes.times,
+        times=1.7e9 + boxes.times,  # of day
         frame_ids=tuple(range(FRAMES)),
         Ks=np.tile(Ks, (FRAMES, 1, 1, 1)),
         viewmats=np.tile(viewmats, (FRAMES, 1, 1, 1)),
@@ -72,6 +72,7 @@ def test_a_discovery_is_stored_and_goes_on_to_the_same_bits(boxes, sequence, seg
     *_, again = parts(sequence, loaded.method.config, eval_cameras=[HELD_OUT], after=loaded)
     for a, b in zip(jax.tree.leaves(again.result), jax.tree.leaves(now.result), strict=True):
         np.testing.assert_array_equal(a, b)
+    np.testing.assert_allclose(now.result.trajectory.times, boxes.times, atol=1e-6)
     assert now.result.weights.shape == (boxes.gaussians.num, now.result.scene.num_parts)
     assert sorted(now.result.joints()) == list(range(1, now.result.scene.num_parts))
 
