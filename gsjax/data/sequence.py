@@ -204,9 +204,10 @@ class Sequence:
             DataError: the file is unreadable, the loader returned another shape or type, or the unit is
                 wrong.
         """
-        depth, what = self._load(self.load_depth, "depth", t, c), self.where("depth", t, c)
+        depth = self._load(self.load_depth, "depth", t, c)
         if depth is None:
             return None
+        what = self.where("depth", t, c)
         check_loaded(what, depth, (self.height, self.width), np.floating)
         if self.float_images:
             depth = np.where(np.isfinite(self._raw_image(t, c)).all(-1), depth, 0)
