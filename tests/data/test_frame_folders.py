@@ -38,6 +38,8 @@ def test_pictures_come_in_order_of_name_and_nothing_else_does(tmp_path):
         (("2024_clip_01.png", "2024_clip_02.png"), (1, 2)),
         (("a.png", "b3.png"), (0, 1)),
         (("f1_left.png", "f1_right.png"), (0, 1)),
+        (("1305031102.975304.png", "1305031103.011304.png"), (0, 1)),
+        (("shot1_099.png", "shot2_001.png"), (0, 1)),
     ],
 )
 def test_the_frame_number_is_the_last_number_in_the_name(tmp_path, names, numbers):
