@@ -38,13 +38,14 @@ def pictures_beside(folder: Path, count: int, frames: str) -> list[Path]:
         frames: name of the frames' folder or file, for messages.
 
     Raises:
-        DataError: the number of pictures is not `count`.
+        DataError: the number of pictures is not `count`, or their names sort differently than their numbers.
     """
     found = pictures(folder)
     if len(found) != count:
         expected = f"{count} pictures, one per frame of {frames}"
         advice = f"{COMPLETE} Pictures are paired in order of name."
         raise DataError(folder, expected, f"{len(found)}", advice)
+    frame_numbers(found)  # an error if they would be paired with the wrong frames
     return found
 
 

@@ -68,6 +68,12 @@ def test_there_must_be_one_picture_per_frame(tmp_path):
     assert len(pictures_beside(tmp_path / "masks", 2, "images")) == 2
 
 
+def test_pictures_beside_frames_must_sort_in_order_of_their_numbers_too(tmp_path):
+    save(tmp_path, "masks/1.png", "masks/2.png", "masks/10.png")
+    with pytest.raises(DataError, match=r"masks: .*found 2.png after 10.png. Pad the numbers with zeros"):
+        pictures_beside(tmp_path / "masks", 3, "clip.mp4")
+
+
 def test_a_single_frame_shows_no_motion(tmp_path):
     with pytest.warns(DataWarning, match=r"0.png: it is the only frame"):
         warn_about_single_frame([tmp_path / "0.png"])
