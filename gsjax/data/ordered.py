@@ -19,7 +19,8 @@ def open_as_sequence(dataset: str, read: ReadOptions | None = None) -> Sequence:
     Raises:
         DataError: the data cannot be read, or photographs differ in size.
     """
-    if is_photographs(dataset) and not is_recording(dataset):
+    read = read or ReadOptions()
+    if is_photographs(dataset) and not is_recording(dataset, read.images):
         return sequence_of(open_photographs(dataset, read))
     return open_sequence(dataset, read)
 
