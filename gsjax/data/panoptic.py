@@ -23,7 +23,7 @@ from gsjax.data.frame_folders import DEFAULT_RATE_HZ
 from gsjax.data.masks import read_mask
 from gsjax.data.names import portable
 from gsjax.data.objects import Truth
-from gsjax.data.origin import near_origin
+from gsjax.data.origin import near_origin, relative_to_origin
 from gsjax.data.sequence import Sequence
 from gsjax.data.validation import check_intrinsics, check_poses
 from gsjax.geometry.joints import Joint
@@ -103,8 +103,8 @@ def read_panoptic(path: str | Path, *, depth_unit_m: float | None = None) -> Seq
 def write_panoptic(sequence: Sequence, path: str | Path, depth_unit_m: float = 0.0001) -> None:
     """Save a sequence in this layout, with a single train_meta.json and lossless PNG images.
 
-    Names of labels are saved too, and truth, whose labels must be those of a tabletop: 2, 3, ... for objects,
-    1 for a robot.
+    Poses are saved in the coordinates of the data, also far from 0. Names of labels are saved too, and truth,
+    whose labels must be those of a tabletop: 2, 3, ... for objects, 1 for a robot.
 
     Args:
         sequence: the sequence; all its frames are loaded.
@@ -116,6 +116,7 @@ def write_panoptic(sequence: Sequence, path: str | Path, depth_unit_m: float = 0
         ValueError: the truth has other labels, or a mask has labels outside 0 to 65535.
     """
     root = Path(path)
+    sequence = relative_to_origin(sequence, None)  # the layout has no place for an origin
     truth = sequence.truth
     if truth is not None and truth.label_ids.tolist() != list(range(2, 2 + len(truth.names))):
         found = truth.label_ids.tolist()
