@@ -24,6 +24,7 @@ from gsjax.data.masks import read_mask
 from gsjax.data.names import portable
 from gsjax.data.objects import Truth
 from gsjax.data.origin import near_origin, relative_to_origin
+from gsjax.data.pictures import is_picture
 from gsjax.data.sequence import Sequence
 from gsjax.data.validation import check_intrinsics, check_poses
 from gsjax.geometry.joints import Joint
@@ -342,7 +343,7 @@ def _has(root: Path, kind: str, name: str) -> bool:
 def _has_first_mask_only(root: Path, first: str) -> bool:
     """Whether the camera of image `first` has only the mask of that image, all that the tracker needs."""
     mask = _mask_path(root, first)
-    return _has(root, "seg", first) and [*mask.parent.iterdir()] == [mask]
+    return _has(root, "seg", first) and [file for file in mask.parent.iterdir() if is_picture(file)] == [mask]
 
 
 def _frame_number(name: str, fallback: int) -> int:

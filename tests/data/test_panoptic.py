@@ -196,6 +196,8 @@ def test_the_first_mask_may_be_the_only_one(folder):
     folder.add("seg", 1, np.uint8)
     for file in sorted((folder.root / "seg/0").iterdir())[1:]:
         file.unlink()
+    for name in (".DS_Store", "._000000.png", "Thumbs.db"):  # of file managers
+        (folder.root / "seg/0" / name).write_bytes(b"")
     sequence = folder.read()
     assert sequence.mask(0, 0) is not None
     assert sequence.mask(1, 0) is None
