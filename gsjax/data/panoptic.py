@@ -69,6 +69,9 @@ def read_panoptic(path: str | Path, *, depth_unit_m: float | None = None) -> Seq
         )
     unit = depth_unit_m or float(meta.get("depth_unit_m", DEFAULT_DEPTH_UNIT_M))
 
+    ids = tuple(_frame_number(meta["fn"][t][0], t) for t in present)
+    if len(set(ids)) < len(ids):  # such as the number of the camera
+        ids = tuple(present)
     first_mask_only = [_has_first_mask_only(root, name) for name in names[0]]
 
     def locate(kind: str, t: int, c: int) -> str:
@@ -89,7 +92,7 @@ def read_panoptic(path: str | Path, *, depth_unit_m: float | None = None) -> Seq
         width=width,
         height=height,
         times=times[present],
-        frame_ids=tuple(_frame_number(meta["fn"][t][0], t) for t in present),
+        frame_ids=ids,
         Ks=meta["k"][present],
         viewmats=meta["w2c"][present],
         load_image=lambda t, c: read_image(_image_path(root, names[t][c]), width, height),

@@ -1,6 +1,7 @@
 """The one sequence type that every reader returns and every method takes."""
 
 import warnings
+from collections import Counter
 from collections.abc import Callable, Mapping
 from collections.abc import Sequence as Indices
 from dataclasses import dataclass, field, replace
@@ -70,8 +71,9 @@ class Sequence:
         background: RGB, 0 to 1, composited behind transparent images; None if none is transparent.
 
     Raises:
-        ValueError: there is no camera, ids of cameras repeat, shapes disagree, intrinsics are not a camera's,
-            a pose is not a rigid motion, times do not increase, or the background is not from 0 to 1.
+        ValueError: there is no camera, ids of cameras or frames repeat, shapes disagree, intrinsics are not a
+            camera's, a pose is not a rigid motion, times do not increase, or the background is not from 0 to
+            1.
     """
 
     name: str
@@ -113,6 +115,8 @@ class Sequence:
         check_shape("times", self.times, (frames,))
         check_times(self.times, shared=self.shared_times)
         check_shape("frame_ids", np.asarray(self.frame_ids), (frames,))
+        if repeated := [i for i, count in Counter(self.frame_ids).items() if count > 1]:
+            raise ValueError(f"frame_ids must differ from each other, got {repeated[0]} more than once")
         check_shape("Ks", self.Ks, (frames, cameras, 3, 3))
         check_shape("viewmats", self.viewmats, (frames, cameras, 4, 4))
         if self.origin is not None:

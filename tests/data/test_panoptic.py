@@ -328,6 +328,13 @@ def test_frames_without_a_number_are_counted(folder):
     assert folder.read().frame_ids == (0, 1, 2)
 
 
+def test_frames_whose_names_end_in_the_camera_are_counted(folder):
+    for name in (folder.root / "ims").glob("*/*"):
+        name.rename(name.with_stem(f"{name.stem}_cam{name.parent.name}"))
+    folder.meta["fn"] = [[f"{c}/{t:06d}_cam{c}.jpg" for c in (0, 1)] for t in range(FRAMES)]
+    assert folder.read().frame_ids == (0, 1, 2)
+
+
 def test_a_unit_of_depth_that_the_user_gives(folder):
     folder.add("depth", 0, np.uint16, 500)
     folder.meta["depth_unit_m"] = 0.01

@@ -236,6 +236,7 @@ def test_a_rotation_of_few_digits_passes():
         ({"times": np.zeros(0), "frame_ids": ()}, "at least one frame"),
         ({"camera_ids": (3, 3)}, "differ"),
         ({"frame_ids": (1, 2)}, "frame_ids must have shape"),
+        ({"frame_ids": (1, 2, 2, 3)}, r"frame_ids must differ from each other, got 2 more than once"),
     ],
 )
 def test_a_sequence_that_disagrees_with_itself_is_refused(changes, says):
