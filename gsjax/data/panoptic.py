@@ -1,7 +1,8 @@
 """The Panoptic layout of Dynamic 3D Gaussians (Luiten et al. 2024), with depth, times and truth added.
 
 train_meta.json        w, h, k[t][c] 3x3, w2c[t][c] 4x4 (OpenCV axes), fn[t][c], cam_id[t][c];
-                       gsjax adds time[t] in seconds, depth_unit_m, and label_names {"3": "cup"}
+                       gsjax adds time[t] in seconds, depth_unit_m, label_names {"3": "cup"}, and absent:
+                       files of seg/ and depth/ that some frames never had
 test_meta.json         the same for held-out cameras, optional; both are merged
 ims/CAM/FRAME.jpg      named in fn
 seg/CAM/FRAME.png      labels, optional, possibly for some cameras only, or only for the first frame
@@ -79,11 +80,13 @@ def read_panoptic(path: str | Path, *, depth_unit_m: float | None = None) -> Seq
 
     def load_depth(t: int, c: int) -> np.ndarray | None:
         name = names[t][c]
-        return read_depth(_depth_path(root, name), unit, width, height) if _has(root, "depth", name) else None
+        absent = not _has(root, "depth", name) or _file("depth", name) in meta["absent"]
+        return None if absent else read_depth(_depth_path(root, name), unit, width, height)
 
     def load_mask(t: int, c: int) -> np.ndarray | None:
         name = names[t][c]
-        absent = not _has(root, "seg", name) or (first_mask_only[c] and name != names[0][c])
+        absent = not _has(root, "seg", name) or _file("seg", name) in meta["absent"]
+        absent |= first_mask_only[c] and name != names[0][c]
         return None if absent else read_mask(_mask_path(root, name), width, height)
 
     return Sequence(
@@ -126,11 +129,13 @@ def write_panoptic(sequence: Sequence, path: str | Path, depth_unit_m: float = 0
         found = truth.label_ids.tolist()
         raise ValueError(f"write_panoptic requires objects labelled 2, 3, ..., got {found}")
     names = [[f"{cam}/{frame:06d}.png" for cam in sequence.camera_ids] for frame in sequence.frame_ids]
-    too_far = 0
+    too_far, absent = 0, []
     for t, frame in enumerate(names):
         for c, name in enumerate(frame):
             write_png(root / "ims" / name, sequence.image(t, c))
             depth, mask = sequence.depth(t, c), sequence.mask(t, c)
+            loaded = {"depth": depth, "seg": mask}
+            absent += [_file(kind, name) for kind, found in loaded.items() if found is None]
             if depth is not None:
                 steps = np.round(depth / depth_unit_m)
                 fits = steps < SATURATED_DEPTH
@@ -155,6 +160,8 @@ def write_panoptic(sequence: Sequence, path: str | Path, depth_unit_m: float = 0
         "time": sequence.times.tolist(),
         "depth_unit_m": depth_unit_m,
     }
+    if absent := [file for file in absent if (root / file).parent.is_dir()]:  # other frames have it
+        meta["absent"] = absent
     if sequence.names_of_labels:
         meta["label_names"] = {str(label): name for label, name in sequence.names_of_labels.items()}
     if truth is not None:
@@ -182,6 +189,7 @@ def _read_metas(root: Path) -> dict[str, Any]:
     merged["fn"] = [a + b for a, b in zip(merged["fn"], extra["fn"], strict=True)]
     for key in ("cam_id", "file"):
         merged[key] = merged[key] + extra[key]
+    merged["absent"] |= extra["absent"]
     for key in ("k", "w2c"):
         merged[key] = np.concatenate([merged[key], extra[key]], axis=1)
     return merged
@@ -221,7 +229,8 @@ def _checked(path: Path, meta: dict[str, Any]) -> dict[str, Any]:
             raise DataError(path, expected, f"{ids} in frame {t}", _ADVICE_META)
     arrays = {key: _stack(path, key, meta[key], side) for key, side in (("k", 3), ("w2c", 4))}
     names = {"fn": [[portable(name) for name in frame] for frame in meta["fn"]]}
-    return meta | arrays | names | {"cam_id": [int(i) for i in meta["cam_id"][0]], "file": [path] * cameras}
+    own = {"cam_id": [int(i) for i in meta["cam_id"][0]], "file": [path] * cameras}
+    return meta | arrays | names | own | {"absent": {portable(file) for file in meta.get("absent", ())}}
 
 
 def _check_cameras(meta: dict[str, Any], present: list[int]) -> None:
@@ -328,11 +337,16 @@ def _image_path(root: Path, name: str) -> Path:
 
 
 def _mask_path(root: Path, name: str) -> Path:
-    return (root / "seg" / name).with_suffix(".png")
+    return root / _file("seg", name)
 
 
 def _depth_path(root: Path, name: str) -> Path:
-    return (root / "depth" / name).with_suffix(".png")
+    return root / _file("depth", name)
+
+
+def _file(kind: str, name: str) -> str:
+    """The file of image `name` in seg/ or depth/, relative to the folder of the recording."""
+    return Path(kind, name).with_suffix(".png").as_posix()
 
 
 _FINDERS = {"image": _image_path, "mask": _mask_path, "depth": _depth_path}

@@ -136,6 +136,7 @@ def test_a_camera_count_that_differs_names_the_frame(folder):
         (lambda m: m["w2c"][1][1].pop(), r"w2c in frame 1, camera position 1, as 4x4 numbers, found 3x4"),
         (lambda m: m.update(time=[0.0, 1.0]), "time to be 3 numbers"),
         (lambda m: m.update(fn=[]), "at least one frame"),
+        (lambda m: m.update(absent=[[1]]), "the lists and numbers of this layout, found something else"),
         (lambda m: m.update(fn=[[1, 2]] * 3), "the lists and numbers of this layout, found something else"),
     ],
 )

@@ -49,6 +49,23 @@ def test_writing_needs_the_labels_of_a_tabletop(tmp_path):
         write_panoptic(replace(scene, truth=truth), tmp_path)
 
 
+def test_frames_without_depth_or_mask_survive_the_disk(tmp_path):
+    whole = open_sequence("simulated:tabletop?frames=4&width=16&height=12").select(cameras=[0])
+    some = replace(
+        whole,
+        truth=None,
+        load_depth=lambda t, c: None if t == 0 else whole.load_depth(t, c),
+        load_mask=lambda t, c: None if t == 1 else whole.load_mask(t, c),
+    )
+    write_panoptic(some, tmp_path)
+    found = read_panoptic(tmp_path)
+    assert [found.depth(t, 0) is None for t in range(4)] == [True, False, False, False]
+    assert [found.mask(t, 0) is None for t in range(4)] == [False, True, False, False]
+    (tmp_path / "seg/0/000003.png").unlink()  # lost, as it is not among those that never were
+    with pytest.raises(DataError, match=r"seg/0/000003.png: expected a mask, found no such file"):
+        read_panoptic(tmp_path).mask(3, 0)
+
+
 def _labelled(mask_value, depth=1.0):
     """A sequence whose masks and depths are constant."""
     sequence = replace(tabletop(frames=1, width=WIDTH, height=HEIGHT), truth=None)
