@@ -251,11 +251,12 @@ class Sequence:
         """Displacement (x, y) of each pixel from frame `t` to t + 1, pixels; NaN = unknown, None = no flow.
 
         Raises:
-            IndexError: `t` is the last frame.
+            IndexError: `t` is the last frame, or none.
             DataError: the loader returned another shape or type.
         """
         if self.load_flow is None:
             return None
+        self._check_index(t, c)
         self._check_index(t + 1, c)
         flow = self.load_flow(t, t + 1, c)
         if flow is not None:

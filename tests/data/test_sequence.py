@@ -193,6 +193,8 @@ def test_indices_out_of_range_are_errors(t, c):
 def test_flow_of_the_last_frame_is_an_error():
     with pytest.raises(IndexError):
         make().flow(3, 0)
+    with pytest.raises(IndexError):
+        make().flow(-1, 0)  # would be the flow from the last frame to the first
 
 
 def spoil(index, value):
