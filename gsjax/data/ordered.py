@@ -27,7 +27,7 @@ def open_as_sequence(dataset: str, read: ReadOptions | None = None) -> Sequence:
 
 def _natural_key(name: str) -> list[tuple[int, str]]:
     """Sort key by which frame_2 comes before frame_10."""
-    return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", name)]
+    return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", name)]
 
 
 def sequence_of(photographs: Photographs) -> Sequence:
