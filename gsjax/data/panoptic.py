@@ -27,7 +27,7 @@ from gsjax.data.objects import Truth
 from gsjax.data.origin import near_origin, relative_to_origin
 from gsjax.data.pictures import is_picture
 from gsjax.data.sequence import Sequence
-from gsjax.data.validation import check_intrinsics, check_poses
+from gsjax.data.validation import check_intrinsics, check_poses, check_times
 from gsjax.geometry.joints import Joint
 from gsjax.io.atomic import write_json, write_npz
 from gsjax.io.brief import brief
@@ -120,10 +120,11 @@ def write_panoptic(sequence: Sequence, path: str | Path, depth_unit_m: float = 0
             counts the pixels.
 
     Raises:
-        ValueError: the truth has other labels, or a mask has labels outside 0 to 65535.
+        ValueError: the truth has other labels, frames share a time, or a mask has labels outside 0 to 65535.
     """
     root = Path(path)
     sequence = relative_to_origin(sequence, None)  # the layout has no place for an origin
+    check_times(sequence.times)  # shared ones could not be read
     truth = sequence.truth
     if truth is not None and truth.label_ids.tolist() != list(range(2, 2 + len(truth.names))):
         found = truth.label_ids.tolist()

@@ -49,6 +49,12 @@ def test_writing_needs_the_labels_of_a_tabletop(tmp_path):
         write_panoptic(replace(scene, truth=truth), tmp_path)
 
 
+def test_frames_that_share_a_time_are_refused_as_they_could_not_be_read(tmp_path):
+    scene = replace(tabletop(frames=2, width=16, height=12), times=np.array([0.5, 0.5]), shared_times=True)
+    with pytest.raises(ValueError, match="increase, but frame 1 is at 0.5 s after 0.5 s"):
+        write_panoptic(scene, tmp_path)
+
+
 def test_frames_without_depth_or_mask_survive_the_disk(tmp_path):
     whole = open_sequence("simulated:tabletop?frames=4&width=16&height=12").select(cameras=[0])
     some = replace(
