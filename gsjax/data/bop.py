@@ -121,7 +121,9 @@ def read_bop(path: str | Path, *, world: str | None = None, depth_unit_m: float 
         truth=followed.truth(root) if annotated else None,
         label_names=followed.names,
         locate=lambda kind, t, c: str(
-            root / "mask_visib" / f"{numbers[t]:06d}_*.png" if kind == "mask" else files[kind][numbers[t]]
+            root / "mask_visib" / f"{numbers[t]:06d}_*.png"
+            if kind == "mask"
+            else files[kind].get(numbers[t], root / kind / f"{numbers[t]:06d}.png")
         ),
     )
 

@@ -2,6 +2,7 @@
 
 import re
 import warnings
+from itertools import pairwise
 from pathlib import Path
 
 from gsjax.data.errors import COMPLETE, DataError, DataWarning
@@ -37,13 +38,14 @@ def pictures_beside(folder: Path, count: int, frames: str) -> list[Path]:
         frames: name of the frames' folder or file, for messages.
 
     Raises:
-        DataError: the number of pictures is not `count`.
+        DataError: the number of pictures is not `count`, or their names sort differently than their numbers.
     """
     found = pictures(folder)
     if len(found) != count:
         expected = f"{count} pictures, one per frame of {frames}"
         advice = f"{COMPLETE} Pictures are paired in order of name."
         raise DataError(folder, expected, f"{len(found)}", advice)
+    frame_numbers(found)  # an error if they would be paired with the wrong frames
     return found
 
 
@@ -69,23 +71,27 @@ def numbered(folder: Path, suffixes: tuple[str, ...] = SUFFIXES) -> dict[int, Pa
 
 def frame_numbers(frames: list[Path]) -> tuple[int, ...]:
     """The last number in each name (12 for frame-000012_color.png); or positions from 0 if a name has no
-    number or two names have the same one.
+    number, two names have the same one, or only all numbers of the names together increase, as those of time
+    stamps do.
 
     Raises:
         DataError: names sort differently than their numbers, so the frames would be out of order in time.
     """
-    texts = [_NUMBER.findall(path.stem) for path in frames]
-    if not all(texts):
-        return tuple(range(len(frames)))
-    numbers = [int(text[-1]) for text in texts]
-    if len(set(numbers)) < len(numbers):
-        return tuple(range(len(frames)))
-    for before, after, number, following in zip(frames, frames[1:], numbers, numbers[1:], strict=False):
-        if following < number:
-            advice = "Pad the numbers with zeros to equal length."
-            found = f"{after.name} after {before.name}"
-            raise DataError(frames[0].parent, "names that sort in the order of their numbers", found, advice)
-    return tuple(numbers)
+    positions = tuple(range(len(frames)))
+    counters = [[int(text) for text in _NUMBER.findall(path.stem)] for path in frames]
+    if not all(counters):
+        return positions
+    numbers = tuple(counter[-1] for counter in counters)
+    falls = [pair for pair, (a, b) in zip(pairwise(frames), pairwise(numbers), strict=True) if b < a]
+    in_order = all(a < b for a, b in pairwise(counters))
+    if len(set(numbers)) < len(numbers) or (falls and in_order):  # 19.80.png, 20.20.png
+        return positions
+    if falls:
+        before, after = falls[0]
+        advice = "Pad the numbers with zeros to equal length."
+        found = f"{after.name} after {before.name}"
+        raise DataError(frames[0].parent, "names that sort in the order of their numbers", found, advice)
+    return numbers
 
 
 def warn_about_single_frame(frames: list[Path]) -> None:

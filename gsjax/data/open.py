@@ -214,10 +214,13 @@ def _photographs(path: str | Path, options: ReadOptions) -> Photographs:
     raise _unknown(root, PHOTOGRAPHS + RECORDINGS, options)
 
 
-def is_recording(path: str | Path) -> bool:
-    """Whether a path holds a recording over time, judged by its files."""
+def is_recording(path: str | Path, images: str = "images") -> bool:
+    """Whether a path holds a recording over time, judged by its files; `images` is the name of the folder of
+    frames within."""
     root = Path(path)
-    return str(path).startswith(SIMULATED_PREFIX) or _is_bag(root) or layout_of(root, RECORDINGS) is not None
+    if str(path).startswith(SIMULATED_PREFIX) or _is_bag(root):
+        return True
+    return layout_of(root, RECORDINGS, images) is not None
 
 
 def _is_bag(path: Path) -> bool:

@@ -19,14 +19,15 @@ def open_as_sequence(dataset: str, read: ReadOptions | None = None) -> Sequence:
     Raises:
         DataError: the data cannot be read, or photographs differ in size.
     """
-    if is_photographs(dataset) and not is_recording(dataset):
+    read = read or ReadOptions()
+    if is_photographs(dataset) and not is_recording(dataset, read.images):
         return sequence_of(open_photographs(dataset, read))
     return open_sequence(dataset, read)
 
 
 def _natural_key(name: str) -> list[tuple[int, str]]:
     """Sort key by which frame_2 comes before frame_10."""
-    return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", name)]
+    return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", name)]
 
 
 def sequence_of(photographs: Photographs) -> Sequence:

@@ -1,7 +1,8 @@
 """The Panoptic layout of Dynamic 3D Gaussians (Luiten et al. 2024), with depth, times and truth added.
 
 train_meta.json        w, h, k[t][c] 3x3, w2c[t][c] 4x4 (OpenCV axes), fn[t][c], cam_id[t][c];
-                       gsjax adds time[t] in seconds, depth_unit_m, and label_names {"3": "cup"}
+                       gsjax adds time[t] in seconds, depth_unit_m, label_names {"3": "cup"}, and absent:
+                       files of seg/ and depth/ that some frames never had
 test_meta.json         the same for held-out cameras, optional; both are merged
 ims/CAM/FRAME.jpg      named in fn
 seg/CAM/FRAME.png      labels, optional, possibly for some cameras only, or only for the first frame
@@ -23,9 +24,10 @@ from gsjax.data.frame_folders import DEFAULT_RATE_HZ
 from gsjax.data.masks import read_mask
 from gsjax.data.names import portable
 from gsjax.data.objects import Truth
-from gsjax.data.origin import near_origin
+from gsjax.data.origin import near_origin, relative_to_origin
+from gsjax.data.pictures import is_picture
 from gsjax.data.sequence import Sequence
-from gsjax.data.validation import check_intrinsics, check_poses
+from gsjax.data.validation import check_intrinsics, check_poses, check_times
 from gsjax.geometry.joints import Joint
 from gsjax.io.atomic import write_json, write_npz
 from gsjax.io.brief import brief
@@ -68,6 +70,9 @@ def read_panoptic(path: str | Path, *, depth_unit_m: float | None = None) -> Seq
         )
     unit = depth_unit_m or float(meta.get("depth_unit_m", DEFAULT_DEPTH_UNIT_M))
 
+    ids = tuple(_frame_number(meta["fn"][t][0], t) for t in present)
+    if len(set(ids)) < len(ids):  # such as the number of the camera
+        ids = tuple(present)
     first_mask_only = [_has_first_mask_only(root, name) for name in names[0]]
 
     def locate(kind: str, t: int, c: int) -> str:
@@ -75,11 +80,13 @@ def read_panoptic(path: str | Path, *, depth_unit_m: float | None = None) -> Seq
 
     def load_depth(t: int, c: int) -> np.ndarray | None:
         name = names[t][c]
-        return read_depth(_depth_path(root, name), unit, width, height) if _has(root, "depth", name) else None
+        absent = not _has(root, "depth", name) or _file("depth", name) in meta["absent"]
+        return None if absent else read_depth(_depth_path(root, name), unit, width, height)
 
     def load_mask(t: int, c: int) -> np.ndarray | None:
         name = names[t][c]
-        absent = not _has(root, "seg", name) or (first_mask_only[c] and name != names[0][c])
+        absent = not _has(root, "seg", name) or _file("seg", name) in meta["absent"]
+        absent |= first_mask_only[c] and name != names[0][c]
         return None if absent else read_mask(_mask_path(root, name), width, height)
 
     return Sequence(
@@ -88,7 +95,7 @@ def read_panoptic(path: str | Path, *, depth_unit_m: float | None = None) -> Seq
         width=width,
         height=height,
         times=times[present],
-        frame_ids=tuple(_frame_number(meta["fn"][t][0], t) for t in present),
+        frame_ids=ids,
         Ks=meta["k"][present],
         viewmats=meta["w2c"][present],
         load_image=lambda t, c: read_image(_image_path(root, names[t][c]), width, height),
@@ -103,8 +110,8 @@ def read_panoptic(path: str | Path, *, depth_unit_m: float | None = None) -> Seq
 def write_panoptic(sequence: Sequence, path: str | Path, depth_unit_m: float = 0.0001) -> None:
     """Save a sequence in this layout, with a single train_meta.json and lossless PNG images.
 
-    Names of labels are saved too, and truth, whose labels must be those of a tabletop: 2, 3, ... for objects,
-    1 for a robot.
+    Poses are saved in the coordinates of the data, also far from 0. Names of labels are saved too, and truth,
+    whose labels must be those of a tabletop: 2, 3, ... for objects, 1 for a robot.
 
     Args:
         sequence: the sequence; all its frames are loaded.
@@ -113,19 +120,23 @@ def write_panoptic(sequence: Sequence, path: str | Path, depth_unit_m: float = 0
             counts the pixels.
 
     Raises:
-        ValueError: the truth has other labels, or a mask has labels outside 0 to 65535.
+        ValueError: the truth has other labels, frames share a time, or a mask has labels outside 0 to 65535.
     """
     root = Path(path)
+    sequence = relative_to_origin(sequence, None)  # the layout has no place for an origin
+    check_times(sequence.times)  # shared ones could not be read
     truth = sequence.truth
     if truth is not None and truth.label_ids.tolist() != list(range(2, 2 + len(truth.names))):
         found = truth.label_ids.tolist()
         raise ValueError(f"write_panoptic requires objects labelled 2, 3, ..., got {found}")
     names = [[f"{cam}/{frame:06d}.png" for cam in sequence.camera_ids] for frame in sequence.frame_ids]
-    too_far = 0
+    too_far, absent = 0, []
     for t, frame in enumerate(names):
         for c, name in enumerate(frame):
             write_png(root / "ims" / name, sequence.image(t, c))
             depth, mask = sequence.depth(t, c), sequence.mask(t, c)
+            loaded = {"depth": depth, "seg": mask}
+            absent += [_file(kind, name) for kind, found in loaded.items() if found is None]
             if depth is not None:
                 steps = np.round(depth / depth_unit_m)
                 fits = steps < SATURATED_DEPTH
@@ -150,6 +161,8 @@ def write_panoptic(sequence: Sequence, path: str | Path, depth_unit_m: float = 0
         "time": sequence.times.tolist(),
         "depth_unit_m": depth_unit_m,
     }
+    if absent := [file for file in absent if (root / file).parent.is_dir()]:  # other frames have it
+        meta["absent"] = absent
     if sequence.names_of_labels:
         meta["label_names"] = {str(label): name for label, name in sequence.names_of_labels.items()}
     if truth is not None:
@@ -177,6 +190,7 @@ def _read_metas(root: Path) -> dict[str, Any]:
     merged["fn"] = [a + b for a, b in zip(merged["fn"], extra["fn"], strict=True)]
     for key in ("cam_id", "file"):
         merged[key] = merged[key] + extra[key]
+    merged["absent"] |= extra["absent"]
     for key in ("k", "w2c"):
         merged[key] = np.concatenate([merged[key], extra[key]], axis=1)
     return merged
@@ -216,7 +230,8 @@ def _checked(path: Path, meta: dict[str, Any]) -> dict[str, Any]:
             raise DataError(path, expected, f"{ids} in frame {t}", _ADVICE_META)
     arrays = {key: _stack(path, key, meta[key], side) for key, side in (("k", 3), ("w2c", 4))}
     names = {"fn": [[portable(name) for name in frame] for frame in meta["fn"]]}
-    return meta | arrays | names | {"cam_id": [int(i) for i in meta["cam_id"][0]], "file": [path] * cameras}
+    own = {"cam_id": [int(i) for i in meta["cam_id"][0]], "file": [path] * cameras}
+    return meta | arrays | names | own | {"absent": {portable(file) for file in meta.get("absent", ())}}
 
 
 def _check_cameras(meta: dict[str, Any], present: list[int]) -> None:
@@ -323,11 +338,16 @@ def _image_path(root: Path, name: str) -> Path:
 
 
 def _mask_path(root: Path, name: str) -> Path:
-    return (root / "seg" / name).with_suffix(".png")
+    return root / _file("seg", name)
 
 
 def _depth_path(root: Path, name: str) -> Path:
-    return (root / "depth" / name).with_suffix(".png")
+    return root / _file("depth", name)
+
+
+def _file(kind: str, name: str) -> str:
+    """The file of image `name` in seg/ or depth/, relative to the folder of the recording."""
+    return Path(kind, name).with_suffix(".png").as_posix()
 
 
 _FINDERS = {"image": _image_path, "mask": _mask_path, "depth": _depth_path}
@@ -341,7 +361,7 @@ def _has(root: Path, kind: str, name: str) -> bool:
 def _has_first_mask_only(root: Path, first: str) -> bool:
     """Whether the camera of image `first` has only the mask of that image, all that the tracker needs."""
     mask = _mask_path(root, first)
-    return _has(root, "seg", first) and [*mask.parent.iterdir()] == [mask]
+    return _has(root, "seg", first) and [file for file in mask.parent.iterdir() if is_picture(file)] == [mask]
 
 
 def _frame_number(name: str, fallback: int) -> int:

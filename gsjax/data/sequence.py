@@ -1,6 +1,7 @@
 """The one sequence type that every reader returns and every method takes."""
 
 import warnings
+from collections import Counter
 from collections.abc import Callable, Mapping
 from collections.abc import Sequence as Indices
 from dataclasses import dataclass, field, replace
@@ -70,8 +71,9 @@ class Sequence:
         background: RGB, 0 to 1, composited behind transparent images; None if none is transparent.
 
     Raises:
-        ValueError: there is no camera, ids of cameras repeat, shapes disagree, intrinsics are not a camera's,
-            a pose is not a rigid motion, times do not increase, or the background is not from 0 to 1.
+        ValueError: there is no camera, ids of cameras or frames repeat, shapes disagree, intrinsics are not a
+            camera's, a pose is not a rigid motion, times do not increase, or the background is not from 0 to
+            1.
     """
 
     name: str
@@ -113,6 +115,8 @@ class Sequence:
         check_shape("times", self.times, (frames,))
         check_times(self.times, shared=self.shared_times)
         check_shape("frame_ids", np.asarray(self.frame_ids), (frames,))
+        if repeated := [i for i, count in Counter(self.frame_ids).items() if count > 1]:
+            raise ValueError(f"frame_ids must differ from each other, got {repeated[0]} more than once")
         check_shape("Ks", self.Ks, (frames, cameras, 3, 3))
         check_shape("viewmats", self.viewmats, (frames, cameras, 4, 4))
         if self.origin is not None:
@@ -204,9 +208,10 @@ class Sequence:
             DataError: the file is unreadable, the loader returned another shape or type, or the unit is
                 wrong.
         """
-        depth, what = self._load(self.load_depth, "depth", t, c), self.where("depth", t, c)
+        depth = self._load(self.load_depth, "depth", t, c)
         if depth is None:
             return None
+        what = self.where("depth", t, c)
         check_loaded(what, depth, (self.height, self.width), np.floating)
         if self.float_images:
             depth = np.where(np.isfinite(self._raw_image(t, c)).all(-1), depth, 0)
@@ -246,11 +251,12 @@ class Sequence:
         """Displacement (x, y) of each pixel from frame `t` to t + 1, pixels; NaN = unknown, None = no flow.
 
         Raises:
-            IndexError: `t` is the last frame.
+            IndexError: `t` is the last frame, or none.
             DataError: the loader returned another shape or type.
         """
         if self.load_flow is None:
             return None
+        self._check_index(t, c)
         self._check_index(t + 1, c)
         flow = self.load_flow(t, t + 1, c)
         if flow is not None:

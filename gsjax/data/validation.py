@@ -161,7 +161,9 @@ def check_depth(depth: Float[np.ndarray, "height width"], what: str) -> Float[np
     Raises:
         DataError: the median of the valid pixels is above 50 m or below 20 mm: the unit is wrong.
     """
-    depth = np.where(np.isfinite(depth) & (depth > 0), depth, 0).astype(np.float32)
+    with np.errstate(over="ignore"):  # 1e300 of doubles, invalid too
+        depth = depth.astype(np.float32)
+    depth = np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(0))
     valid = depth[depth > 0]
     if valid.size == 0:
         warnings.warn(f"{what}: no pixel has a valid depth", DataWarning, stacklevel=3)

@@ -70,7 +70,7 @@ def run(options: Options) -> int:
         return 0
     table = None
     with Notes(Console(stderr=True, highlight=False)):
-        if is_photographs(options.path) and not is_recording(options.path):
+        if is_photographs(options.path) and not is_recording(options.path, options.read.images):
             photographs = open_photographs(options.path, options.read)
             photographs.image(0)  # an error if it cannot be read
             check_photographs(photographs)

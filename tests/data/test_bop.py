@@ -174,6 +174,8 @@ def test_what_is_optional(folder):
     with pytest.warns(DataWarning, match="mask_visib: no mask belongs to an instance in scene_gt.json"):
         read = read_bop(folder.root)
     assert (read.has_depth, read.has_masks, read.truth) == (False, False, None)
+    assert read.depth(0, 0) is None
+    assert read.where("depth", 0, 0) == str(folder.root / "depth/000000.png")
 
 
 def test_folders_that_are_no_scene(folder):

@@ -16,6 +16,7 @@ from gsjax.data import (
     photographs_of,
     read_endonerf,
 )
+from gsjax.data.ordered import open_as_sequence
 from gsjax.geometry.cameras import look_at
 from tests.data import dots
 from tests.data.test_poses_bounds import HEIGHT, WIDTH, K, row
@@ -82,6 +83,13 @@ def test_both_eyes_see_what_was_drawn(folder):
     for c in (0, 1):
         np.testing.assert_array_equal(sequence.mask(2, c), tool_mask(2))
     assert sequence.where("mask", 2, 1) == str(folder / "right/masks/frame-000005.mask.png")
+
+
+def test_frames_in_a_folder_of_another_name_are_still_a_recording(folder):
+    for root in (folder, folder / "right"):
+        (root / "images").rename(root / "frames")
+    sequence = open_as_sequence(str(folder), ReadOptions(images="frames"))
+    assert (sequence.layout, sequence.has_masks, sequence.has_depth) == ("EndoNeRF", True, True)
 
 
 def test_the_tool_label_has_a_name(folder):

@@ -38,6 +38,8 @@ def test_pictures_come_in_order_of_name_and_nothing_else_does(tmp_path):
         (("2024_clip_01.png", "2024_clip_02.png"), (1, 2)),
         (("a.png", "b3.png"), (0, 1)),
         (("f1_left.png", "f1_right.png"), (0, 1)),
+        (("1305031102.975304.png", "1305031103.011304.png"), (0, 1)),
+        (("shot1_099.png", "shot2_001.png"), (0, 1)),
     ],
 )
 def test_the_frame_number_is_the_last_number_in_the_name(tmp_path, names, numbers):
@@ -64,6 +66,12 @@ def test_there_must_be_one_picture_per_frame(tmp_path):
         pictures_beside(tmp_path / "masks", 2, "clip.mp4")
     save(tmp_path, "masks/1.jpg")
     assert len(pictures_beside(tmp_path / "masks", 2, "images")) == 2
+
+
+def test_pictures_beside_frames_must_sort_in_order_of_their_numbers_too(tmp_path):
+    save(tmp_path, "masks/1.png", "masks/2.png", "masks/10.png")
+    with pytest.raises(DataError, match=r"masks: .*found 2.png after 10.png. Pad the numbers with zeros"):
+        pictures_beside(tmp_path / "masks", 3, "clip.mp4")
 
 
 def test_a_single_frame_shows_no_motion(tmp_path):

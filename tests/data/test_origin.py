@@ -6,7 +6,14 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from gsjax.data import DataWarning, open_photographs, open_sequence, photographs_of
+from gsjax.data import (
+    DataWarning,
+    open_photographs,
+    open_sequence,
+    photographs_of,
+    read_panoptic,
+    write_panoptic,
+)
 from gsjax.data.objects import PointModel
 from gsjax.data.origin import near_origin, relative_to_origin
 from gsjax.data.simulated import tabletop
@@ -157,3 +164,9 @@ def test_a_recording_of_another_layout_is_moved_too(tmp_path):
         sequence = open_sequence(tmp_path)
     assert sequence.origin is not None
     assert np.abs(sequence.viewmats[..., :3, 3]).max() < 1
+    write_panoptic(sequence, tmp_path / "converted")
+    with pytest.warns(DataWarning, match="relative to the origin"):
+        converted = read_panoptic(tmp_path / "converted")
+    np.testing.assert_allclose(
+        relative_to_origin(converted, None).viewmats, relative_to_origin(sequence, None).viewmats, atol=1e-6
+    )

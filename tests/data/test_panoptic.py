@@ -1,13 +1,11 @@
 import json
 import warnings
-from dataclasses import replace
 
 import cv2
 import numpy as np
 import pytest
 
-from gsjax.data import DataError, DataWarning, ReadOptions, open_sequence, read_panoptic, write_panoptic
-from gsjax.data.simulated import tabletop
+from gsjax.data import DataError, DataWarning, ReadOptions, open_sequence, read_panoptic
 
 FRAMES, WIDTH, HEIGHT = 3, 8, 6
 K = [[10.0, 0.0, 4.0], [0.0, 10.0, 3.0], [0.0, 0.0, 1.0]]
@@ -138,6 +136,7 @@ def test_a_camera_count_that_differs_names_the_frame(folder):
         (lambda m: m["w2c"][1][1].pop(), r"w2c in frame 1, camera position 1, as 4x4 numbers, found 3x4"),
         (lambda m: m.update(time=[0.0, 1.0]), "time to be 3 numbers"),
         (lambda m: m.update(fn=[]), "at least one frame"),
+        (lambda m: m.update(absent=[[1]]), "the lists and numbers of this layout, found something else"),
         (lambda m: m.update(fn=[[1, 2]] * 3), "the lists and numbers of this layout, found something else"),
     ],
 )
@@ -198,6 +197,8 @@ def test_the_first_mask_may_be_the_only_one(folder):
     folder.add("seg", 1, np.uint8)
     for file in sorted((folder.root / "seg/0").iterdir())[1:]:
         file.unlink()
+    for name in (".DS_Store", "._000000.png", "Thumbs.db"):  # of file managers
+        (folder.root / "seg/0" / name).write_bytes(b"")
     sequence = folder.read()
     assert sequence.mask(0, 0) is not None
     assert sequence.mask(1, 0) is None
@@ -276,23 +277,6 @@ def test_truth_skips_the_frames_that_have_no_files(folder):
         assert folder.read().truth.poses[:, 0, 0, 3].tolist() == [1, 2]
 
 
-def test_a_simulated_scene_survives_the_disk(tmp_path):
-    scene = tabletop(frames=2, width=64, height=48, cameras=2)
-    write_panoptic(scene, tmp_path)
-    read = read_panoptic(tmp_path)
-    assert read.camera_ids == scene.camera_ids
-    for t in range(2):
-        for c in range(2):
-            np.testing.assert_array_equal(read.image(t, c), scene.image(t, c))
-            np.testing.assert_array_equal(read.mask(t, c), scene.mask(t, c))
-            np.testing.assert_allclose(read.depth(t, c), scene.depth(t, c), atol=5.1e-5)
-    np.testing.assert_array_equal(read.truth.poses, scene.truth.poses)
-    np.testing.assert_array_equal(read.truth.label_ids, scene.truth.label_ids)
-    np.testing.assert_array_equal(read.times, scene.times)
-    np.testing.assert_array_equal(read.viewmats, scene.viewmats)
-    assert (read.truth.names, read.truth.robot) == (scene.truth.names, scene.truth.robot)
-
-
 @pytest.mark.parametrize("name", ["tabletop_0", "tabletop_1", "articulated_0"])
 def test_simulated_recordings(shared_data, name):
     sequence = read_panoptic(shared_data / name)
@@ -337,26 +321,6 @@ def test_real_recording_with_held_out_cameras(shared_data):
     assert set(np.unique(sequence.mask(0, 0))) == {0, 255}
 
 
-def test_names_of_labels_survive_the_disk_and_others_are_refused(tmp_path):
-    sequence = open_sequence("simulated:tabletop?frames=1&width=32&height=24").select(cameras=[0])
-    write_panoptic(replace(sequence, truth=None, label_names={1: "robot", 3: "cup"}), tmp_path)
-    found = open_sequence(tmp_path)
-    assert found.names_of_labels == {1: "robot", 3: "cup"}
-    meta = json.loads((tmp_path / "train_meta.json").read_text())
-    message = r"train_meta.json: expected label_names to be names of mask values"
-    for names in (["cup"], {"three": "cup"}, {"3": 3}, {"²": "cup"}):
-        (tmp_path / "train_meta.json").write_text(json.dumps(meta | {"label_names": names}))
-        with pytest.raises(DataError, match=message):
-            open_sequence(tmp_path)
-
-
-def test_writing_needs_the_labels_of_a_tabletop(tmp_path):
-    scene = tabletop(frames=1, width=16, height=12, cameras=1)
-    truth = replace(scene.truth, label_ids=np.array([1, 2, 3, 4]))
-    with pytest.raises(ValueError, match=r"labelled 2, 3, ..., got \[1, 2, 3, 4\]"):
-        write_panoptic(replace(scene, truth=truth), tmp_path)
-
-
 def test_frames_without_a_number_are_counted(folder):
     for t in range(FRAMES):
         for c in (0, 1):
@@ -365,29 +329,11 @@ def test_frames_without_a_number_are_counted(folder):
     assert folder.read().frame_ids == (0, 1, 2)
 
 
-def _labelled(mask_value, depth=1.0):
-    """A sequence whose masks and depths are constant."""
-    sequence = replace(tabletop(frames=1, width=WIDTH, height=HEIGHT), truth=None)
-    shape = (HEIGHT, WIDTH)
-    return replace(
-        sequence,
-        load_mask=lambda t, c: np.full(shape, mask_value, np.int32),
-        load_depth=lambda t, c: np.full(shape, depth, np.float32),
-    )
-
-
-def test_large_labels_survive_the_disk_and_negative_ones_are_refused(tmp_path):
-    write_panoptic(_labelled(300), tmp_path / "large")
-    assert (read_panoptic(tmp_path / "large").mask(0, 0) == 300).all()
-    with pytest.raises(ValueError, match="labels from 0 to 65535, got -1"):
-        write_panoptic(_labelled(-1), tmp_path / "negative")
-
-
-def test_depth_too_far_to_be_saved_is_counted(tmp_path):
-    with pytest.warns(
-        DataWarning, match=rf"depth of {3 * WIDTH * HEIGHT} pixels farther than 6.553 m is lost"
-    ):
-        write_panoptic(_labelled(1, depth=8.0), tmp_path)
+def test_frames_whose_names_end_in_the_camera_are_counted(folder):
+    for name in (folder.root / "ims").glob("*/*"):
+        name.rename(name.with_stem(f"{name.stem}_cam{name.parent.name}"))
+    folder.meta["fn"] = [[f"{c}/{t:06d}_cam{c}.jpg" for c in (0, 1)] for t in range(FRAMES)]
+    assert folder.read().frame_ids == (0, 1, 2)
 
 
 def test_a_unit_of_depth_that_the_user_gives(folder):

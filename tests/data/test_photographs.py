@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from gsjax.data import Cloud, DataError, Photographs, open_sequence, photographs_of
+from gsjax.data.ordered import sequence_of
 from gsjax.geometry.cameras import intrinsics, look_at, project
 from tests.data import dots
 
@@ -44,6 +45,11 @@ def test_a_point_is_where_the_camera_says():
             pixel, _ = project(jnp.asarray(POINT, jnp.float32), camera.viewmat, camera.K)
             assert (camera.width, camera.height) == tuple(scene.sizes[i])
             assert dots.offset(scene.image(i), np.asarray(pixel)) < 0.05
+
+
+def test_frames_follow_the_numbers_in_their_names_and_a_superscript_is_none():
+    some = photographs(names=("1²10", "1²9", "1²8"), sizes=np.tile(SIZES[:1], (3, 1)), times=None)
+    np.testing.assert_array_equal(sequence_of(some).viewmats[:, 0], some.viewmats[::-1])
 
 
 def test_a_selection_in_another_order():

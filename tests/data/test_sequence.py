@@ -193,6 +193,8 @@ def test_indices_out_of_range_are_errors(t, c):
 def test_flow_of_the_last_frame_is_an_error():
     with pytest.raises(IndexError):
         make().flow(3, 0)
+    with pytest.raises(IndexError):
+        make().flow(-1, 0)  # would be the flow from the last frame to the first
 
 
 def spoil(index, value):
@@ -236,6 +238,7 @@ def test_a_rotation_of_few_digits_passes():
         ({"times": np.zeros(0), "frame_ids": ()}, "at least one frame"),
         ({"camera_ids": (3, 3)}, "differ"),
         ({"frame_ids": (1, 2)}, "frame_ids must have shape"),
+        ({"frame_ids": (1, 2, 2, 3)}, r"frame_ids must differ from each other, got 2 more than once"),
     ],
 )
 def test_a_sequence_that_disagrees_with_itself_is_refused(changes, says):
@@ -326,7 +329,7 @@ def test_float_pixels_that_are_not_finite_turn_black_and_lose_their_depth():
 
 
 def test_depth_that_is_not_finite_is_invalid():
-    cleaned = check_depth(np.array([[np.nan, np.inf, -1.0], [1.0, 2.0, 0.0]]), "depth")
+    cleaned = check_depth(np.array([[np.nan, np.inf, -1.0], [1.0, 2.0, 1e300]]), "depth")
     np.testing.assert_array_equal(cleaned, np.array([[0, 0, 0], [1, 2, 0]], np.float32))
     assert cleaned.dtype == np.float32
 

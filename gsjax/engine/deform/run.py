@@ -191,7 +191,7 @@ def _recording(options: Options, notes: Notes) -> tuple[Sequence, DepthSource]:
     chosen = (options.frames, options.read, options.scale)
     whole = open_recording(options.dataset, (), (), *chosen, opened=open_as_sequence).judged
     check_recording(whole)
-    if is_photographs(options.dataset) and not is_recording(options.dataset):
+    if is_photographs(options.dataset) and not is_recording(options.dataset, options.read.images):
         photographs = open_photographs(options.dataset, options.read)
         notes.add(_of_photographs(photographs, whole.viewmats[0, 0]))
         if photographs.times is None and photographs.splits is not None:
