@@ -227,10 +227,10 @@ def take(tree: Tree, indices: Integer[ArrayLike, "M"] | Bool[ArrayLike, "N"]) ->
             if indices.shape != (count,):
                 raise ValueError(f"indices: expected a mask of shape ({count},), found {indices.shape}")
             indices = np.flatnonzero(indices)
-        elif ((indices < -count) | (indices >= count)).any():
-            raise ValueError(
-                f"indices: expected rows below {count}, found {indices[np.abs(indices).argmax()]}"
-            )
+        elif not indices.size:
+            indices = indices.astype(int)  # an empty list becomes floats
+        elif (wrong := (indices < -count) | (indices >= count)).any():
+            raise ValueError(f"indices: expected rows below {count}, found {indices[wrong][0]}")
     return _rows(tree, indices)
 
 

@@ -139,9 +139,15 @@ def test_take_by_index_and_by_mask():
         (np.array([True, False]), r"a mask of shape \(5,\), found \(2,\)"),
         (np.array([0, 5]), "rows below 5, found 5"),
         (np.array([-6, 1]), "rows below 5, found -6"),
+        (np.array([-5, 5]), "rows below 5, found 5"),
     ):
         with pytest.raises(ValueError, match=says):
             take(gaussians, wrong)
+
+
+@pytest.mark.usefixtures("as_users_run")
+def test_an_empty_list_takes_nothing():
+    assert len(take(Tags(labels=jnp.arange(5)), []).labels) == 0
 
 
 def test_colors_may_be_whole_numbers_and_traced():
