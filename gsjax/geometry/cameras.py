@@ -198,8 +198,8 @@ def perturbed(
     """
     turn = jaxlie.SO3.exp(twist[:3]).as_matrix()
     rotations = jnp.matmul(viewmats[:, :3, :3], turn.T, precision="highest")
-    centers = -jnp.einsum("cji,cj->ci", viewmats[:, :3, :3], viewmats[:, :3, 3]) + radius * twist[3:]
-    shifts = -jnp.einsum("cij,cj->ci", rotations, centers)
+    centers = camera_centers(viewmats) + radius * twist[3:]
+    shifts = -jnp.einsum("cij,cj->ci", rotations, centers, precision="highest")
     return viewmats.at[:, :3, :3].set(rotations).at[:, :3, 3].set(shifts)
 
 

@@ -159,6 +159,8 @@ def _collect(value: Any, found: list[Hashable], known: dict[int, Any]) -> None:
         found.append(len(value))
         for one in value:
             _collect(one, found, known)
+    elif isinstance(value, set | frozenset):
+        _collect(sorted(value, key=repr), found, known)
     elif isinstance(value, dict):
         for name, one in value.items():
             found.append(str(name))

@@ -11,6 +11,7 @@ slack, which absorbs the unmatched (the dustbin of SuperGlue, Sarlin et al. 2020
 pair is matched only if its score is higher than the slack.
 """
 
+import math
 from functools import partial
 from typing import Literal
 
@@ -55,7 +56,8 @@ def sinkhorn(
         derivative: how to differentiate.
 
     Raises:
-        ValueError: `derivative` is unknown, `iterations` is below 1, or `temperature` is not above 0.
+        ValueError: `derivative` is unknown, `iterations` is below 1, `temperature` is not above 0, or `slack`
+            is not finite.
     """
     if derivative not in ("unrolled", "implicit"):
         raise ValueError(f"derivative={derivative!r}: expected 'unrolled' or 'implicit'")
@@ -63,6 +65,8 @@ def sinkhorn(
         raise ValueError(f"iterations={iterations}: expected 1 or more")
     if isinstance(temperature, int | float) and not temperature > 0:
         raise ValueError(f"temperature={temperature}: expected a number above 0")
+    if isinstance(slack, int | float) and not math.isfinite(slack):
+        raise ValueError(f"slack={slack}: expected a finite score, or None")
     pairs = jnp.isfinite(scores)
     if rows is not None:
         pairs &= rows[:, None]

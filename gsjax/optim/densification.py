@@ -23,6 +23,7 @@ DEAD = 0.005
 EMPTY_LOGIT = -20.0
 """Opacity logit of a slot that has never held a Gaussian: the opacity is below 1/255, so it is not drawn."""
 
+_FAINTEST_COPY = 1.001 * DEAD  # still above DEAD when it has been stored as a logit
 _MOST_COPIES = 51  # most copies of one Gaussian at once, as in the reference implementation
 _SHARPNESS, _FAINT = 100.0, 0.005  # of the sigmoid that exempts opaque Gaussians from the noise
 
@@ -72,14 +73,15 @@ def split_into_copies(
 ) -> tuple[Float[Array, "n"], Float[Array, "n"]]:
     """The opacity of each of `copies` Gaussians that together look like one, and the factor on its scales.
 
-    Opacities are clipped to between DEAD and 1 - 1e-6, so that logits are finite and no copy starts dead.
+    Opacities are clipped to between slightly more than DEAD and 1 - 1e-6, so that no copy starts dead and
+    logits are finite.
     """
     opaque = jnp.clip(opacities, DEAD, 1 - 1e-6)
     each = -jnp.expm1(jnp.log1p(-opaque) / copies)
     table = jnp.asarray(_signed_sums(), opacities.dtype)  # [copies, k]
     powers = jnp.cumprod(jnp.broadcast_to(each[:, None], (len(each), _MOST_COPIES)), axis=1)
     total = (table[copies - 1] * powers).sum(-1)
-    return jnp.clip(each, DEAD, 1 - 1e-6), opaque / jnp.maximum(total, 1e-12)
+    return jnp.clip(each, _FAINTEST_COPY, 1 - 1e-6), opaque / jnp.maximum(total, 1e-12)
 
 
 @cache

@@ -24,6 +24,8 @@ from gsjax.scene.feature_grid import interpolated
 from gsjax.scene.gaussians import Gaussians
 from gsjax.scene.time_encodings import HexPlane, Sinusoids, Voxels, init_hexplane, init_voxels, within
 
+_MOST_VOXELS = 255  # with 256^3 vertices, the most that a feature grid holds
+
 
 @dataclass(frozen=True)
 class DeformationConfig:
@@ -37,7 +39,7 @@ class DeformationConfig:
     """Axis and angle composed with the rotation, as in SurstSplat, or a difference of quaternions, as in
     GaussianClin."""
     resolution: int = 64
-    """Vertices per axis of the coarsest planes, or of the voxels."""
+    """Vertices per axis of the coarsest planes, or voxels per axis (at most 255)."""
     time_resolution: int = 30
     """Vertices along the time axis of all planes: about half the number of frames, so that nearby frames
     share vertices."""
@@ -66,6 +68,10 @@ class DeformationConfig:
         for name, low in least.items():
             if getattr(self, name) < low:
                 raise ValueError(f"{name}: expected at least {low}, found {getattr(self, name)}")
+        if self.kind == "voxels" and self.resolution > _MOST_VOXELS:
+            raise ValueError(
+                f"resolution: expected at most {_MOST_VOXELS} with voxels, found {self.resolution}"
+            )
 
 
 class Offsets(NamedTuple):

@@ -150,7 +150,11 @@ def gaussians_from_activated(
     count = np.shape(means)[0] if np.ndim(means) else None
     wanted = {"means": 3, "quats": 4, "scales": 3, "opacities": None, "colors": 3}
     arrays = dict(zip(wanted, (means, quats, scales, opacities, colors), strict=True))
-    arrays = {name: _on_device(value, dtype) for name, value in arrays.items()}
+    wide = jnp.promote_types(dtype, jnp.float32)  # in half precision, 1 - 1e-6 is 1
+    arrays = {
+        name: _on_device(value, dtype if name in ("means", "quats") else wide)
+        for name, value in arrays.items()
+    }
     if getattr(colors, "dtype", None) == np.uint8:
         raise ValueError("colors: expected RGB from 0 to 1, found uint8; divide by 255")
     for name, columns in wanted.items():
@@ -175,7 +179,8 @@ def _raw(activated: dict[str, Array]) -> tuple[Array, Array, Array]:
     opacities = jnp.clip(activated["opacities"], _MIN_OPACITY, 1 - _MIN_OPACITY)
     logits = jnp.log(opacities) - jnp.log1p(-opacities)
     log_scales = jnp.log(jnp.maximum(activated["scales"], _MIN_SCALE))
-    return log_scales, logits, rgb_to_sh0(activated["colors"])[:, None, :]
+    colors, dtype = rgb_to_sh0(activated["colors"])[:, None, :], activated["means"].dtype
+    return log_scales.astype(dtype), logits.astype(dtype), colors.astype(dtype)
 
 
 def concatenate(parts: Sequence[Gaussians]) -> Gaussians:
@@ -222,10 +227,10 @@ def take(tree: Tree, indices: Integer[ArrayLike, "M"] | Bool[ArrayLike, "N"]) ->
             if indices.shape != (count,):
                 raise ValueError(f"indices: expected a mask of shape ({count},), found {indices.shape}")
             indices = np.flatnonzero(indices)
-        elif ((indices < -count) | (indices >= count)).any():
-            raise ValueError(
-                f"indices: expected rows below {count}, found {indices[np.abs(indices).argmax()]}"
-            )
+        elif not indices.size:
+            indices = indices.astype(int)  # an empty list becomes floats
+        elif (wrong := (indices < -count) | (indices >= count)).any():
+            raise ValueError(f"indices: expected rows below {count}, found {indices[wrong][0]}")
     return _rows(tree, indices)
 
 

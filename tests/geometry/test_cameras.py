@@ -1,5 +1,7 @@
 """Cameras: projection and its inverse, and conventions of axes and pixels."""
 
+import re
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -82,6 +84,12 @@ def test_perturbed_cameras_are_rotated_about_their_own_centres_and_shifted():
     np.testing.assert_allclose(shifts, [2.0 * twist[3:]] * 2, atol=1e-12)
     turn = Rotation.from_rotvec(np.array(twist[:3])).as_matrix()
     np.testing.assert_allclose(found[:, :3, :3], viewmats[:, :3, :3] @ turn.T, atol=1e-12)
+
+
+def test_no_product_of_perturbed_cameras_is_in_reduced_precision():
+    program = jax.jit(perturbed).lower(jnp.eye(4)[None], jnp.ones(6), 2.0).as_text()
+    assert "HIGHEST" in program
+    assert not re.search(r"contracting_dims = \[\d.*DEFAULT", program)
 
 
 @pytest.mark.thorough

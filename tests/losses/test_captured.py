@@ -49,6 +49,8 @@ def weighted(weight):
         jnp.arange(4),
         jax.random.key(1),
         (5, 1),
+        {5, 1},
+        frozenset({2}),
     ],
     ids=str,
 )
@@ -67,6 +69,11 @@ def test_what_they_take_from_outside_counts(value, monkeypatch):
     monkeypatch.setitem(globals(), "WEIGHT", value)
     assert captured((calls,)) != before
     unset = 0.0
+
+
+def test_the_order_in_which_a_set_was_filled_is_no_change():
+    """8 and 0 share a place in the table, so the set iterates in the order in which they came."""
+    assert captured((weighted({8, 0}),)) == captured((weighted({0, 8}),)) != captured((weighted({0, 9}),))
 
 
 def test_what_a_trace_itself_changes_is_no_change(monkeypatch):

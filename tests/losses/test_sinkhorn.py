@@ -314,6 +314,7 @@ def test_it_agrees_with_ott():
         ({"iterations": 0}, "iterations=0.*1 or more"),
         ({"temperature": 0.0}, "temperature=0.0.*above 0"),
         ({"temperature": float("nan")}, "temperature=nan.*above 0"),
+        ({"slack": float("-inf")}, "slack=-inf.*finite"),
     ],
 )
 def test_mistakes_are_named(options, says):

@@ -42,7 +42,7 @@ def test_copies_at_one_place_transmit_as_much_light_as_the_original(opacity, cop
     x = np.linspace(-12, 12, 20_001)
     one = opacity * np.exp(-(x**2) / 2)
     together = 1 - (1 - each * np.exp(-((x / factor) ** 2) / 2)) ** copies
-    if each > DEAD:  # lower opacities are clipped to DEAD
+    if each > 1.01 * DEAD:  # lower opacities are clipped
         np.testing.assert_allclose(np.trapezoid(together, x), np.trapezoid(one, x), rtol=1e-4)
         np.testing.assert_allclose(1 - (1 - each) ** copies, opacity, rtol=1e-6)
 
@@ -54,6 +54,13 @@ def test_single_precision_is_enough_for_many_copies(copies):
         exact = split_into_copies(jnp.asarray(np.asarray(opacities), float), jnp.full(4, copies))
     for found, wanted in zip(split_into_copies(opacities, jnp.full(4, copies)), exact, strict=True):
         np.testing.assert_allclose(found, wanted, rtol=2e-2)
+
+
+def test_no_copy_starts_dead():
+    """Neither before nor after its opacity is stored as a logit."""
+    each, _ = split_into_copies(jnp.array([0.0051, 0.006, 0.009, 0.04]), jnp.array([1, 2, 3, 30]))
+    assert (each > DEAD).all()
+    assert is_alive(some(each)).all()
 
 
 @pytest.mark.thorough

@@ -48,6 +48,19 @@ def test_what_is_painted_is_what_the_rasterizer_draws(frozen, channels):
 
 
 @pytest.mark.thorough
+def test_a_scene_in_half_precision_is_seen_in_single(small, geometry):
+    """As the rasterizer sees it; what is painted must not change its type on the way."""
+    arrays = geometry(small(3)[1])
+    half = [jnp.asarray(array, jnp.bfloat16) for array in arrays[:4]]
+    views, plan = freeze_views(*half, *arrays[4:], 33, 17)
+    single = [array.astype(jnp.float32) for array in half]
+    expected = freeze_views(*single, *arrays[4:], 33, 17)
+    assert plan == expected[1]
+    assert {leaf.dtype for leaf in jax.tree.leaves(views)} == {jnp.dtype(jnp.float32), jnp.dtype(jnp.int32)}
+    jax.tree.map(np.testing.assert_array_equal, views, expected[0])
+
+
+@pytest.mark.thorough
 def test_fisheyes_are_painted_as_the_rasterizer_draws_them(small, geometry):
     _, scene = small(3)
     lens = jnp.tile(jnp.array([0.3, -0.05, 0.01, 0.0]), (len(scene["viewmats"]), 1))

@@ -177,6 +177,7 @@ def test_a_position_that_is_not_a_number_leaves_the_gradients_of_others():
     [
         ({"resolution": 1}, "resolution: expected at least 2, found 1"),
         ({"hidden": 0}, "hidden: expected at least 1"),
+        ({"kind": "voxels", "resolution": 256}, "resolution: expected at most 255 with voxels, found 256"),
     ],
 )
 def test_sizes_are_checked(options, words):

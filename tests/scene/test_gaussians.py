@@ -37,6 +37,18 @@ def test_extreme_activated_values_stay_finite():
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gaussians))
 
 
+@pytest.mark.parametrize("dtype", [jnp.bfloat16, jnp.float16])
+def test_extreme_activated_values_stay_finite_in_half_precision(dtype):
+    """Where 1 - 1e-6 is 1, and 1e-12 may be 0."""
+    values = activated() | {"scales": np.zeros((5, 3)), "opacities": np.array([0.0, 0.3, 0.6, 0.9999, 1.0])}
+    gaussians = gaussians_from_activated(**values, dtype=dtype)
+    assert {leaf.dtype for leaf in jax.tree.leaves(gaussians)} == {jnp.dtype(dtype)}
+    assert cull_invalid(gaussians)[1] == 0
+    full = gaussians_from_activated(**values)
+    for found, wanted in zip(jax.tree.leaves(gaussians), jax.tree.leaves(full), strict=True):
+        np.testing.assert_array_equal(found, np.asarray(wanted).astype(dtype))
+
+
 @pytest.mark.parametrize(("degree", "rest"), [(1, 3), (2, 8), (3, 15)])
 def test_sh_joins_its_two_fields(degree, rest):
     gaussians = gaussians_from_activated(**activated(), shN=np.full((5, rest, 3), 2.0))
@@ -127,9 +139,15 @@ def test_take_by_index_and_by_mask():
         (np.array([True, False]), r"a mask of shape \(5,\), found \(2,\)"),
         (np.array([0, 5]), "rows below 5, found 5"),
         (np.array([-6, 1]), "rows below 5, found -6"),
+        (np.array([-5, 5]), "rows below 5, found 5"),
     ):
         with pytest.raises(ValueError, match=says):
             take(gaussians, wrong)
+
+
+@pytest.mark.usefixtures("as_users_run")
+def test_an_empty_list_takes_nothing():
+    assert len(take(Tags(labels=jnp.arange(5)), []).labels) == 0
 
 
 def test_colors_may_be_whole_numbers_and_traced():

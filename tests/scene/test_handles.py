@@ -203,6 +203,14 @@ def test_a_handle_without_weight_changes_nothing_however_far_it_is():
         )
 
 
+@pytest.mark.parametrize("blend", BLENDS)
+def test_no_product_is_in_reduced_precision(blend):
+    """The default is TF32 on GPUs that have it, which is off by half a millimetre per metre."""
+    program = skinned.lower(*made_up(6), blend).as_text()
+    assert "HIGHEST" in program
+    assert "DEFAULT" not in program
+
+
 def test_blended_quaternions_are_of_length_one():
     _, weights, _, pose = made_up(5, num=50)
     np.testing.assert_allclose(np.linalg.norm(blend_quats(weights, pose.quats), axis=1), 1, atol=1e-6)

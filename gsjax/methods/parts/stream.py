@@ -208,11 +208,11 @@ def gaps_between(
     rotations, offsets = rigid_motions(canonical.centers, pose)
     rigid = jnp.concatenate([rotations, offsets[..., None]], axis=-1).reshape(-1, 12)
     still = jnp.eye(3, 4, dtype=rigid.dtype).ravel()
-    mine = weights @ rigid
+    mine = jnp.matmul(weights, rigid, precision="highest")
     all_ = jnp.concatenate([mine, jnp.broadcast_to(still, (canonical.fixed.num, 12))])
     apart = (mine[:, None] - all_[canonical.neighbors]).reshape(*canonical.neighbors.shape, 3, 4)
     at = canonical.movable.means
-    return jnp.einsum("nkij,nj->nki", apart[..., :3], at) + apart[..., 3]
+    return jnp.einsum("nkij,nj->nki", apart[..., :3], at, precision="highest") + apart[..., 3]
 
 
 def stream_loss(config: StreamConfig, extra_losses: ExtraLosses = ()) -> Callable:

@@ -123,9 +123,10 @@ def _scaled_and_faded(
     gaussians, weights = scene.gaussians, scene.weights
     # Written in terms of the change, so that the rounding of weights that sum to 1 has no effect.
     larger = now.scales - 1
-    growth = (weights @ larger)[:, None]
-    means = gaussians.means + growth * gaussians.means - weights @ (larger[:, None] * scene.centers)
-    logits = faded(gaussians.logit_opacities, weights @ (1 - now.opacities))
+    weighted = partial(jnp.matmul, weights, precision="highest")  # no TF32 on GPUs that have it
+    growth = weighted(larger)[:, None]
+    means = gaussians.means + growth * gaussians.means - weighted(larger[:, None] * scene.centers)
+    logits = faded(gaussians.logit_opacities, weighted(1 - now.opacities))
     return means, gaussians.log_scales + jnp.log1p(growth), logits
 
 

@@ -44,6 +44,12 @@ def test_where_nothing_is_edited_it_is_skinning_to_the_bit(seed):
     assert_same(found, expected)
 
 
+def test_no_product_is_in_reduced_precision():
+    program = jax.jit(gaussians_at).lower(*made_up(0)).as_text()
+    assert "HIGHEST" in program
+    assert "DEFAULT" not in program
+
+
 @pytest.mark.usefixtures("x64")
 @given(seeds)
 def test_at_rest_the_scene_is_canonical(seed):
