@@ -73,17 +73,17 @@ def write_page(
         ValueError: the Gaussians or their motion are more than a page can hold, or some frame of the film
             holds values that are not finite.
     """
+    means = np.asarray(gaussians.means, np.float64)
+    center = np.quantile(means, (0.01, 0.99), axis=0).mean(axis=0)  # without a few that are far away
+    radius = np.quantile(np.linalg.norm(means - center, axis=1), 0.98)
+    order, motion, moved = (np.arange(gaussians.num), None, b"") if film is None else _packed(film)
+    order = np.append(order, np.arange(len(order), gaussians.num))
     most = _MOST_BYTES // RECORD.itemsize
     if gaussians.num > most:
         raise ValueError(
             f"{path}: expected at most {most:,} Gaussians, since browsers hold no longer text, found "
             f"{gaussians.num:,}; write .sog, or fewer"
         )
-    means = np.asarray(gaussians.means, np.float64)
-    center = np.quantile(means, (0.01, 0.99), axis=0).mean(axis=0)  # without a few that are far away
-    radius = np.quantile(np.linalg.norm(means - center, axis=1), 0.98)
-    order, motion, moved = (np.arange(gaussians.num), None, b"") if film is None else _packed(film)
-    order = np.append(order, np.arange(len(order), gaussians.num))
     about = {
         "title": path.stem,
         "up": [float(value) + 0.0 for value in up],
