@@ -103,6 +103,7 @@ def _encoded(node: Any, path: str, arrays: dict[str, np.ndarray]) -> Any:
     if isinstance(node, (np.ndarray, np.generic, jax.Array)):
         arrays[path], dtype = _to_stored(node)
         kind = "jax" if isinstance(node, jax.Array) else "numpy"
+        kind = "scalar" if isinstance(node, np.generic) else kind
         return {"array": path, "dtype": dtype, "kind": kind}
     if isinstance(node, tuple) and hasattr(node, "_fields"):
         return _fields_of(node, node._fields, path, arrays)
@@ -113,7 +114,7 @@ def _encoded(node: Any, path: str, arrays: dict[str, np.ndarray]) -> Any:
         items = [_encoded(item, f"{path}[{i}]", arrays) for i, item in enumerate(node)]
         return {"list" if isinstance(node, list) else "tuple": items}
     if isinstance(node, dict):
-        keys = [_encoded(key, f"{path}.key", arrays) for key in node]
+        keys = [_encoded(key, f"{path}.key{i}", arrays) for i, key in enumerate(node)]
         values = [_encoded(value, f"{path}[{key!r}]", arrays) for key, value in node.items()]
         return {"dict": [list(pair) for pair in zip(keys, values, strict=True)]}
     where = path or "the tree"
@@ -241,11 +242,13 @@ def _to_stored(leaf: Any) -> tuple[np.ndarray, str]:
 
 
 def _from_stored(array: np.ndarray, dtype: str, kind: str) -> Any:
-    """The inverse of `_to_stored`: a JAX array, a random key or a numpy array."""
+    """The inverse of `_to_stored`: a JAX array, a random key, or an array or number of numpy."""
     if dtype.startswith("key<"):
         return jax.random.wrap_key_data(jnp.asarray(array), impl=dtype[len("key<") : -1])
     if not (array.dtype.isbuiltin == 1 and str(array.dtype) == dtype):
         array = array.view(jnp.dtype(dtype))
+    if kind == "scalar":
+        return array[()]
     return jax.device_put(array) if kind == "jax" else array
 
 

@@ -23,6 +23,7 @@ from gsjax.scene.gaussians import Gaussians
 MAGIC = b"glTF"
 _EXTENSION = "KHR_gaussian_splatting"
 _FLOAT, _BYTE, _POINTS, _VERTICES = 5126, 5121, 0, 34962
+_MOST_BYTES = 2**32 - 2**20  # leaves room for the JSON
 _SHAPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
 
 
@@ -33,6 +34,9 @@ def write_glb(path: Path, gaussians: Gaussians, *, origin: Float[np.ndarray, "3"
         path: the file.
         gaussians: Gaussians that can all be drawn.
         origin: the point that means are relative to; None for 0.
+
+    Raises:
+        ValueError: they take more than 4 GiB.
     """
     attributes = _attributes(gaussians)
     views, accessors, start = [], [], 0
@@ -40,6 +44,11 @@ def write_glb(path: Path, gaussians: Gaussians, *, origin: Float[np.ndarray, "3"
         views.append({"buffer": 0, "byteOffset": start, "byteLength": array.nbytes, "target": _VERTICES})
         accessors.append(_accessor(len(accessors), array))
         start += array.nbytes
+    if start > _MOST_BYTES:
+        raise ValueError(
+            f"{path}: expected at most 4 GiB, the most that .glb has room for, found {start:,} bytes; write "
+            "another format"
+        )
     accessors[0] |= {end: getattr(attributes["POSITION"], end)(axis=0).tolist() for end in ("min", "max")}
     primitive = {
         "attributes": {name: index for index, name in enumerate(attributes)},

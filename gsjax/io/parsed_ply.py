@@ -1,5 +1,6 @@
 """Parses PLY files of any elements with plyfile, after checking that their headers are plausible."""
 
+import io
 import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,6 +16,7 @@ _SIZES = {  # bytes; a list may be empty, and has a count of one byte or more
     **dict.fromkeys((b"double", b"float64"), 8),
 }
 _LONGEST_HEADER = 2**20  # bytes
+_ASCII = bytes(range(128)) + b"?" * 128
 _END = re.compile(rb"[\r\n]end_header[ \t]*(?:[\r\n]|$)")
 
 
@@ -27,18 +29,33 @@ def parse_ply(path: Path) -> PlyData:
     """
     from plyfile import PlyData, PlyParseError
 
-    least, size = _least_size(path), path.stat().st_size
+    (end, least), size = _sizes(path), path.stat().st_size
     if least > size:
         raise ValueError(f"{size:,} bytes, where its header promises {least:,} or more")
     try:
-        return PlyData.read(str(path))
+        with _Stream(path, end) as stream:
+            return PlyData.read(stream)
     except (PlyParseError, OverflowError, MemoryError) as error:
         raise ValueError(str(error)) from error
 
 
-def _least_size(path: Path) -> int:
-    """The fewest bytes that can hold a file's header and the rows that it promises. It is checked because
-    plyfile allocates rows of lists before it reads them.
+class _Stream(io.BufferedReader):
+    """A file whose header is read as ASCII, since plyfile refuses all else and programs write names and dates
+    there in any encoding."""
+
+    def __init__(self, path: Path, end: int):
+        super().__init__(io.FileIO(path))
+        self._end = end  # of the header
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        start = self.tell()
+        data = super().read(size)
+        return data.translate(_ASCII) if start < self._end else data
+
+
+def _sizes(path: Path) -> tuple[int, int]:
+    """The bytes of a file's header, and the fewest that can hold it and the rows that it promises. They are
+    checked because plyfile allocates rows of lists before it reads them.
 
     Raises:
         ValueError: the header has no end, which plyfile would look for byte by byte.
@@ -55,4 +72,4 @@ def _least_size(path: Path) -> int:
             count = int(words[2][:18])  # more digits take no fewer bytes
         elif words[:1] == [b"property"]:
             least += count * (2 if text else _SIZES.get(words[1] if len(words) > 1 else b"", 1))
-    return least - text  # the last line may end without a break
+    return end.end(), least - text  # the last line may end without a break

@@ -306,6 +306,8 @@ def _advice(names: tuple[str, ...]) -> str:
         return "This seems to be a scene of 2D Gaussian splatting, which has no third axis"
     if {"opacity", "scale_0"} <= set(names):
         return "It lacks a part of each Gaussian: export them whole, in the 3D Gaussian splatting PLY format"
+    if "scalar_opacity" in names:
+        return "Its properties begin with scalar_, as CloudCompare writes them: remove that from their names"
     if {"x", "y", "z"} <= set(names):
         return (
             "This seems to be a point cloud or a mesh; gsjax fit begins with the cloud of a dataset, and "

@@ -143,14 +143,22 @@ class _Meta:
             raise self._fault(keys, f"a whole number, 0 to {most}", value)
         return value
 
-    def numbers(self, *keys: str, count: int) -> np.ndarray:
-        """At least `count` finite numbers."""
+    def codebook(self, key: str) -> np.ndarray:
+        """256 numbers. The first may be null, as splat-transform wrote it for scenes with NaN; it continues
+        the others as in PlayCanvas's engine."""
+        found = self.numbers(key, "codebook", count=256, first=1)
+        if not np.isfinite(found[0]):
+            found[0] = found[1] + (found[1] - found[255]) / 255
+        return found
+
+    def numbers(self, *keys: str, count: int, first: int = 0) -> np.ndarray:
+        """`count` numbers, finite from the `first` one on."""
         value = self.get(*keys)
         try:
             found = np.asarray(value, np.float64)
         except (TypeError, ValueError):
             found = np.zeros(0)
-        if found.ndim != 1 or len(found) < count or not np.isfinite(found[:count]).all():
+        if found.ndim != 1 or len(found) < count or not np.isfinite(found[first:count]).all():
             raise self._fault(keys, f"{count} finite numbers", value)
         return found[:count]
 
@@ -192,8 +200,8 @@ def _read(path: Path, load: Load) -> tuple[Gaussians, SceneReport]:
     with np.errstate(over="ignore"):
         means = np.sign(logs) * np.expm1(np.abs(logs))
     scales, colors, quats = (pixels(*meta.names(key, "files", count=1)) for key in ("scales", "sh0", "quats"))
-    log_scales = meta.numbers("scales", "codebook", count=256)[scales[:, :3]]
-    sh0 = meta.numbers("sh0", "codebook", count=256)[colors[:, :3]]
+    log_scales = meta.codebook("scales")[scales[:, :3]]
+    sh0 = meta.codebook("sh0")[colors[:, :3]]
     rest = np.zeros((count, 0, 3)) if not meta.get("shN") else _rest(meta, load, pixels)
     columns = Columns(means, _quats(quats), log_scales, colors[:, 3] / 255, sh0 * SH_C0 + 0.5, rest)
     said = meta.get("antialias")
@@ -234,7 +242,7 @@ def _rest(meta: _Meta, load: Load, pixels: Callable[[str], np.ndarray]) -> np.nd
     bands = REST_SIZES[meta.whole("shN", "bands", most=3)]
     entries = meta.whole("shN", "count", most=_MOST_PALETTE)
     centroids, labels = meta.names("shN", "files", count=2)
-    values = meta.numbers("shN", "codebook", count=256)
+    values = meta.codebook("shN")
     table = _picture(meta.path, centroids, load(centroids))
     rows = -(-entries // _PALETTE_ROW)
     if table.shape[1] != _PALETTE_ROW * bands or table.shape[0] < rows:

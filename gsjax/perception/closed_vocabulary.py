@@ -88,10 +88,11 @@ class ClosedVocabulary:
         """
         areas = np.bincount(labels[labels >= 0].ravel(), minlength=count + 1)[1 : count + 1]
         colors = color_words(image)
+        width = sum(len(words) + 2 for words in self._aspects.values())
         rows = []
         for label, area in enumerate(areas, start=1):
             if area == 0:
-                rows.append(np.zeros(sum(len(words) + 2 for words in self._aspects.values())))
+                rows.append(np.zeros(width))
                 continue
             mask = labels == label
             described = {
@@ -103,7 +104,7 @@ class ClosedVocabulary:
                 described["name"] = np.array([float(label == named) for named in self._names])
             parts = [np.append(_filled(described[aspect]), 1.0) for aspect in self._aspects]
             rows.append(np.concatenate(parts) / np.sqrt(2 * len(parts)))
-        return np.stack(rows) if rows else np.zeros((0, 0))
+        return np.reshape(rows, (count, width))
 
     def embed_text(self, text: str) -> Float[np.ndarray, "D"]:
         """The unit vector of a query: the words that it names, and "any" in aspects in which it names none.

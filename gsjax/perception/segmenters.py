@@ -176,7 +176,7 @@ class PlaneOrRegionSegmenter:
         K: Float[np.ndarray, "3 3"] | None = None,
     ) -> Int[np.ndarray, "image_H image_W"]:
         """Labels of an image: 0 for background, then 1, 2, ... by size. Errors are the chosen segmenter's."""
-        if depth is None or K is None or not np.any(np.nan_to_num(depth) > 0):
+        if depth is None or K is None or not np.any(np.nan_to_num(depth, posinf=0) > 0):
             return self.region(image)
         return self.plane(image, depth, K)
 
@@ -206,7 +206,7 @@ class PieceSegmenter:
     ) -> Int[np.ndarray, "image_H image_W"]:
         """Labels of an image: 0 for background, then 1, 2, ... by size."""
         regions = self.region(image)
-        if depth is not None and K is not None and np.any(np.nan_to_num(depth) > 0):
+        if depth is not None and K is not None and np.any(np.nan_to_num(depth, posinf=0) > 0):
             regions = np.where(self.plane(image, depth, K) > 0, regions, 0)
         return name_by_size(regions, self.min_pixels)
 

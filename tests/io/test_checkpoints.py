@@ -54,6 +54,16 @@ def test_any_tree_comes_back_without_a_template(tmp_path):
     assert loaded["half"].dtype == jnp.bfloat16
 
 
+def test_numbers_of_numpy_come_back_as_such_also_as_keys(tmp_path):
+    """As of `dict(zip(np.unique(labels), names))`."""
+    tree = {"names": {np.int64(1): "cup", np.int64(2): "can", (np.int64(3), 4): np.float32(0.1)}}
+    save_checkpoint(tmp_path / "a.npz", tree)
+    loaded = load_checkpoint(tmp_path / "a.npz")[0]
+    assert loaded == tree
+    assert [type(value) for value in loaded["names"]] == [np.int64, np.int64, tuple]
+    assert type(loaded["names"][3, 4]) is np.float32
+
+
 class Foreign(NamedTuple):
     a: int
 

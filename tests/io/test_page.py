@@ -47,6 +47,14 @@ def test_it_holds_the_scene_and_asks_no_network(tmp_path):
     assert held == (tmp_path / "scene.splat").read_bytes()
 
 
+def test_more_than_a_browser_holds_is_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr("gsjax.io.page._MOST_BYTES", 10 * 32)
+    write_gaussians(tmp_path / "ten.html", make_scene(10))
+    with pytest.raises(ValueError, match=r"more\.html: expected at most 10 Gaussians, .* found 11; write"):
+        write_gaussians(tmp_path / "more.html", make_scene(11))
+    assert not (tmp_path / "more.html").exists()
+
+
 def camera_at(yaw, pitch, distance, center) -> Camera:
     """The camera of `page.html#yaw,pitch,distance,center`, with y down."""
     forward = np.array([np.sin(yaw) * np.cos(pitch), np.sin(pitch), np.cos(yaw) * np.cos(pitch)])
@@ -149,7 +157,7 @@ def test_what_cannot_be_played_is_refused(tmp_path, monkeypatch):
     lost = film._replace(at=lambda frame: eqx.tree_at(lambda g: g.means, scene, scene.means / (1 - frame)))
     with pytest.raises(ValueError, match="film: expected finite places, rotations and scales in each frame"):
         write_gaussians(tmp_path / "scene.html", scene, film=lost)
-    monkeypatch.setattr("gsjax.io.page._MOST_DEFLATED", 1)
+    monkeypatch.setattr("gsjax.io.page._MOST_BYTES", 1)
     with pytest.raises(
         ValueError, match=r"film: .* found more in the first \d of 3 frames; take fewer frames"
     ):

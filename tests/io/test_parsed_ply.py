@@ -56,6 +56,20 @@ def test_a_file_that_is_cut_off_tells_what_is_missing(tmp_path, text):
         read_ply(path)
 
 
+@pytest.mark.parametrize(
+    "words", ["Δευ 8 Μαΐ 2023".encode(), "Exporté".encode("latin-1")], ids=("utf", "latin")
+)
+@pytest.mark.parametrize("text", [False, True])
+def test_comments_may_be_in_any_language(tmp_path, text, words):
+    path = tmp_path / "scene.ply"
+    write_ply(tmp_path / "other.ply", make_scene(20))
+    other = PlyData.read(tmp_path / "other.ply")
+    PlyData(other.elements, text=text).write(path)
+    path.write_bytes(path.read_bytes().replace(b" 1.0\n", b" 1.0\ncomment " + words + b"\n", 1))
+    assert read_ply(path)[0].num == 20
+    assert read_cloud(path).points[:, 2].tolist() == pytest.approx(other["vertex"]["z"])
+
+
 def test_another_ending_is_refused(tmp_path):
     with pytest.raises(
         ValueError, match=r"scene.spz: expected a name that ends in .ply, found .spz; gsjax.write"

@@ -366,6 +366,7 @@ def test_a_missing_file_is_named(tmp_path):
         (["x", "y", "z"], "point cloud or a mesh"),
         (["x", "y", "z", "opacity", *(f"scale_{i}" for i in range(3))], "lacks a part of each Gaussian"),
         (["intensity"], "Gaussian splatting PLY format"),
+        (["x", "y", "z", "scalar_opacity", "scalar_scale_0"], "begin with scalar_, as CloudCompare writes"),
         (["x", "y", "z", "scale_0", "scale_1"], "no third axis"),
     ],
 )

@@ -2,9 +2,11 @@
 
 import gzip
 import io
+import json
 import struct
 import tracemalloc
 import zipfile
+from pathlib import Path
 
 import equinox as eqx
 import jax
@@ -16,6 +18,7 @@ from hypothesis import strategies as st
 
 from gsjax.io.scene_file import SceneError
 from gsjax.io.scenes import read_gaussians, write_gaussians
+from gsjax.io.sog import _Meta
 from tests.io.scenes_to_write import ROUNDING, assert_alike, ksplat, make_scene, picture, sog, spz, spz4
 
 READ_BACK = sorted(ROUNDING)
@@ -142,6 +145,7 @@ def test_an_spz_with_a_flipped_bit_is_found_by_its_checksum(tmp_path):
         (lambda m: m["means"].update(files=["meta.json", "means_u.webp"]), "picture as meta.json"),
         (lambda m: m["means"].update(mins=[0, None, 0]), "3 finite numbers as means.mins"),
         (lambda m: m["scales"].update(codebook=[1, 2]), "256 finite numbers as scales.codebook"),
+        (lambda m: m["sh0"]["codebook"].__setitem__(1, None), "256 finite numbers as sh0.codebook"),
         (lambda m: m["shN"].update(bands=2), "expected 512 x 2 pixels in shN_centroids.webp, found 192 x 2"),
         (lambda m: m["shN"].update(count=3), "labels below 3 in shN_labels.webp, found"),
         (lambda m: m["shN"].update(count=1 << 17), "0 to 65536 as shN.count"),
@@ -166,6 +170,23 @@ def test_a_sog_whose_text_lies(tmp_path, change, says):
 )
 def test_a_sog_with_other_pictures(tmp_path, pictures, says):
     assert says in refusal(tmp_path / "scene.sog", sog(pictures=pictures.items()))
+
+
+@pytest.mark.parametrize("key", ["scales", "sh0", "shN"])
+def test_a_codebook_of_a_sog_that_begins_with_null_goes_on_backwards(key):
+    """splat-transform wrote one for scenes with NaN; PlayCanvas's engine continues the other entries."""
+    text = json.dumps({key: {"codebook": [None, *range(1, 256)]}}).encode()
+    expected = 1 + (1 - 255) / 255
+    assert _Meta(Path("scene.sog"), text).codebook(key).tolist() == [expected, *range(1, 256)]
+
+
+def test_a_sog_whose_codebooks_begin_with_null_is_read(tmp_path):
+    def change(meta):
+        for key in ("scales", "sh0", "shN"):
+            meta[key]["codebook"][0] = None
+
+    (tmp_path / "scene.sog").write_bytes(sog(change))
+    assert read_gaussians(tmp_path / "scene.sog")[0].num == 100
 
 
 def test_a_zip_of_something_else(tmp_path):

@@ -187,6 +187,13 @@ def test_ksplat(tmp_path, level, degree):
     np.testing.assert_allclose(np.abs(np.sum(found.quats * wanted.quats, axis=1)), 1, atol=1e-5)
 
 
+def test_a_glb_beyond_4_gib_is_refused(tmp_path, monkeypatch):
+    positions = np.broadcast_to(np.zeros(3, "<f4"), (2**29, 3))  # takes no memory
+    monkeypatch.setattr("gsjax.io.glb._attributes", lambda _: {"POSITION": positions})
+    with pytest.raises(ValueError, match=r"scene.glb: expected at most 4 GiB, .* found 6,442,450,944 bytes"):
+        write_gaussians(tmp_path / "scene.glb", make_scene(2))
+
+
 def test_glb_is_what_the_extension_says(tmp_path):
     scene = make_scene(7, 2)
     assert write_gaussians(tmp_path / "scene.glb", scene, origin=UTM) == ()

@@ -106,6 +106,12 @@ def test_any_colour_has_some_word():
     assert set(np.unique(color_words(hues[None]))) <= set(range(len(COLORS)))
 
 
+def test_no_objects_have_vectors_of_the_usual_length():
+    image, labels, words = np.zeros((4, 6, 3), np.uint8), np.ones((4, 6), int), ClosedVocabulary()
+    none, one = (words.embed_objects(image, labels, count) for count in (0, 1))
+    assert (none.shape, none[:0].shape[1]) == ((0, one.shape[1]), words.embed_text("red").size)
+
+
 def test_without_sizes_a_thing_is_the_same_in_any_company():
     image, labels = np.zeros((40, 60, 3), np.uint8), np.zeros((40, 60), int)
     image[5:15, 5:15], labels[5:15, 5:15] = (200, 30, 30), 1

@@ -138,7 +138,8 @@ def test_the_segmenter_is_chosen_by_what_there_is():
     segment = PlaneOrRegionSegmenter()
     assert best_iou(segment(image, depth, K), boxes == 1) > 0.9
     assert best_iou(segment(image), true == 1) > 0.9
-    assert best_iou(segment(image, np.zeros_like(depth), K), true == 1) > 0.9
+    for nothing in (0.0, np.inf, np.nan):
+        assert best_iou(segment(image, np.full_like(depth, nothing), K), true == 1) > 0.9
 
 
 def test_pieces_are_the_colours_of_what_stands_out():

@@ -46,6 +46,8 @@ def cabinet(
         ValueError: a number is too small.
     """
     check_counts(width=width, height=height, cameras=cameras, parts=doors + drawers)
+    if min(doors, drawers) < 0:
+        raise ValueError(f"doors, drawers: expected 0 or more of each, found {doors} and {drawers}")
     random = np.random.default_rng(seed)
     columns = max(doors, drawers)
     middles = 2 * _COLUMN * (np.arange(columns) - (columns - 1) / 2)

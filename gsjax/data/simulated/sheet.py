@@ -7,7 +7,9 @@ from jaxtyping import Float
 
 _CLOSE_ENOUGH_M = 1e-10
 _MOST_STEPS = 30
+_HALVINGS = 45
 _NUMBERS = 6  # per bump
+_SLICES = 48
 
 
 @dataclass(frozen=True)
@@ -16,9 +18,8 @@ class Sheet:
 
         X(p) = p + sum_b d_b exp(-((x - x_b)^2 + (y - y_b)^2) / (2 s_b^2)),      p = (x, y, z) at rest
 
-    Points above and below the plane move with it. The map is invertible as long as no bump shifts points by
-    much more than its width, and a ray meets the surface only once if the surface is nowhere as steep as the
-    ray. The scene has to ensure both.
+    Points above and below the plane move with it. The map is invertible as long as no bump shifts points
+    sideways by much more than its width, which the scene has to ensure.
 
     Attributes:
         bumps: x, y, width s and shift d of each bump, concatenated, metres.
@@ -59,8 +60,8 @@ class Sheet:
     def enter(
         self, origin: Float[np.ndarray, "3"], directions: Float[np.ndarray, "3 n"]
     ) -> Float[np.ndarray, "n"]:
-        """The s at which rays origin + s directions meet the sheet, by Newton's method on s and the point at
-        rest; infinity for rays that do not point downwards."""
+        """The s at which rays origin + s directions first meet the sheet, by Newton's method on s and the
+        point at rest; infinity for rays that do not point downwards."""
         entry = np.full(directions.shape[1], np.inf)
         downward = np.flatnonzero(directions[2] < 0)
         rays = directions[:, downward]
@@ -77,7 +78,44 @@ class Sheet:
             if np.abs(error).max(initial=0) < _CLOSE_ENOUGH_M:
                 break
         entry[downward] = np.where(np.abs(error).max(0) < _CLOSE_ENOUGH_M, s, np.inf)
+        may_be_steeper = -rays[2] <= self._steepest() * np.hypot(rays[0], rays[1])
+        doubtful = downward[may_be_steeper | np.isinf(entry[downward])]
+        if doubtful.size:
+            entry[doubtful] = self._first(origin, directions[:, doubtful], entry[doubtful])
         return entry
+
+    def _steepest(self) -> float:
+        """A slope that the surface nowhere exceeds: the largest within two widths of each bump, with a margin
+        for what lies between the places at which it is evaluated."""
+        x, y, width = np.reshape(self.bumps, (-1, _NUMBERS))[:, :3, None, None].swapaxes(0, 1)
+        across, down = np.meshgrid(*2 * [np.linspace(-2, 2, 25)])
+        rest = np.stack([x + width * across, y + width * down, 0 * width * across]).reshape(3, -1)
+        normals = self.normals(rest)
+        return 1.05 * np.max(np.hypot(normals[0], normals[1]) / normals[2], initial=0)
+
+    def _first(self, origin: np.ndarray, rays: np.ndarray, entry: np.ndarray) -> np.ndarray:
+        """`entry` where it is the first crossing of rays that point downwards. Elsewhere, where Newton's
+        method found a later one or none, the first is bisected."""
+        heights = np.reshape(self.bumps, (-1, _NUMBERS))[:, 5]
+        top, bottom = np.maximum(heights, 0).sum(), np.minimum(heights, 0).sum()
+        low = np.maximum((top - origin[2]) / rays[2], 0)
+        step = ((bottom - origin[2]) / rays[2] - low) / _SLICES
+        above = np.arange(len(low))
+        for _ in range(_SLICES - 1):
+            above = above[self._above(origin, rays[:, above], low[above] + step[above])]
+            low[above] += step[above]
+        known = (low - _CLOSE_ENOUGH_M <= entry) & (entry <= low + step + _CLOSE_ENOUGH_M)
+        lost = np.flatnonzero(~known)
+        low, high, rays = low[lost], (low + step)[lost], rays[:, lost]
+        for _ in range(_HALVINGS):
+            middle = (low + high) / 2
+            is_above = self._above(origin, rays, middle)
+            low, high = np.where(is_above, middle, low), np.where(is_above, high, middle)
+        entry[lost] = high
+        return entry
+
+    def _above(self, origin: np.ndarray, rays: np.ndarray, s: np.ndarray) -> np.ndarray:
+        return self.undo(origin[:, None] + s * rays)[2] > 0
 
     def _moved(self, rest: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """X, dX/dx and dX/dy."""

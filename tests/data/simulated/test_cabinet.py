@@ -42,3 +42,5 @@ def test_by_its_name_and_with_too_few():
     assert open_sequence("simulated:cabinet?doors=2&width=16&height=12&cameras=1").name == "cabinet_2_1"
     with pytest.raises(ValueError, match="parts must be at least 1, got 0"):
         cabinet(0, 0, **SMALL)
+    with pytest.raises(ValueError, match="doors, drawers: expected 0 or more of each, found -1 and 3"):
+        cabinet(-1, 3, **SMALL)

@@ -73,6 +73,18 @@ def test_rays_meet_the_surface_and_nothing_before(seed):
     assert (sheet.undo(before.reshape(3, -1))[2] > 0).all()
 
 
+def test_rays_meet_the_first_side_of_a_steep_bump():
+    """Newton's method alone finds a later crossing of some rays, and none of others."""
+    sheet = Sheet((0.0, 0.0, 0.019, 0.01, 0.008, 0.05))
+    eye = np.array([-0.006, -0.022, 0.105])
+    rays = np.stack([*np.meshgrid(np.linspace(-0.6, 0.6, 30), np.linspace(-0.6, 1, 30)), -np.ones((30, 30))])
+    rays = rays.reshape(3, -1)
+    s = sheet.enter(eye, rays)
+    np.testing.assert_allclose(sheet.undo(eye[:, None] + s * rays)[2], 0, atol=1e-9)
+    before = eye[:, None, None] + np.linspace(0, 0.999, 100)[:, None] * (s * rays)[:, None]
+    assert (sheet.undo(before.reshape(3, -1))[2] > -1e-4).all()
+
+
 def test_rays_that_rise_meet_nothing():
     sheet, _ = some_sheet(0)
     rays = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, -1.0]])
@@ -224,6 +236,10 @@ def test_a_stronger_pull_moves_it_as_much_farther(scene):
     far = tissue(pull=2.0, frames=15, width=40, height=32).truth.tracks[14]
     none = tissue(pull=0.0, frames=15, width=40, height=32).truth.tracks[14]
     np.testing.assert_allclose(far - none, 2 * (scene.truth.tracks[14] - none), atol=1e-9)
+
+
+def test_nothing_is_missed_however_far_it_is_pulled():
+    assert (tissue(pull=3.0, frames=15, width=48, height=38).depth(14, 0) > 0).all()
 
 
 def test_patterns_differ_in_looks_alone():
