@@ -53,6 +53,7 @@ hypothesis.settings.register_profile("gsjax", deadline=None, max_examples=25, de
 hypothesis.settings.load_profile("gsjax")
 
 MOST_MAPS, MOST_MB = 20_000, 3_000  # limits for programs compiled by earlier files
+MOST_MAPS_WITHIN = 40_000  # and by earlier tests of a file
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -65,6 +66,16 @@ def forget_compiled():
     most = 0 if resident_mb() > MOST_MB else MOST_MAPS
     if forget_programs(most):
         gc.collect()  # programs are in cycles
+
+
+@pytest.fixture(autouse=True)
+def forget_compiled_within(request):
+    """Drops them within a file too: without maps, XLA fails, and the handler of crashes that pycolmap installs
+    then waits for ever."""
+    yield
+    marks = {mark.name for mark in request.node.iter_markers()}
+    if marks & {"slow", "thorough"} and forget_programs(MOST_MAPS_WITHIN):
+        gc.collect()
 
 
 @pytest.fixture
