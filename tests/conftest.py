@@ -70,8 +70,10 @@ def forget_compiled():
 
 @pytest.fixture(autouse=True)
 def forget_compiled_within(request):
-    """Drops them within a file too: without maps, XLA fails, and the crash handler that pycolmap installs then
-    waits for ever."""
+    """Drops them within a file too.
+
+    Where no map is left, XLA fails, and the crash handler that pycolmap installs then waits for ever.
+    """
     yield
     marks = {mark.name for mark in request.node.iter_markers()}
     if marks & {"slow", "thorough"} and forget_programs(MOST_MAPS_WITHIN):

@@ -106,13 +106,13 @@ def test_a_field_without_descent_takes_passes_over_the_views(gsjax, pristine, sc
 
 @pytest.mark.slow
 def test_the_solution_can_be_asked_while_it_is_trained(gsjax, pristine, scene, tmp_path, monkeypatch):
-    write, written = distill_run._write, []
+    write, written = distill_run.write_field, []
 
-    def watched(folder, result):
-        write(folder, result)
-        written.append((type(result.field.encoding).__name__, gsjax("query", folder.path, "can")[0]))
+    def watched(path, result):
+        write(path, result)
+        written.append((type(result.field.encoding).__name__, gsjax("query", path.parent, "can")[0]))
 
-    monkeypatch.setattr(distill_run, "_write", watched)
+    monkeypatch.setattr(distill_run, "write_field", watched)
     out, told = tmp_path / "field", ("--preset", "field", "--distill.iterations", 3)
     assert gsjax("distill", scene, "--out", out, *images(pristine), *told)[0] == 0
     assert written == [("ArrayImpl", 0), ("FeatureGrid", 0)]
