@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from plyfile import PlyData
 
-FORMAT = 1
+FORMAT = 2
 
 _VOLATILE_KEYS = {"seconds", "machine", "fps", "from_cache"}
 _VOLATILE_ENDINGS = ("_seconds", "_s", "_ms", "_hz", "_mb")
@@ -111,10 +111,11 @@ def describe_file(path: Path) -> dict[str, Any]:
     settings, only their existence is recorded."""
     if path.suffix in (".npz", ".ply", ".png"):
         arrays = {name: array for name, array in _arrays(path) if name not in _VOLATILE_ARRAYS}
-        texts = {name for name, array in arrays.items() if array.dtype.kind == "U" and array.ndim == 0}
         return {
             "arrays": {
-                name: describe_text(str(array)) if name in texts else describe_array(array)
+                name: describe_text(str(array))
+                if array.dtype.kind == "U" and not array.ndim
+                else describe_array(array)
                 for name, array in arrays.items()
             }
         }

@@ -63,9 +63,7 @@ def forget_compiled():
     They take memory and memory maps; Linux allows a process 65,530 maps, too few for all tests.
     """
     yield
-    most = 0 if resident_mb() > MOST_MB else MOST_MAPS
-    if forget_programs(most):
-        gc.collect()  # programs are in cycles
+    forget_programs(0 if resident_mb() > MOST_MB else MOST_MAPS)
 
 
 @pytest.fixture(autouse=True)
@@ -76,8 +74,8 @@ def forget_compiled_within(request):
     """
     yield
     marks = {mark.name for mark in request.node.iter_markers()}
-    if marks & {"slow", "thorough"} and forget_programs(MOST_MAPS_WITHIN):
-        gc.collect()
+    if marks & {"slow", "thorough"}:
+        forget_programs(MOST_MAPS_WITHIN)
 
 
 @pytest.fixture

@@ -218,7 +218,7 @@ def _of_deformation(path: Path, notes: Notes, weights: Path | None, shown: bool)
     if result.meaning is not None and first.features is not None:
         asking = asking_of(QueryableScene(path, result, weights, origin, background))
         likely = probabilities_of(first.features, jnp.asarray(result.meaning.codebook, jnp.float32))
-        labels = 1 + most_likely(np.asarray(likely))
+        labels = 1 + np.asarray(most_likely(likely))
     return Viewable(
         path.absolute().name,
         first,

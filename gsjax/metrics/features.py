@@ -13,7 +13,7 @@ def feature_psnr(
     teacher: Float[np.ndarray, "..."],
     mask: Bool[np.ndarray, "..."] | None = None,
 ) -> float:
-    """f-PSNR (SurstSplat, section 4): PSNR of feature maps with a peak of 1, after scaling each pixel's
+    """f-PSNR (SurstSplat, section 3): PSNR of feature maps with a peak of 1, after scaling each pixel's
     feature to unit length.
 
         -10 log10( mean over pixels and channels of (f / |f| - g / |g|)^2 )

@@ -60,7 +60,7 @@ def between_neighbors(
 
 
 def t_ssim(video: Num[np.ndarray, "..."], masks: Bool[np.ndarray, "..."] | None = None) -> float:
-    """Mean SSIM of neighbouring frames (SurstSplat, section 4); 1 if nothing moves. Like T-LPIPS, with
+    """Mean SSIM of neighbouring frames (SurstSplat, section 3.3); 1 if nothing moves. Like T-LPIPS, with
     windows of 11 pixels instead of a network.
 
     Args:
@@ -162,7 +162,7 @@ def along_flow(
     masks: Bool[np.ndarray, "..."] | None = None,
 ) -> float:
     """The mean over t of compare(frame t + 1 warped to t along the flow, frame t), over the pixels of
-    `flow_warp_error`: warped LPIPS and warped SSIM (SurstSplat, section 4), which discount explained motion.
+    `flow_warp_error`: warped LPIPS and warped SSIM (SurstSplat, section 3.3), which discount explained motion.
 
     Elsewhere both images show frame t, so that a window or network that reaches there finds no difference.
 

@@ -1,6 +1,7 @@
 """Faster programs on the host: compiler options, memory reuse, and a cache of compiled programs."""
 
 import ctypes
+import gc
 import hashlib
 import os
 import platform
@@ -105,6 +106,7 @@ def forget_programs(most_maps: int = 30_000) -> bool:
     if not maps.exists() or maps.read_bytes().count(b"\n") <= most_maps:
         return False
     jax.clear_caches()
+    gc.collect()  # programs are in cycles
     return True
 
 

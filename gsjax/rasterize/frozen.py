@@ -71,9 +71,9 @@ def freeze_views(
     if len(means) == 0:
         raise ValueError("means: expected at least one Gaussian to see, found none")
     scene = (means, quats, scales, opacities)
+    plan = _plan(*scene, viewmats, Ks, width, height, headroom=1.0, fisheye=fisheye, **options)
     dtype = jnp.result_type(*scene, viewmats, Ks, jnp.float32)  # half is seen in single, as by `plan`
     scene = tuple(jnp.asarray(array, dtype) for array in scene)
-    plan = _plan(*scene, viewmats, Ks, width, height, headroom=1.0, fisheye=fisheye, **options)
     cameras = zip(
         *map(np.asarray, (viewmats, Ks) if fisheye is None else (viewmats, Ks, fisheye)), strict=True
     )

@@ -48,7 +48,7 @@ class DeformationConfig:
     channels: int = 16
     """Channels per vertex."""
     frequencies: int = 6
-    """Number of sinusoid frequencies: 1, 2, 4, ... half periods over the box, or over the whole duration."""
+    """Number of sinusoid frequencies: 1, 2, 4, ... periods over the box, or over the whole duration."""
     hidden: int = 64
     """Width of the network's hidden layers."""
     depth: int = 1

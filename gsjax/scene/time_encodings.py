@@ -114,7 +114,7 @@ def _line(planes: Float[Array, "3 T R F"], time: Float[Array, ""]) -> Float[Arra
 
 
 class Sinusoids(eqx.Module):
-    """Positions and time, and their sines and cosines of 1, 2, 4, ... half periods over the whole range.
+    """Positions and time, and their sines and cosines of 1, 2, 4, ... periods over the whole range.
 
     Attributes:
         frequencies: number of frequencies.

@@ -223,13 +223,13 @@ def label_everything(
     there, codebook = scene.at(frame), jnp.asarray(scene.meaning.codebook, jnp.float32)
     jax.block_until_ready(probabilities_of(there.features, codebook))  # compiles
     begun = perf_counter()
-    likely = np.asarray(probabilities_of(there.features, codebook))
+    likely = jax.block_until_ready(probabilities_of(there.features, codebook))
     seconds = perf_counter() - begun
-    labels = 1 + most_likely(likely)
+    labels = 1 + np.asarray(most_likely(likely))
     colors = {name: label_color(label) for label, name in enumerate(result.names, 1)}
     shades = np.array([INVALID, *colors.values()], np.float32) / 255
     with replaced_folder(folder, OF_QUERY) as new:
-        arrays = {"labels": labels, "probabilities": likely, "names": result.names}
+        arrays = {"labels": labels, "probabilities": np.asarray(likely), "names": result.names}
         write_npz(new / "selection.npz", arrays)
         write_scene(new / "recolored.ply", recolored(there, shades[labels]), labels, origin=scene.origin)
         if question.pictures:
@@ -259,8 +259,8 @@ def _draw_labels(
     shares: dict[str, dict[str, float]] = {}
     with VideoWriter(folder / "video.mp4", _frame_rate(result)) as video:
         for seen in _frames(result, scene.background, console):
-            likely = np.asarray(probabilities_of(seen.features, codebook))
-            labels = np.where(seen.there, 1 + most_likely(likely), 0)
+            likely = probabilities_of(seen.features, codebook)
+            labels = np.where(seen.there, 1 + np.asarray(most_likely(likely)), 0)
             colors = to_uint8(seen.colors)
             over = overlay_labels(colors, labels)
             panel = in_rows({f"frame {seen.number}": colors, "what is what": over}, 2, _PANEL_HEIGHT)

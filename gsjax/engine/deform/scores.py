@@ -28,6 +28,7 @@ from gsjax.methods.deform import (
     on_grid,
     prompt_probabilities,
 )
+from gsjax.methods.deform.query import most_likely
 from gsjax.metrics.features import feature_psnr
 from gsjax.metrics.image import MS_SSIM_LEAST_SIDE, ms_ssim, psnr, ssim
 from gsjax.metrics.segmentation import IGNORED_LABEL, LabelOverlap
@@ -188,10 +189,9 @@ def _of_frame(drawn: Drawn, frame: Frame) -> dict[str, Any]:
     true, counts = _photograph(frame), _counted(frame)
     least = min(true.shape[:2])
     row: dict[str, Any] = {"psnr_masked": psnr(drawn.colors, true, counts)}
-    row["ssim"] = ssim(drawn.colors, true, counts) if least >= _LEAST_SIDE else None
-    row["ms_ssim"] = None
-    if least >= MS_SSIM_LEAST_SIDE:
-        row["ms_ssim"] = ms_ssim(_filled(drawn.colors, frame), true, counts)
+    filled = _filled(drawn.colors, frame)
+    row["ssim"] = ssim(filled, true, counts) if least >= _LEAST_SIDE else None
+    row["ms_ssim"] = ms_ssim(filled, true, counts) if least >= MS_SSIM_LEAST_SIDE else None
     row["depth_mm"] = None
     if frame.depths is not None:
         depth = np.asarray(frame.depths[0])
@@ -229,9 +229,9 @@ def _of_classes(
 
 @jax.jit
 def classes_of_pixels(features: Float[Array, "h w c"], codebook: Float[Array, "k c"]) -> Int[Array, "h w"]:
-    """The row of each pixel's nearest code; -1 where all are equally near, as where nothing is drawn."""
-    likely = prompt_probabilities(features, codebook)
-    return jnp.where(likely.max(axis=-1) > likely.min(axis=-1), likely.argmax(axis=-1), IGNORED_LABEL)
+    """The row of each pixel's nearest code; -1 where all are equally near, or nothing is drawn."""
+    nearest = most_likely(prompt_probabilities(features, codebook))
+    return jnp.where((features != 0).any(axis=-1), nearest, IGNORED_LABEL)
 
 
 def _classes(overlap: LabelOverlap, names: Iterable[str]) -> list[dict[str, Any]]:

@@ -161,6 +161,8 @@ def _when(asked: Question, facts: SceneFacts, rows: list[int]) -> Answer:
         if asked.event == "touch" and np.isfinite(gaps).any():
             nearest = facts.frames[int(np.nanargmin(gaps))]
             never += f" They are nearest in frame {nearest}, {np.nanmin(gaps):.1f} {facts.unit} apart."
+        elif any(_absent(asked, facts, row) is None for row in rows):
+            return Answer("It is not known.", None)
         return Answer(never, None)
     frame = facts.frames[int(np.nanargmax(score))]
     names = " and ".join(facts.names[k] for k in asked.things)

@@ -140,7 +140,8 @@ PRESETS = MappingProxyType(
     }
 )
 """The two papers' recipes: GaussianClin (section A: Adam, 1k canonical and 3k joint iterations), and
-SurstSplat (section 3: AdamW, cosine, weight decay 1e-5). And this project's for a camera that goes around a
+SurstSplat (section 3: AdamW, cosine, weight decay 1e-5), both with the learning rates of
+`DeformRatesConfig` instead of the papers' single ones. And this project's for a camera that goes around a
 moving object: high learning rates, as random points in its hull have far to go; a short warm-up, as a long
 one would blur what moves; and a field with few vertices, too coarse to fit the one view of each time
 alone."""

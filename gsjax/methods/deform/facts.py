@@ -145,9 +145,8 @@ def scene_facts(result: DeformResult, rows: Sequence[int]) -> SceneFacts:
         raise ValueError("rows: expected at least one frame, found none")
     timeline = result.timeline
     times, frames = timeline.times[list(rows)], timeline.frame_ids[list(rows)].tolist()
-    likely = np.asarray(result.probabilities(times[0]))
-    solid = np.asarray(result.scene.gaussians.opacities) > _LEAST_OPACITY
-    labels = np.where(solid, most_likely(likely), -1)
+    solid = result.scene.gaussians.opacities > _LEAST_OPACITY
+    labels = np.asarray(jnp.where(solid, most_likely(result.probabilities(times[0])), -1))
     members = [np.flatnonzero(labels == k) for k in range(len(result.names))]
     points = tuple(some[:: max(1, -(-len(some) // _MOST_POINTS))] for some in members)
     facts = facts_of_views(_views(result, rows, points), result.names, frames, times, metric=timeline.metric)
@@ -185,9 +184,7 @@ def _drawn(
     drawn = render(now, camera, plan)
     assert drawn.features is not None
     likely = prompt_probabilities(drawn.features[0], codebook)
-    apart = (likely.shape[-1] == 1) | (likely.max(axis=-1) > likely.min(axis=-1))  # as in `most_likely`
-    shown = (drawn.alphas[0] > _LEAST_ALPHA) & apart
-    labels = jnp.where(shown, likely.argmax(axis=-1), -1)
+    labels = jnp.where(drawn.alphas[0] > _LEAST_ALPHA, most_likely(likely), -1)
     return (now.means, labels, drawn.depths[0]), drawn.meta._replace(features=None)
 
 

@@ -37,7 +37,8 @@ _NEAR = 0.05  # relative difference in depth between a node and its pixel, for i
 
 @dataclass(frozen=True)
 class GraphConfig:
-    """Nodes, edges and loss weights of the graph; the defaults are SurstSplat's (section 3)."""
+    """Nodes, edges and loss weights of the graph; only SurstSplat's weights of losses, 0.1, are printed
+    (section 3)."""
 
     kind: Literal["matching", "similarity", "none"] = "matching"
     """SurstSplat's node and structure losses (eqs. 11 and 12), GaussianClin's similar pairs (eq. 8), or no

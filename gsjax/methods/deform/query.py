@@ -1,6 +1,7 @@
 """Gaussians of a deforming scene that match a prompt (SurstSplat, section 2.4; GaussianClin, section 3.4)."""
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
@@ -25,12 +26,10 @@ def prompt_probabilities(
     return jax.nn.softmax(directions(features) @ directions(prompts).T / temperature, axis=-1)
 
 
-def most_likely(probabilities: Float[np.ndarray, "*n k"]) -> Int[np.ndarray, "*n"]:
-    """The index of the most likely prompt; -1 where all are equally likely."""
-    if probabilities.shape[-1] == 1:
-        return np.zeros(probabilities.shape[:-1], int)
+def most_likely(probabilities: Float[Array, "*n k"]) -> Int[Array, "*n"]:
+    """The index of the most likely prompt; -1 where several are all equally likely."""
     apart = probabilities.max(axis=-1) > probabilities.min(axis=-1)
-    return np.where(apart, probabilities.argmax(axis=-1), -1)
+    return jnp.where(apart | (probabilities.shape[-1] == 1), probabilities.argmax(axis=-1), -1)
 
 
 def region_feature(

@@ -163,10 +163,10 @@ def zero_field(teacher: Teacher, means: Float[Array, "n 3"], config: DistillConf
 
     Args:
         teacher: the teacher's features.
-        means: centres of the Gaussians, which also set the field's precision.
+        means: centres of the Gaussians, which also set the field's precision, single at least.
         config: the energy, and the largest number of channels.
     """
-    basis = jnp.asarray(basis_of(teacher, config), means.dtype)
+    basis = jnp.asarray(basis_of(teacher, config), jnp.promote_types(means.dtype, jnp.float32))
     return FeatureField(jnp.zeros((len(means), basis.shape[1]), basis.dtype), basis)
 
 

@@ -94,7 +94,8 @@ class UnifyConfig:
     noise: float = 2.5
     """Tracking error, pixels; parts that have moved less are not compared yet."""
     tolerance: float = 0.15
-    """Join parts whose motions differ by less than this share of the smaller motion."""
+    """Join parts whose motions differ by less than this share of the smaller motion, or by less than the
+    tracking error."""
     least_gain: float = 0.01
     """At the end, join a part to another or to the background if the loss rises by at most this share."""
 

@@ -179,5 +179,5 @@ def scene_and_trajectory(
 def _about_other_centers(poses: HandlePose, shifts: Float[Array, "P 3"]) -> HandlePose:
     """The same motions about centres that are shifted, metres: x -> R (x - c) + c + T about any c, with
     T' = T + (R - I)(c' - c)."""
-    turned = jnp.einsum("tpij,pj->tpi", quats_to_matrices(poses.quats), shifts)
+    turned = jnp.einsum("tpij,pj->tpi", quats_to_matrices(poses.quats), shifts, precision="highest")
     return HandlePose(poses.quats, poses.translations + turned - shifts)

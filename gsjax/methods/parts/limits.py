@@ -103,8 +103,6 @@ def describe_beyond(
 
 def _radii(scene: PartScene) -> Float[Array, "P"]:
     """The distance of each part's Gaussians from its handle, root mean square, metres."""
-    means, weights = scene.gaussians.means, scene.weights
-    total = jnp.maximum(jnp.sum(weights, axis=0), 1e-9)
-    middle = weights.T @ means / total[:, None]
-    spread = weights.T @ jnp.sum(means**2, axis=-1) / total - jnp.sum(middle**2, axis=-1)
-    return jnp.sqrt(jnp.maximum(spread + jnp.sum((middle - scene.centers) ** 2, axis=-1), 1e-6))
+    squares = jnp.sum((scene.gaussians.means[:, None] - scene.centers) ** 2, axis=-1)
+    total = jnp.maximum(jnp.sum(scene.weights, axis=0), 1e-9)
+    return jnp.sqrt(jnp.maximum(jnp.sum(scene.weights * squares, axis=0) / total, 1e-6))

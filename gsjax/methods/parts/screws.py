@@ -25,7 +25,8 @@ def pose_of(motions: jaxlie.SE3) -> HandlePose:
 def pose_from(motions: Float[Array, "P 4 4"], centers: Float[Array, "P 3"]) -> HandlePose:
     """The pose of handles at `centers` that moves the canonical scene by these motions of the world."""
     rotations = motions[:, :3, :3]
-    shifts = jnp.einsum("pij,pj->pi", rotations, centers) + motions[:, :3, 3] - centers
+    turned = jnp.einsum("pij,pj->pi", rotations, centers, precision="highest")
+    shifts = turned + motions[:, :3, 3] - centers
     return HandlePose(normalize_quats(jaxlie.SO3.from_matrix(rotations).wxyz), shifts)
 
 

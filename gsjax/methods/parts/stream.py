@@ -144,7 +144,7 @@ def posed(
     if nudges is not None:
         moved = eqx.tree_at(lambda g: g.means, moved, moved.means + nudges)
     if opacities is not None:
-        logits = faded(moved.logit_opacities, weights @ (1 - opacities))
+        logits = faded(moved.logit_opacities, jnp.matmul(weights, 1 - opacities, precision="highest"))
         moved = eqx.tree_at(lambda g: g.logit_opacities, moved, logits)
     return jax.tree.map(lambda a, b: jnp.concatenate([a, b]), moved, canonical.fixed)
 

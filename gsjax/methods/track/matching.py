@@ -210,6 +210,6 @@ def lift(
     together = jax.vmap(solve, in_axes=1)(matrices, rights)
     best = jax.nn.one_hot(jnp.argmax(weight, axis=0), weight.shape[0], axis=0)
     alone = jax.vmap(solve, in_axes=1)(matrices * best[..., None, None], rights * best[..., None])
-    residual = jnp.einsum("ckij,kj->cki", matrices, together) - rights
-    apart = jnp.linalg.norm(residual, axis=-1).max(0) > config.max_residual
+    residual = jnp.linalg.norm(jnp.einsum("ckij,kj->cki", matrices, together) - rights, axis=-1)
+    apart = (residual > weight * config.max_residual).any(0)
     return jnp.where(apart[:, None], alone, together), usable.any(0)

@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from gsjax.geometry.sight import pixels_at
 from gsjax.losses.extra import ExtraLosses, named_losses
 from gsjax.methods.track.budget import Chosen
 from gsjax.methods.track.config import TrackConfig
@@ -102,13 +103,11 @@ def matching_reduction(scene: TrackedScene, frame: Frame, config: TrackConfig) -
     means = np.asarray(scene.gaussians.means, np.float64)[: scene.num_moving]
     sizes = []
     for viewmat, K in zip(np.asarray(frame.cameras.viewmat), np.asarray(frame.cameras.K), strict=True):
-        local = means @ viewmat[:3, :3].T + viewmat[:3, 3]
-        pixels = K[0, 0] * local[:, :2] / np.maximum(local[:, 2:], 1e-3) + K[:2, 2]
+        pixels, depths = pixels_at(means @ viewmat[:3, :3].T + viewmat[:3, 3], K)
         pixels = np.clip(pixels, 0, (frame.cameras.width, frame.cameras.height))
-        seen = local[:, 2] > frame.cameras.near
-        there = [k for k in range(1, scene.num_objects + 1) if (groups == k).any()]  # no empty slots
-        visible = [pixels[seen & (groups == k)] for k in there]
+        seen = depths > frame.cameras.near
+        visible = [pixels[seen & (groups == k)] for k in range(1, scene.num_objects + 1)]
         sizes.append([np.ptp(places, axis=0).max() if len(places) else 0.0 for places in visible])
-    largest = np.sort(np.max(sizes, axis=0))
-    size = largest[-2] if len(largest) > 1 else largest[-1]
+    shown = sorted(size for size in np.max(sizes, axis=0) if size > 0)  # no empty slots
+    size = shown[-2:][0] if shown else 0.0
     return max(1, int(np.ceil(size / config.match.patch)))

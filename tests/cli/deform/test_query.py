@@ -256,7 +256,7 @@ def test_features_that_change_are_those_of_the_frame(run):
 
 
 def test_nothing_is_most_likely_where_all_are_equally_likely():
-    likely = np.array([[0.2, 0.8], [0.6, 0.4], [0.5, 0.5]])
+    likely = jnp.array([[0.2, 0.8], [0.6, 0.4], [0.5, 0.5]])
     np.testing.assert_array_equal(most_likely(likely), [1, 0, -1])
 
 
@@ -267,7 +267,7 @@ def test_the_prompt_of_a_feature_has_the_other_names_as_negatives():
     prompt = feature_prompt(meaning, 0.2 * (codebook[2] + 0.4 * codebook[0]))
     assert (prompt.name, prompt.negatives) == ("c", ("a", "b"))
     np.testing.assert_allclose(prompt.vectors[1:], codebook[:2], atol=1e-12)
-    likely = np.asarray(prompt_probabilities(jnp.asarray(codebook), jnp.asarray(prompt.vectors)))
+    likely = prompt_probabilities(jnp.asarray(codebook), jnp.asarray(prompt.vectors))
     np.testing.assert_array_equal(most_likely(likely), [1, 2, 0])
 
 

@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gsjax.engine.deform.scores import OVER_TIME, classes_of_pixels, over_time
+from gsjax.engine.deform.scores import OVER_TIME, Drawn, _of_frame, classes_of_pixels, over_time
 from tests.methods.deform.tissue import one_frame
 
 HEIGHT, WIDTH = 40, 48
@@ -59,7 +59,21 @@ def test_a_neighbour_without_a_mask_is_not_compared():
     assert over_time([(picture(), seen(0.0, counts)), (picture(1.0), seen(1.0))]) == {}
 
 
+def test_what_does_not_count_does_not_change_the_similarity_around_it():
+    """Regression test: windows at the outline of a tool compared it with the tissue drawn behind it."""
+    counts = np.ones((HEIGHT, WIDTH), bool)
+    counts[10:20, 10:20] = False
+    frame = seen(0.0, counts)
+    colors = np.where(counts[..., None], frame.images[0] / 255.0, 1.0)
+    assert _of_frame(Drawn(colors, np.ones((HEIGHT, WIDTH)), None), frame)["ssim"] == pytest.approx(1)
+
+
 def test_pixels_are_of_the_class_whose_code_is_nearest():
     codes = jnp.eye(3, 5)
     features = jnp.array([[[0.1, 0.02, 0, 0, 0], [0, 0, 7.0, 0, 1], [0, 0, 0, 0, 0]]])  # the last has none
     np.testing.assert_array_equal(classes_of_pixels(features, codes), [[0, 2, -1]])
+
+
+def test_a_single_class_is_all_that_is_drawn():
+    features = jnp.array([[[0.1, 0.02], [0, 0]]])
+    np.testing.assert_array_equal(classes_of_pixels(features, jnp.eye(1, 2)), [[0, -1]])

@@ -110,6 +110,15 @@ class TestAnswers:
         found = ask("do the tissue and the needle driver touch in frame 12", blind)
         assert found == ("Their distance is not known.", None, "")
 
+    def test_when_is_unknown_of_what_is_seen_but_not_measured(self, facts):
+        gaps, depths = (np.full_like(a, np.nan) for a in (facts.gaps, facts.depths))
+        blind = replace(facts, gaps=gaps, depths=depths)
+        for question in (
+            "When do the tissue and the needle driver first touch?",
+            "When is the needle driver nearest to the camera?",
+        ):
+            assert ask(question, blind) == ("It is not known.", None, "")
+
     def test_a_motion_has_its_true_length(self, facts):
         one, other = (made_up(t).points[1] for t in (12 - 10, 13 - 10))
         found = ask("how far does the needle driver move between frames 12 and 13", facts)

@@ -122,7 +122,7 @@ def small_state(A, b, shown):
 
 
 def test_what_is_beside_nothing_does_not_take_its_stray_vector():
-    """The second Gaussian has no mask but for a stray pixel; the third is in no pixel, beside both."""
+    """The second Gaussian has no mask but for a stray pixel; the third, beside it, is in no pixel."""
     mass, b = np.diag([1, 0.01, 0]).astype(np.float32), np.float32([[1, 0], [0, 0.01], [0, 0]])
     state = small_state(mass, b, np.float32([1, 1, 0]))
     field = FeatureField(jnp.zeros((3, 2)), jnp.eye(2))

@@ -172,6 +172,12 @@ def test_of_cameras_that_disagree_the_best_is_believed():
     np.testing.assert_allclose(move[0], MOVE, atol=1e-3)
 
 
+def test_how_far_cameras_may_disagree_does_not_depend_on_their_scores():
+    wrong = MOVE + np.array([0.1, 0.0, 0.0])
+    move, _ = lift(*seen_to_move([wrong, MOVE], True, jnp.array([0.35, 0.4])), CONFIG)
+    np.testing.assert_allclose(move[0], MOVE, atol=2e-3)
+
+
 def test_a_poor_match_moves_nothing():
     match, now = seen_to_move([MOVE], True, score=0.2)
     assert not lift(match, now, CONFIG)[1][0]

@@ -332,6 +332,18 @@ def test_what_is_behind_a_camera_does_not_reduce_the_pictures(started, table):
     assert matching_reduction(started, turned, TrackConfig(matching=True, coarseness=1)) == 1
 
 
+@pytest.mark.thorough
+def test_what_is_beside_the_pictures_does_not_reduce_them(started, table):
+    _, frames, _ = table()
+    frame = replace(frames[0], cameras=jax.tree.map(lambda a: a[:1], frames[0].cameras))
+    viewmat = frame.cameras.viewmat[0]
+    spread = jnp.linspace(0, 1, started.gaussians.num)[:, None]
+    local = jnp.array([3.0, 3.0, 0.05]) + spread  # below and to the right of the picture
+    means = (local - viewmat[:3, 3]) @ viewmat[:3, :3]
+    beside = eqx.tree_at(lambda s: s.gaussians.means, started, means)
+    assert matching_reduction(beside, frame, TrackConfig(matching=True, coarseness=1)) == 1
+
+
 @pytest.mark.slow
 def test_a_still_scene_stays_still(table, quick):
     _, frames, mask = table(still=True)
