@@ -162,7 +162,8 @@ def along_flow(
     masks: Bool[np.ndarray, "..."] | None = None,
 ) -> float:
     """The mean over t of compare(frame t + 1 warped to t along the flow, frame t), over the pixels of
-    `flow_warp_error`: warped LPIPS and warped SSIM (SurstSplat, section 3.3), which discount explained motion.
+    `flow_warp_error`: warped LPIPS and warped SSIM (SurstSplat, section 3.3), which discount explained
+    motion.
 
     Elsewhere both images show frame t, so that a window or network that reaches there finds no difference.
 
