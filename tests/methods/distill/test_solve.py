@@ -151,6 +151,17 @@ def test_conjugate_gradients_keep_nothing_at_zero():
 
 
 @pytest.mark.thorough
+def test_a_scene_in_half_precision_is_solved_in_single(scene):
+    gaussians, _, masks = scene
+    half = jax.tree.map(lambda a: a.astype(jnp.bfloat16), gaussians)
+    config = DistillConfig(start="solve", iterations=0, solve=SolveConfig(iterations=3))
+    ticks, _ = solved(half, teacher_with(masks), config)
+    vectors = ticks.result.field.encoding
+    assert vectors.dtype == jnp.float32
+    assert np.isfinite(vectors).all()
+
+
+@pytest.mark.thorough
 @pytest.mark.usefixtures("x64")
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize(("dtype", "error"), [(jnp.float64, 1e-7), (jnp.float32, 2e-5)])
