@@ -12,7 +12,12 @@ from gsjax.data.pictures import SUFFIXES, is_picture, reject_unread
 DEFAULT_RATE_HZ = 30.0
 """Frame rate assumed if the data has no times."""
 
-_NUMBER = re.compile(r"\d+")
+_NUMBER = re.compile(r"(\d+)")
+
+
+def natural_key(name: str) -> list[tuple[int, str]]:
+    """Sort key by which frame_2 comes before frame_10."""
+    return [(int(part), "") if part.isdecimal() else (-1, part) for part in _NUMBER.split(name)]
 
 
 def pictures(folder: Path) -> list[Path]:
@@ -71,27 +76,24 @@ def numbered(folder: Path, suffixes: tuple[str, ...] = SUFFIXES) -> dict[int, Pa
 
 def frame_numbers(frames: list[Path]) -> tuple[int, ...]:
     """The last number in each name (12 for frame-000012_color.png); or positions from 0 if a name has no
-    number, two names have the same one, or only all numbers of the names together increase, as those of time
-    stamps do.
+    number, or these do not increase, as in 19.80.png and 20.20.png.
+
+    Args:
+        frames: files, sorted by name.
 
     Raises:
         DataError: names sort differently than their numbers, so the frames would be out of order in time.
     """
-    positions = tuple(range(len(frames)))
-    counters = [[int(text) for text in _NUMBER.findall(path.stem)] for path in frames]
-    if not all(counters):
-        return positions
-    numbers = tuple(counter[-1] for counter in counters)
-    falls = [pair for pair, (a, b) in zip(pairwise(frames), pairwise(numbers), strict=True) if b < a]
-    in_order = all(a < b for a, b in pairwise(counters))
-    if len(set(numbers)) < len(numbers) or (falls and in_order):  # 19.80.png, 20.20.png
-        return positions
-    if falls:
-        before, after = falls[0]
-        advice = "Pad the numbers with zeros to equal length."
-        found = f"{after.name} after {before.name}"
-        raise DataError(frames[0].parent, "names that sort in the order of their numbers", found, advice)
-    return numbers
+    found = [_NUMBER.findall(path.stem) for path in frames]
+    numbers = tuple(int(texts[-1]) for texts in found if texts)
+    if len(numbers) == len(frames) and all(a < b for a, b in pairwise(numbers)):
+        return numbers
+    for before, after in pairwise(frames):
+        if natural_key(after.name) < natural_key(before.name):
+            advice = "Pad the numbers with zeros to equal length."
+            order = f"{after.name} after {before.name}"
+            raise DataError(after.parent, "names that sort in the order of their numbers", order, advice)
+    return tuple(range(len(frames)))
 
 
 def warn_about_single_frame(frames: list[Path]) -> None:

@@ -1,12 +1,10 @@
 """A recording from photographs that one camera took in succession, for example the frames of a video whose
 poses were estimated by structure from motion."""
 
-import re
-
 import numpy as np
 
 from gsjax.data.errors import DataError
-from gsjax.data.frame_folders import DEFAULT_RATE_HZ
+from gsjax.data.frame_folders import DEFAULT_RATE_HZ, natural_key
 from gsjax.data.open import ReadOptions, is_photographs, is_recording, open_photographs, open_sequence
 from gsjax.data.photographs import Photographs
 from gsjax.data.sequence import Sequence
@@ -23,11 +21,6 @@ def open_as_sequence(dataset: str, read: ReadOptions | None = None) -> Sequence:
     if is_photographs(dataset) and not is_recording(dataset, read.images):
         return sequence_of(open_photographs(dataset, read))
     return open_sequence(dataset, read)
-
-
-def _natural_key(name: str) -> list[tuple[int, str]]:
-    """Sort key by which frame_2 comes before frame_10."""
-    return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", name)]
 
 
 def sequence_of(photographs: Photographs) -> Sequence:
@@ -47,7 +40,7 @@ def sequence_of(photographs: Photographs) -> Sequence:
         )
     times, names = photographs.times, photographs.names
     if times is None:
-        order = sorted(range(len(names)), key=lambda i: _natural_key(names[i]))
+        order = sorted(range(len(names)), key=lambda i: natural_key(names[i]))
     else:
         order = np.argsort(np.asarray(times), kind="stable").tolist()
     width, height = (int(side) for side in photographs.sizes[order[0]])

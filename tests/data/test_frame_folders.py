@@ -40,15 +40,17 @@ def test_pictures_come_in_order_of_name_and_nothing_else_does(tmp_path):
         (("f1_left.png", "f1_right.png"), (0, 1)),
         (("1305031102.975304.png", "1305031103.011304.png"), (0, 1)),
         (("shot1_099.png", "shot2_001.png"), (0, 1)),
+        (("left_1.png", "left_2.png", "right_1.png"), (0, 1, 2)),
     ],
 )
 def test_the_frame_number_is_the_last_number_in_the_name(tmp_path, names, numbers):
     assert frame_numbers([tmp_path / name for name in names]) == numbers
 
 
-def test_numbers_without_padding_are_refused(tmp_path):
-    frames = sorted(tmp_path / f"{i}.png" for i in (1, 2, 10))
-    with pytest.raises(DataError, match=r"found 2.png after 10.png. Pad the numbers with zeros"):
+@pytest.mark.parametrize("end", ["", "_cam0", "_v1"])
+def test_numbers_without_padding_are_refused(tmp_path, end):
+    frames = sorted(tmp_path / f"{i}{end}.png" for i in (2, 3, 10))
+    with pytest.raises(DataError, match=rf"found 2{end}.png after 10{end}.png. Pad the numbers with zeros"):
         frame_numbers(frames)
 
 
