@@ -12,7 +12,7 @@ from gsjax.data.lens import intrinsics_matrix
 from gsjax.data.opencv_cameras import RgbdCamera
 
 _MILLIMETRES = 1e3
-_LONGEST_MS = 2**31 - 1
+_LONGEST_WAIT = 1.0  # seconds; Python sees Ctrl-C only between two waits
 
 
 class RealSenseCapture:
@@ -30,7 +30,7 @@ class RealSenseCapture:
     """
 
     def __init__(self, rs: Any, serial: str, patience: float = 5.0):
-        self._patience_ms = int(min(1e3 * patience, _LONGEST_MS))
+        self._patience = patience
         config, self._pipeline = rs.config(), rs.pipeline()
         config.enable_device(serial)
         config.enable_stream(rs.stream.depth, rs.format.z16)
@@ -52,7 +52,11 @@ class RealSenseCapture:
 
     def grab(self) -> bool:
         """Wait for the next frame; False if none comes."""
-        arrived, frames = self._pipeline.try_wait_for_frames(self._patience_ms)
+        arrived, frames, left = False, None, self._patience
+        while not arrived and left > 0:
+            wait = min(left, _LONGEST_WAIT)
+            arrived, frames = self._pipeline.try_wait_for_frames(round(1e3 * wait))
+            left -= wait
         self._frames = self._align.process(frames) if arrived else None
         return bool(arrived)
 

@@ -192,11 +192,11 @@ def test_a_missing_camera_is_an_error_with_advice():
 
 
 class FakeRealSense(ModuleType):
-    """The part of pyrealsense2 that is used, with one camera that delivers `frames` frames."""
+    """The part of pyrealsense2 that is used, with one camera: `frames` frames after `late` waits in vain."""
 
-    def __init__(self, frames=2, starts=True, depth=True):
+    def __init__(self, frames=2, starts=True, depth=True, late=0):
         super().__init__("pyrealsense2")
-        self.left, self.starts, self.depth, self.waits = frames, starts, depth, []
+        self.left, self.starts, self.depth, self.late, self.waits = frames, starts, depth, late, []
         self.stream = SimpleNamespace(depth="depth", color="color")
         self.format = SimpleNamespace(z16="z16", bgr8="bgr8")
         self.camera_info = SimpleNamespace(serial_number="serial number")
@@ -223,6 +223,8 @@ class FakeRealSense(ModuleType):
 
     def try_wait_for_frames(self, milliseconds):
         self.waits.append(milliseconds)
+        if len(self.waits) <= self.late:
+            return False, {}
         self.left -= 1
         return self.left >= 0, {}
 
@@ -244,12 +246,17 @@ def test_a_realsense_camera_gives_metres_and_red_green_blue(monkeypatch):
     np.testing.assert_allclose(shots[0].frame.images[0, 0, 0], [0, 0, 1])
 
 
-@pytest.mark.parametrize(("patience", "milliseconds"), [(0.5, 500), (30.0, 30_000), (math.inf, 2**31 - 1)])
-def test_a_realsense_camera_is_waited_for_as_long_as_asked(monkeypatch, patience, milliseconds):
-    fake = FakeRealSense(frames=0)
+@pytest.mark.parametrize(
+    ("patience", "late", "milliseconds"),
+    [(0.5, 1, [500]), (2.5, 3, [1000, 1000, 500]), (math.inf, 30, [1000] * 31)],
+)
+def test_a_realsense_camera_is_waited_for_as_long_as_asked(monkeypatch, patience, late, milliseconds):
+    """Never for more than a second at a time, so that Ctrl-C is noticed."""
+    fake = FakeRealSense(late=late)
     monkeypatch.setitem(sys.modules, "pyrealsense2", fake)
-    assert list(snapshots([open_realsense(0, patience=patience)])) == []
-    assert fake.waits == [milliseconds]
+    arrived = next(snapshots([open_realsense(0, patience=patience)]), None)
+    assert (arrived is not None) == (patience == math.inf)
+    assert fake.waits == milliseconds
 
 
 @pytest.mark.parametrize(
