@@ -6,6 +6,7 @@ torchvision and the `lpips` package use: `features.N.weight` and `features.N.bia
 """
 
 import hashlib
+import io
 import json
 import os
 from functools import partial
@@ -203,6 +204,7 @@ def load_lpips(path: str | os.PathLike) -> LpipsWeights:
 
     Raises:
         FileNotFoundError: there is no such file or folder, or the folder holds none.
+        OSError: a file cannot be opened, as without permission.
         ValueError: the format is not supported (a pickle of torch), a file is damaged, or an array is missing
             or has a wrong shape.
     """
@@ -253,19 +255,21 @@ def _files(path: Path) -> list[Path]:
     return [path]
 
 
-def _read_npz(file: Path) -> dict[str, np.ndarray]:
-    with np.load(file, allow_pickle=False) as saved:
-        return dict(saved)
+# Arrays that are not used may have types that numpy lacks or that take pickles, and are not decoded.
 
 
-def _read_safetensors(file: Path) -> dict[str, np.ndarray]:
+def _read_npz(data: bytes) -> dict[str, np.ndarray]:
+    with np.load(io.BytesIO(data), allow_pickle=False) as saved:
+        return {name: saved[name] for name in _USED.intersection(saved.files)}
+
+
+def _read_safetensors(data: bytes) -> dict[str, np.ndarray]:
     """The format: the length of the header (8 bytes), the header as JSON, and the bytes of the arrays."""
-    data = file.read_bytes()
     start = 8 + int.from_bytes(data[:8], "little")
     header = json.loads(data[8:start])
     arrays = {}
     for name, entry in header.items():
-        if name not in _USED:  # it may have a type that numpy lacks
+        if name not in _USED:
             continue
         if entry["dtype"] not in _DTYPES:
             raise ValueError(f"{name}: expected {' or '.join(_DTYPES)}, found {entry['dtype']}")
@@ -278,8 +282,9 @@ _READERS = {".npz": _read_npz, ".safetensors": _read_safetensors}
 
 
 def _read(file: Path) -> dict[str, np.ndarray]:
+    data = file.read_bytes()
     try:
-        return _READERS[file.suffix.lower()](file)
+        return _READERS[file.suffix.lower()](data)
     except Exception as error:  # of numpy, zipfile, zlib and json, for damaged files
         raise ValueError(
             f"{file}: expected named arrays, found a file that cannot be read ({error}); convert the "
