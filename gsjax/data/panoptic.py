@@ -27,7 +27,7 @@ from gsjax.data.objects import Truth
 from gsjax.data.origin import near_origin, relative_to_origin
 from gsjax.data.pictures import is_picture
 from gsjax.data.sequence import Sequence
-from gsjax.data.validation import check_intrinsics, check_poses, check_times
+from gsjax.data.validation import check_intrinsics, check_poses
 from gsjax.geometry.joints import Joint
 from gsjax.io.atomic import write_json, write_npz
 from gsjax.io.brief import brief
@@ -61,7 +61,10 @@ def read_panoptic(path: str | Path, *, depth_unit_m: float | None = None) -> Seq
     meta = _read_metas(root)
     present = _present_frames(root, meta["fn"])
     names = [meta["fn"][t] for t in present]
-    _check_cameras(meta, present)
+    ids = tuple(_frame_number(meta["fn"][t][0], t) for t in present)
+    if len(set(ids)) < len(ids):  # such as the number of the camera
+        ids = tuple(present)
+    _check_cameras(meta, present, ids)
     frames, width, height = len(meta["fn"]), meta["w"], meta["h"]
     times = np.asarray(meta.get("time", np.arange(frames) / DEFAULT_RATE_HZ), np.float64)
     if times.shape != (frames,):
@@ -69,10 +72,6 @@ def read_panoptic(path: str | Path, *, depth_unit_m: float | None = None) -> Seq
             root / META_NAMES[0], f"time to be {frames} numbers", f"shape {times.shape}", _ADVICE_META
         )
     unit = depth_unit_m or float(meta.get("depth_unit_m", DEFAULT_DEPTH_UNIT_M))
-
-    ids = tuple(_frame_number(meta["fn"][t][0], t) for t in present)
-    if len(set(ids)) < len(ids):  # such as the number of the camera
-        ids = tuple(present)
     first_mask_only = [_has_first_mask_only(root, name) for name in names[0]]
 
     def locate(kind: str, t: int, c: int) -> str:
@@ -124,7 +123,9 @@ def write_panoptic(sequence: Sequence, path: str | Path, depth_unit_m: float = 0
     """
     root = Path(path)
     sequence = relative_to_origin(sequence, None)  # the layout has no place for an origin
-    check_times(sequence.times)  # shared ones could not be read
+    if len(shared := np.flatnonzero(np.diff(sequence.times) == 0)):
+        found = f"{sequence.times[shared[0]]} s in frames {shared[0]} and {shared[0] + 1}"
+        raise ValueError(f"write_panoptic requires a time of its own for each frame, got {found}")
     truth = sequence.truth
     if truth is not None and truth.label_ids.tolist() != list(range(2, 2 + len(truth.names))):
         found = truth.label_ids.tolist()
@@ -229,18 +230,19 @@ def _checked(path: Path, meta: dict[str, Any]) -> dict[str, Any]:
             expected = f"cameras {meta['cam_id'][0]} as in frame 0"
             raise DataError(path, expected, f"{ids} in frame {t}", _ADVICE_META)
     arrays = {key: _stack(path, key, meta[key], side) for key, side in (("k", 3), ("w2c", 4))}
+    if not isinstance(absent := meta.get("absent", []), list):
+        raise DataError(path, "absent to be a list of files", brief(repr(absent)), _ADVICE_META)
     names = {"fn": [[portable(name) for name in frame] for frame in meta["fn"]]}
     own = {"cam_id": [int(i) for i in meta["cam_id"][0]], "file": [path] * cameras}
-    return meta | arrays | names | own | {"absent": {portable(file) for file in meta.get("absent", ())}}
+    return meta | arrays | names | own | {"absent": {portable(file) for file in absent}}
 
 
-def _check_cameras(meta: dict[str, Any], present: list[int]) -> None:
+def _check_cameras(meta: dict[str, Any], present: list[int], ids: tuple[int, ...]) -> None:
     """Raises ValueError if a camera is invalid in a frame that has images; the message names its file."""
     for c, (path, camera) in enumerate(zip(meta["file"], meta["cam_id"], strict=True)):
 
         def where(t: int, _: int, camera: int = camera) -> str:
-            number = _frame_number(meta["fn"][present[t]][0], present[t])
-            return f"camera {camera} in frame {number}"
+            return f"camera {camera} in frame {ids[t]}"
 
         try:
             check_intrinsics(meta["k"][present, c, None], where)

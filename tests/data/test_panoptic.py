@@ -136,6 +136,7 @@ def test_a_camera_count_that_differs_names_the_frame(folder):
         (lambda m: m["w2c"][1][1].pop(), r"w2c in frame 1, camera position 1, as 4x4 numbers, found 3x4"),
         (lambda m: m.update(time=[0.0, 1.0]), "time to be 3 numbers"),
         (lambda m: m.update(fn=[]), "at least one frame"),
+        (lambda m: m.update(absent="seg/0/000001.png"), "expected absent to be a list of files, found 'seg"),
         (lambda m: m.update(absent=[[1]]), "the lists and numbers of this layout, found something else"),
         (lambda m: m.update(fn=[[1, 2]] * 3), "the lists and numbers of this layout, found something else"),
     ],
@@ -334,6 +335,9 @@ def test_frames_whose_names_end_in_the_camera_are_counted(folder):
         name.rename(name.with_stem(f"{name.stem}_cam{name.parent.name}"))
     folder.meta["fn"] = [[f"{c}/{t:06d}_cam{c}.jpg" for c in (0, 1)] for t in range(FRAMES)]
     assert folder.read().frame_ids == (0, 1, 2)
+    folder.meta["w2c"][1][0][0][0] = 3.0
+    with pytest.raises(ValueError, match="camera 0 in frame 1: R is not a rotation"):
+        folder.read()
 
 
 def test_a_unit_of_depth_that_the_user_gives(folder):

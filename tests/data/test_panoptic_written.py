@@ -51,7 +51,7 @@ def test_writing_needs_the_labels_of_a_tabletop(tmp_path):
 
 def test_frames_that_share_a_time_are_refused_as_they_could_not_be_read(tmp_path):
     scene = replace(tabletop(frames=2, width=16, height=12), times=np.array([0.5, 0.5]), shared_times=True)
-    with pytest.raises(ValueError, match=r"increase, but frame 1 is at 0.5 s after 0.5 s"):
+    with pytest.raises(ValueError, match=r"a time of its own for each frame, got 0.5 s in frames 0 and 1"):
         write_panoptic(scene, tmp_path)
 
 
