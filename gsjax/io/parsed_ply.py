@@ -16,7 +16,8 @@ _SIZES = {  # bytes; a list may be empty, and has a count of one byte or more
     **dict.fromkeys((b"double", b"float64"), 8),
 }
 _LONGEST_HEADER = 2**20  # bytes
-_ASCII = bytes(range(128)) + b"?" * 128
+# Bytes from 128 to 191, by which letters of one alphabet differ in UTF-8, stay distinct, so that names do.
+_ASCII = bytes(range(128)) + bytes(range(64, 128)) + b"?" * 64
 _END = re.compile(rb"[\r\n]end_header[ \t]*(?:[\r\n]|$)")
 
 

@@ -70,6 +70,14 @@ def test_comments_may_be_in_any_language(tmp_path, text, words):
     assert read_cloud(path).points[:, 2].tolist() == pytest.approx(other["vertex"]["z"])
 
 
+@pytest.mark.parametrize("names", [("强度", "高度"), ("Δx", "Σx")])
+def test_properties_may_have_names_in_any_language(tmp_path, names):
+    header = ["ply", "format ascii 1.0", "element vertex 1"]
+    header += [f"property float {name}" for name in ("x", "y", "z", *names)]
+    (tmp_path / "scan.ply").write_text("\n".join([*header, "end_header", "1 2 3 4 5", ""]), encoding="utf-8")
+    assert read_cloud(tmp_path / "scan.ply").points.tolist() == [[1, 2, 3]]
+
+
 def test_another_ending_is_refused(tmp_path):
     with pytest.raises(
         ValueError, match=r"scene.spz: expected a name that ends in .ply, found .spz; gsjax.write"
