@@ -251,7 +251,7 @@ class Sequence:
         """Displacement (x, y) of each pixel from frame `t` to t + 1, pixels; NaN = unknown, None = no flow.
 
         Raises:
-            IndexError: `t` is the last frame, or none.
+            IndexError: `t` is the last frame, or there is no such frame.
             DataError: the loader returned another shape or type.
         """
         if self.load_flow is None:

@@ -26,6 +26,7 @@ from gsjax.scene.gaussians import Gaussians, take
 _FOCAL = 1.2  # of the height: 45 degrees from top to bottom
 _MOST = 65535
 _MOST_BYTES = 400_000_000  # in base64, the 2^29 characters of Chromium's longest text
+_MOST_GAUSSIANS = _MOST_BYTES // RECORD.itemsize
 _LEAST_STEP = 1e-3  # seconds that the last frame is shown
 _LEAST_UNIT = 1e-6  # of the distance of the farthest Gaussian
 _TEMPLATE = Path(__file__).with_name("page.html")
@@ -73,17 +74,16 @@ def write_page(
         ValueError: the Gaussians or their motion are more than a page can hold, or some frame of the film
             holds values that are not finite.
     """
+    if gaussians.num > _MOST_GAUSSIANS:
+        raise ValueError(
+            f"{path}: expected at most {_MOST_GAUSSIANS:,} Gaussians, the most that a browser opens in a "
+            f"page, found {gaussians.num:,}; write .sog, or fewer"
+        )
     means = np.asarray(gaussians.means, np.float64)
     center = np.quantile(means, (0.01, 0.99), axis=0).mean(axis=0)  # without a few that are far away
     radius = np.quantile(np.linalg.norm(means - center, axis=1), 0.98)
     order, motion, moved = (np.arange(gaussians.num), None, b"") if film is None else _packed(film)
     order = np.append(order, np.arange(len(order), gaussians.num))
-    most = _MOST_BYTES // RECORD.itemsize
-    if gaussians.num > most:
-        raise ValueError(
-            f"{path}: expected at most {most:,} Gaussians, since browsers hold no longer text, found "
-            f"{gaussians.num:,}; write .sog, or fewer"
-        )
     about = {
         "title": path.stem,
         "up": [float(value) + 0.0 for value in up],
@@ -192,9 +192,9 @@ def _compressed(film: Film, rows: Int[np.ndarray, "M"], ranges: _Ranges, scales_
         before, size = steps, size + len(packed[-1])
         if size > _MOST_BYTES:
             raise ValueError(
-                f"film: expected motion of at most {_MOST_BYTES / 1e6:.0f} MB, since browsers hold no "
-                f"longer text, found more in the first {frame + 1} of {len(film.times)} frames; take fewer "
-                "frames (--frames)"
+                f"film: expected motion of at most {_MOST_BYTES / 1e6:.0f} MB, the most that a browser "
+                f"opens, found more in the first {frame + 1} of {len(film.times)} frames; take fewer frames "
+                "(--frames)"
             )
     return b"".join([*packed, packer.flush()])
 

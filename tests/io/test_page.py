@@ -48,10 +48,13 @@ def test_it_holds_the_scene_and_asks_no_network(tmp_path):
 
 
 def test_more_than_a_browser_holds_is_refused(tmp_path, monkeypatch):
-    monkeypatch.setattr("gsjax.io.page._MOST_BYTES", 10 * 32)
+    monkeypatch.setattr("gsjax.io.page._MOST_GAUSSIANS", 10)
     write_gaussians(tmp_path / "ten.html", make_scene(10))
     with pytest.raises(ValueError, match=r"more\.html: expected at most 10 Gaussians, .* found 11; write"):
         write_gaussians(tmp_path / "more.html", make_scene(11))
+    film = film_of(make_scene(30), scales=False)._replace(at=lambda frame: pytest.fail("wasted work"))
+    with pytest.raises(ValueError, match=r"found 30; write"):
+        write_gaussians(tmp_path / "more.html", make_scene(30), film=film)
     assert not (tmp_path / "more.html").exists()
 
 
