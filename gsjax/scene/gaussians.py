@@ -150,7 +150,7 @@ def gaussians_from_activated(
     count = np.shape(means)[0] if np.ndim(means) else None
     wanted = {"means": 3, "quats": 4, "scales": 3, "opacities": None, "colors": 3}
     arrays = dict(zip(wanted, (means, quats, scales, opacities, colors), strict=True))
-    wide = jnp.promote_types(dtype, jnp.float32)  # in half precision, 1 - 1e-6 is 1
+    wide = jnp.promote_types(jnp.result_type(dtype), jnp.float32)  # in half precision, 1 - 1e-6 is 1
     arrays = {
         name: _on_device(value, dtype if name in ("means", "quats") else wide)
         for name, value in arrays.items()

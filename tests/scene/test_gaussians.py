@@ -49,6 +49,14 @@ def test_extreme_activated_values_stay_finite_in_half_precision(dtype):
         np.testing.assert_array_equal(found, np.asarray(wanted).astype(dtype))
 
 
+@pytest.mark.usefixtures("x64")
+def test_activated_values_stay_in_double_precision():
+    values = activated()
+    np.testing.assert_allclose(
+        gaussians_from_activated(**values, dtype=float).scales, values["scales"], rtol=1e-14
+    )
+
+
 @pytest.mark.parametrize(("degree", "rest"), [(1, 3), (2, 8), (3, 15)])
 def test_sh_joins_its_two_fields(degree, rest):
     gaussians = gaussians_from_activated(**activated(), shN=np.full((5, rest, 3), 2.0))
