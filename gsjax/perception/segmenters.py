@@ -73,7 +73,7 @@ class PlaneSegmenter:
             raise ValueError("depth, K: expected both, found None; without depth use RegionSegmenter")
         if image.shape[:2] != depth.shape:
             raise ValueError(f"depth: expected shape {image.shape[:2]} to match image, found {depth.shape}")
-        valid = np.isfinite(depth) & (depth > 0)
+        valid = _valid(depth)
         if not valid.any():
             raise ValueError(
                 "depth: expected positive, finite pixels, found none; without depth use RegionSegmenter"
@@ -176,7 +176,7 @@ class PlaneOrRegionSegmenter:
         K: Float[np.ndarray, "3 3"] | None = None,
     ) -> Int[np.ndarray, "image_H image_W"]:
         """Labels of an image: 0 for background, then 1, 2, ... by size. Errors are the chosen segmenter's."""
-        if depth is None or K is None or not np.any(np.nan_to_num(depth, posinf=0) > 0):
+        if depth is None or K is None or not _valid(depth).any():
             return self.region(image)
         return self.plane(image, depth, K)
 
@@ -206,9 +206,13 @@ class PieceSegmenter:
     ) -> Int[np.ndarray, "image_H image_W"]:
         """Labels of an image: 0 for background, then 1, 2, ... by size."""
         regions = self.region(image)
-        if depth is not None and K is not None and np.any(np.nan_to_num(depth, posinf=0) > 0):
+        if depth is not None and K is not None and _valid(depth).any():
             regions = np.where(self.plane(image, depth, K) > 0, regions, 0)
         return name_by_size(regions, self.min_pixels)
+
+
+def _valid(depth: Num[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"]:
+    return np.isfinite(depth) & (depth > 0)
 
 
 def _camera_points(depth: np.ndarray, K: np.ndarray) -> Float[np.ndarray, "H W 3"]:

@@ -161,6 +161,8 @@ def test_pieces_are_the_colours_of_what_stands_out():
     assert (pieces[95:, :30] == 0).all()
     flat = PieceSegmenter()(image)
     assert (flat[95:, :30] > 0).all()
+    for nothing in (0.0, np.inf, np.nan):
+        np.testing.assert_array_equal(PieceSegmenter()(image, np.full_like(depth, nothing), K), flat)
 
 
 def test_names_go_by_size_and_specks_are_dropped():
