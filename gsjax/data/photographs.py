@@ -17,6 +17,7 @@ from gsjax.data.validation import (
     check_poses,
     check_shape,
     positions_of,
+    usable_depth,
 )
 from gsjax.geometry.cameras import NEAR, Camera, on_device
 from gsjax.scene.frame import Frame
@@ -183,9 +184,7 @@ class Photographs:
             DataError: as for `image`.
         """
         depth = self._optional(self.load_depth, "depth", i, np.floating)
-        if depth is None:
-            return None
-        return np.where(np.isfinite(depth) & (depth > 0), depth, 0).astype(np.float32)
+        return None if depth is None else usable_depth(depth)
 
     def labels(self, i: int) -> Integer[np.ndarray, "height width"] | None:
         """Label of each pixel, 0 for the background; None without labels.

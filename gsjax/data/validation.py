@@ -17,6 +17,8 @@ _UNIT_TOLERANCE = 1e-2  # on a quaternion's length: files often have few digits
 FARTHEST_MEDIAN_M, NEAREST_MEDIAN_M = 50.0, 0.02
 """A median depth outside this range means a wrong unit rather than an unusual scene."""
 
+_ENDLESS = 1e6  # in any unit; renderers write 1e10 or more where they see nothing
+
 
 def check_shape(name: str, array: np.ndarray, shape: tuple[int, ...]) -> None:
     """Raises ValueError unless an array has the expected shape.
@@ -153,17 +155,20 @@ def check_times(times: Float[np.ndarray, "frames"], *, shared: bool = False) -> 
         )
 
 
+def usable_depth(depth: Float[np.ndarray, "height width"]) -> Float[np.ndarray, "height width"]:
+    """The depth in float32, with pixels set to 0 (invalid) that are not finite, not above 0, or endless."""
+    return np.where((depth > 0) & (depth < _ENDLESS), depth, 0).astype(np.float32)
+
+
 def check_depth(depth: Float[np.ndarray, "height width"], what: str) -> Float[np.ndarray, "height width"]:
-    """The depth with NaN, infinite and negative pixels set to 0 (invalid), after a check of its range.
+    """`usable_depth`, after a check of its range.
 
     Warns with DataWarning if no pixel is valid.
 
     Raises:
         DataError: the median of the valid pixels is above 50 m or below 20 mm: the unit is wrong.
     """
-    with np.errstate(over="ignore"):  # 1e300 of doubles, invalid too
-        depth = depth.astype(np.float32)
-    depth = np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(0))
+    depth = usable_depth(depth)
     valid = depth[depth > 0]
     if valid.size == 0:
         warnings.warn(f"{what}: no pixel has a valid depth", DataWarning, stacklevel=3)

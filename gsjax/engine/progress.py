@@ -131,14 +131,14 @@ class Schedule:
 
 
 def means_of(*names: str) -> Callable[[Tick, list[Mapping[str, Any]]], dict[str, Any]]:
-    """A `Schedule.row` with the mean of each named loss; None if no step had it."""
+    """A `Schedule.row` with the mean of each named loss over the steps that have a finite one; None if none
+    has."""
 
     def row(now: Tick, infos: list[Mapping[str, Any]]) -> dict[str, Any]:
         found = {}
         for name in ("loss", *names):
-            values = [float(info[name]) for info in infos if name in info]
-            mean = float(np.mean(values)) if values else np.nan
-            found[name] = mean if np.isfinite(mean) else None  # JSON has no infinity
+            values = [float(info[name]) for info in infos if name in info and np.isfinite(info[name])]
+            found[name] = float(np.mean(values)) if values else None
         return found
 
     return row

@@ -329,8 +329,8 @@ def test_float_pixels_that_are_not_finite_turn_black_and_lose_their_depth():
 
 
 def test_depth_that_is_not_finite_is_invalid():
-    cleaned = check_depth(np.array([[np.nan, np.inf, -1.0], [1.0, 2.0, 1e300]]), "depth")
-    np.testing.assert_array_equal(cleaned, np.array([[0, 0, 0], [1, 2, 0]], np.float32))
+    cleaned = check_depth(np.array([[np.nan, np.inf, -1.0], [1.0, 1e10, 1e300]]), "depth")
+    np.testing.assert_array_equal(cleaned, np.array([[0, 0, 0], [1, 0, 0]], np.float32))
     assert cleaned.dtype == np.float32
 
 

@@ -60,7 +60,7 @@ class DeformWeightsConfig:
     with its surroundings (ARAP, as in SC-GS). Unused without nodes."""
 
     def __post_init__(self):
-        expect(self, "weights.", **dict.fromkeys(vars(self), (0, np.inf)))
+        expect(self, "weights.", **dict.fromkeys(vars(self), (0, np.inf)) | {"dssim": (0, 1)})
 
 
 @dataclass(frozen=True)

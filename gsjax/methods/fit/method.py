@@ -19,7 +19,7 @@ from gsjax.losses.extra import ExtraLosses, named_losses
 from gsjax.methods.fit.config import FitConfig
 from gsjax.methods.fit.model import Model, extend_state, model_of, refined, with_degree, with_slots
 from gsjax.methods.fit.padding import with_common_sizes
-from gsjax.methods.fit.start import initial_gaussians, start_points
+from gsjax.methods.fit.start import initial_gaussians, start_points, warn_of_hidden
 from gsjax.methods.fit.update import Batch, fit_step, grow, slots_wanted, split
 from gsjax.methods.sampling import shuffled_index
 from gsjax.optim.compiler import host_jit
@@ -101,6 +101,7 @@ class Fit:
             raise ValueError("masks: no pixel counts in any of the photographs to fit; are they inverted?")
         extent = extent_of(np.concatenate([frame.cameras.viewmat for frame in frames]))
         points, colors, source = start_points(frames, cloud, config.start, config.seed)
+        warn_of_hidden(points, frames)
         slots = config.cap if config.strategy == "relocate" else min(config.cap, rung(1.5 * len(points)))
         gaussians = initial_gaussians(points, colors, slots, config.start, config.seed)
         behind = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0), "random": None}

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -291,6 +292,20 @@ def test_starts_that_the_data_does_not_have_are_refused(views):
         Fit(QUICK).start([])
     cloud = (np.zeros((3, 3)), np.full((3, 3), 0.5))
     assert start_points(views, cloud, StartConfig(), 0)[2] == "cloud"
+
+
+def test_a_scene_nearer_than_the_near_plane_is_named(views):
+    def smaller(viewmat):
+        return np.concatenate(
+            [viewmat[..., :3], viewmat[..., 3:] * np.float32([1e-4, 1e-4, 1e-4, 1])[:, None]], -1
+        )
+
+    small = [
+        eqx.tree_at(lambda f: f.cameras.viewmat, frame, smaller(np.asarray(frame.cameras.viewmat)))
+        for frame in without_depth(views)
+    ]
+    with pytest.warns(UserWarning, match=r"nearer to the cameras than their near plane, .* \(--read.near\)"):
+        Fit(QUICK).start(small)
 
 
 def test_a_start_at_random_has_the_colours_of_bytes_and_of_floats(views):
