@@ -97,7 +97,12 @@ def _list_parts(run: Path) -> int:
     """Print the parts that can be edited."""
     with Notes(Console(stderr=True, highlight=False)):
         saved = open_parts_run(run)
-    found = parse_json((run / "metrics.json").read_text(encoding="utf-8"))
+    metrics = run / "metrics.json"
+    if not metrics.is_file():
+        raise FileNotFoundError(
+            f"{run}: expected a scored run, found no metrics.json; finish it with --resume"
+        )
+    found = parse_json(metrics.read_text(encoding="utf-8"))
     print_table(table_of_parts(found))
     video = run / f"video_{saved.camera(None)}.mp4"
     if video.is_file():  # a run that was stopped has none

@@ -64,10 +64,11 @@ _TIMES = {
 }
 _PART_NOTE = (
     "Colours are those of the videos. Joints are fitted to the motion since the canonical frame, in the "
-    "world. 'Off' is against the true part that most of the Gaussians are of; points off is over the "
-    "Gaussians that are truly of it, whatever part they were given to. 'Sure' is how far the motion is from "
-    "where the joint would be called another, or the part free; of a free part, from where it would be on a "
-    "joint."
+    "world. Errors are against the true part that most of the Gaussians are of (without masks, the one that "
+    "moves most alike). Point errors are over all frames and the Gaussians that are truly of it, whatever "
+    "part they were given to (without masks, the frames that show the part and the Gaussians given to it). "
+    "Confidence is how far the motion is from where the joint would be called another, or the part free; of "
+    "a free part, from where it would be on a joint."
 )
 
 

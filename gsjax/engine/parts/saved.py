@@ -21,7 +21,7 @@ from gsjax.methods.parts.timeline import Names
 from gsjax.scene.handles import Blend, HandlePose
 from gsjax.scene.origin import in_world, rebased, relative_to
 
-_FILES = ("parts.npz", "scene.ply", "metrics.json")
+_FILES = ("parts.npz", "scene.ply")
 _ARRAYS = {
     "anchor": (),
     "weights": ("N", "P"),
@@ -130,7 +130,9 @@ def _read(path: Path) -> tuple[Layer, dict[str, int], bool, Float[np.ndarray, "3
     arrays = _arrays(path / "parts.npz")
     num, parts = arrays["weights"].shape
     anchor, frames = int(arrays["anchor"]), len(arrays["times"])
-    names, followed = _of_metrics(path / "metrics.json", frames)
+    names, followed = {f"part {part}": part for part in range(1, parts)}, frames
+    if (metrics := path / "metrics.json").is_file():  # written last, after scoring, which takes minutes
+        names, followed = _of_metrics(metrics, frames)
     gaussians, origin = read_scene(path, num, "parts.npz", _AGAIN)
     arrays["centres"] = relative_to(arrays["centres"], origin)
     # The other frames hold the poses of the anchor.

@@ -45,7 +45,7 @@ def part_rows(
                 "part": part,
                 "name": f"part {part}",
                 "gaussians": len(mine),
-                "moved_mm": _farthest_mm(motions[:, part], mine),
+                "moved_mm": float(_moved_mm(motions[:, part], mine).max()),
                 "kind": fitted.kind,
                 "range": None if opens is None else (np.degrees(opens) if turns else 1000 * opens),
                 "axis": None if fitted.joint is None else fitted.joint.axis.tolist(),
@@ -116,11 +116,8 @@ def score_parts(
     # An object without Gaussians is judged by points around its true position: if it moves, it was missed.
     ways = {k: relative_motion(pose, anchor) for k, pose in poses.items()}
     around = {k: pose[anchor, :3, 3] + _AROUND for k, pose in poses.items()}
-    far = {k: _farthest_mm(ways[k], means[labels == k] if k in labels else around[k]) for k in poses}
-    moving = [label for label in poses if far[label] > _STILL_MM]
-    still = [truth.names[list(poses).index(label)] for label in poses if label not in moving]
-    if still:
-        notes.add(f"Counted as background, because they do not move: {', '.join(still)}.")
+    moved = {k: _moved_mm(ways[k], means[labels == k] if k in labels else around[k]) for k in poses}
+    moving = [label for label in poses if moved[label].max() > _STILL_MM]
     known = np.where(np.isin(labels, [-1, *moving]), labels, BACKGROUND)
     found, there = np.asarray(scene.labels), np.asarray(trajectory.opacities) > 0
     match = match_parts(found, known)
@@ -137,8 +134,7 @@ def score_parts(
         row["moved_mm"] = scores[label].moved_mm
         _score_joint(row, joints[part], joint_of[label], means[found == part], anchor, there[:, part])
     missed = [names[label] for label in moving if label not in pairs]
-    if missed:
-        notes.warn(f"moving objects that no part was found for: {', '.join(missed)}")
+    _note_unmatched([names[label] for label in poses if label not in moving], missed, notes)
     return {
         "ari": adjusted_rand_index(found, known),
         "true_parts": len(moving),
@@ -177,28 +173,30 @@ def _score_joints(
     means, labels = np.asarray(scene.gaussians.means, np.float64), np.asarray(scene.labels)
     motions, there = motions_in_world(scene, trajectory), np.asarray(trajectory.opacities) > 0
     ways = {k: relative_motion(truth.poses[:, k], anchor) for k in range(len(truth.names))}
-    still = [truth.names[k] for k, way in ways.items() if _farthest_mm(way, means) <= _STILL_MM]
-    if still:
-        notes.add(f"Counted as background, because they do not move: {', '.join(still)}.")
-    ways = {k: way for k, way in ways.items() if truth.names[k] not in still}
-    found: set[str] = set()
+    moving = {k: way for k, way in ways.items() if _moved_mm(way, means).max() > _STILL_MM}
+    left = dict(moving)
     for row in sorted(rows, key=lambda row: -row["gaussians"]):
-        points = means[labels == row["part"]]
-        left = {k: way for k, way in ways.items() if truth.names[k] not in found}
+        points, shown = means[labels == row["part"]], there[:, row["part"]]
         if not len(points) or not left:
             continue
         back = np.linalg.inv(motions[:, row["part"]])  # rigid: |motion x - way x| = |x - back way x|
-        off = {k: _farthest_mm(back @ way, points) for k, way in left.items()}
-        best = min(off, key=off.__getitem__)
-        if off[best] < 0.5 * row["moved_mm"]:
-            found.add(truth.names[best])
-            row |= {"true_name": truth.names[best], "point_error_mm": off[best]}
-            shown = there[:, row["part"]]
+        off = {k: _moved_mm((back @ way)[shown], points) for k, way in left.items()}
+        best = min(off, key=lambda k: off[k].max())
+        if off[best].max() < 0.5 * row["moved_mm"]:
+            del left[best]
+            row |= {"true_name": truth.names[best], "point_error_mm": float(off[best].mean())}
             _score_joint(row, joints[row["part"]], truth.joints[best], points, anchor, shown)
-    missed = [truth.names[k] for k in ways if truth.names[k] not in found]
+    missed = [truth.names[k] for k in left]
+    _note_unmatched([truth.names[k] for k in ways if k not in moving], missed, notes)
+    return {"true_parts": len(moving), "missed": missed}
+
+
+def _note_unmatched(still: list[str], missed: list[str], notes: Notes) -> None:
+    """Note which true parts count as background, and warn of moving ones that were not found."""
+    if still:
+        notes.add(f"Counted as background, because they do not move: {', '.join(still)}.")
     if missed:
         notes.warn(f"moving objects that no part was found for: {', '.join(missed)}")
-    return {"true_parts": len(ways), "missed": missed}
 
 
 def _tracks(scene: PartScene, trajectory: Trajectory, blend: Blend) -> Float[np.ndarray, "T N 3"]:
@@ -207,9 +205,11 @@ def _tracks(scene: PartScene, trajectory: Trajectory, blend: Blend) -> Float[np.
     return np.stack([means(moment(trajectory, t)) for t in range(len(trajectory.times))])
 
 
-def _farthest_mm(motions: Float[np.ndarray, "T 4 4"], points: Float[np.ndarray, "n 3"]) -> float:
-    """The largest displacement over time, averaged over the points; 0 without points."""
+def _moved_mm(
+    motions: Float[np.ndarray, "T 4 4"], points: Float[np.ndarray, "n 3"]
+) -> Float[np.ndarray, "T"]:
+    """How far the points are displaced at each time, on average; 0 without points."""
     if not len(points):
-        return 0.0
+        return np.zeros(len(motions))
     moved = np.einsum("tij,nj->tni", motions[:, :3, :3], points) + motions[:, None, :3, 3]
-    return 1000 * float(np.linalg.norm(moved - points, axis=-1).mean(-1).max())
+    return 1000 * np.linalg.norm(moved - points, axis=-1).mean(-1)

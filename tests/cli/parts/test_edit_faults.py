@@ -94,6 +94,13 @@ def test_what_is_no_film_is_left_alone(gsjax, run, tmp_path, file):
     assert mine.read_text() == "mine"
 
 
+def test_parts_are_listed_once_they_are_scored(gsjax, run):
+    (run / "metrics.json").unlink()
+    code, said = gsjax("edit", run)
+    assert code == 2
+    assert "expected a scored run, found no metrics.json; finish it with --resume" in said
+
+
 def _of_track(run):
     (run / "parts.npz").unlink()
     (run / "metrics.json").write_text('{"kind": "track"}')

@@ -152,6 +152,15 @@ def test_parts_without_their_recording(tmp_path, notes):
     assert any("its recording is not shown" in note for note in notes.all)
 
 
+def test_parts_without_scores_yet_are_shown(tmp_path, notes):
+    write_parts_run(tmp_path / "parts")
+    (tmp_path / "parts" / "metrics.json").unlink()
+    scene, _ = open_viewable(tmp_path / "parts", notes)
+    assert (scene.num_frames, len(scene.shots.names)) == (4, 3)
+    assert scene.name_of(int(np.flatnonzero(scene.labels == 1)[0])) == "part 1"
+    assert notes.all == []
+
+
 def test_a_ply_file(ply, notes):
     scene, folder = open_viewable(ply, notes)
     assert folder == ply.parent
