@@ -103,7 +103,8 @@ def exploration(
     Args:
         gaussians: Gaussians in all slots.
         key: random key for eta.
-        amount: learning rate of the means times the strength of the noise.
+        amount: learning rate of the means times the strength of the noise. The noise is the product of it
+            and a square of sizes; divide it by the square of the scene's radius for all to be in radii.
     """
     spread = jax.random.normal(key, gaussians.means.shape, gaussians.means.dtype)
     rotations = quats_to_matrices(gaussians.quats)

@@ -66,7 +66,8 @@ class GrowthConfig:
     factor: float = 1.05
     """Growth of the number of Gaussians at each relocation, up to the cap."""
     noise: float = 5e5
-    """Noise on the positions of nearly transparent Gaussians, relative to the learning rate of the means."""
+    """Noise on the positions of nearly transparent Gaussians, relative to the learning rate of the means and
+    the square of their sizes, all in scene radii."""
     opacity_cost: float = 0.01
     """Weight of the mean opacity in the loss, which frees Gaussians that are not needed."""
     scale_cost: float = 0.01

@@ -145,7 +145,7 @@ def fit_step(config: FitConfig, extra_losses: ExtraLosses = ()) -> Step:
         before, after = params.gaussians, moved.gaussians
         means = before.means + rate * (after.means - before.means)
         if config.strategy == "relocate":
-            walk = exploration(after, key, config.growth.noise * rate)
+            walk = exploration(after, key, config.growth.noise * rate / radius**2)
             means += jnp.where(is_alive(after)[:, None] & ~info["skipped"], walk, 0.0)
         moved = eqx.tree_at(lambda m: m.gaussians.means, moved, means)
         if moved.twists is not None:

@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -294,18 +293,28 @@ def test_starts_that_the_data_does_not_have_are_refused(views):
     assert start_points(views, cloud, StartConfig(), 0)[2] == "cloud"
 
 
-def test_a_scene_nearer_than_the_near_plane_is_named(views):
-    def smaller(viewmat):
-        return np.concatenate(
-            [viewmat[..., :3], viewmat[..., 3:] * np.float32([1e-4, 1e-4, 1e-4, 1])[:, None]], -1
-        )
+def in_unit(views: list[Frame], unit: float) -> list[Frame]:
+    """The views without depth, with poses in another unit: one metre is `unit`."""
+    scale = np.array([unit, unit, unit, 1])[:, None]
+    mats = [np.concatenate([m[..., :3], m[..., 3:] * scale], -1) for m in (v.cameras.viewmat for v in views)]
+    return [having(view, depths=None, viewmat=mat) for view, mat in zip(views, mats, strict=True)]
 
-    small = [
-        eqx.tree_at(lambda f: f.cameras.viewmat, frame, smaller(np.asarray(frame.cameras.viewmat)))
-        for frame in without_depth(views)
-    ]
+
+def test_a_scene_nearer_than_the_near_plane_is_named(views):
     with pytest.warns(UserWarning, match=r"nearer to the cameras than their near plane, .* \(--read.near\)"):
-        Fit(QUICK).start(small)
+        Fit(QUICK).start(in_unit(views, 1e-4))
+
+
+@pytest.mark.thorough
+def test_a_fit_does_not_depend_on_the_unit_of_the_poses(views):
+    """Regression test: the noise on positions grew with its cube, and blew up a scene in millimetres."""
+    config = replace(QUICK, start=StartConfig(source="random", count=100))
+    fits = [fitted_to(in_unit(views, unit), config) for unit in (1.0, 1000.0)]
+    for _ in zip(*fits, strict=True):
+        pass
+    means, others = (np.asarray(ticks.result.means) for ticks in fits)
+    np.testing.assert_allclose(others / 1000, means, atol=0.02)
+    assert np.median(np.abs(others / 1000 - means)) < 1e-3
 
 
 def test_a_start_at_random_has_the_colours_of_bytes_and_of_floats(views):
