@@ -89,8 +89,8 @@ def warn_of_hidden(points: Float[np.ndarray, "m 3"], frames: list[Frame]) -> Non
     ahead, near = depths > 0, frames[0].cameras.near
     if ahead.any() and (depths < near)[ahead].mean() > _HIDDEN:
         warnings.warn(
-            f"most of the scene is nearer to the cameras than their near plane, {near:g}, and is not drawn: is "
-            "the unit of the poses far larger than the scene? Set near (--read.near) to less than "
+            f"most of the scene is nearer to the cameras than their near plane, {near:g}, and is not drawn: "
+            "is the unit of the poses far larger than the scene? Set near (--read.near) to less than "
             f"{np.median(depths[ahead]):.2g}",
             stacklevel=2,
         )
