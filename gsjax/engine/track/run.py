@@ -102,6 +102,7 @@ def run(options: Options) -> int:
         kept = folder.path / KEPT_MASK
         masks = kept if options.resume and isinstance(options.masks, Path) else settings.masks
         mask = first_mask(recording.tracked, options.mask_camera, masks, options.scale)
+        tracking = load(folder.resume, options.track) if options.resume else None
         folder.write_config(settings)  # from here on an earlier run is gone
         if mask.source == PICTURE and mask.labels is not None:
             recording = without_own_objects(recording)
@@ -111,8 +112,7 @@ def run(options: Options) -> int:
         rehearsal = Rehearsal(
             first, options.track, options.budget_ms is not None, needed=recording.tracked.num_frames > 1
         )
-        if options.resume:
-            tracking = load(folder.resume, options.track)
+        if tracking is not None:
             notes.add(f"Resumed after {counted(tracking.resumed, 'frame')} of an earlier run.")
         else:
             with drawing_ahead(recording):

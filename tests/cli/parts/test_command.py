@@ -148,6 +148,21 @@ def test_a_run_that_was_stopped_goes_on_to_the_same_bits(gsjax_parts, tmp_path, 
 
 
 @pytest.mark.thorough
+def test_a_run_that_cannot_be_resumed_stays_as_it_was(gsjax_parts, tmp_path, monkeypatch):
+    monkeypatch.setattr(gsjax.engine.parts.run, "run_fit", lambda options: 130)
+    run, given = tmp_path / "run", (*QUICK, "--anchor", "0")
+    assert gsjax_parts(*given)[0] == 130
+    (run / "resume").mkdir()
+    for name in ("resume/parts.npz", "report.html"):
+        (run / name).write_text("of another version")
+    before = {file: file.read_bytes() for file in run.rglob("*.*") if file.is_file()}
+    code, said = gsjax_parts(*given, "--resume")
+    assert code == 2, said
+    assert "found one of another version of gsjax" in " ".join(said.split())
+    assert {file: file.read_bytes() for file in run.rglob("*.*") if file.is_file()} == before
+
+
+@pytest.mark.thorough
 def test_what_cannot_be_done_is_said(gsjax_parts, tmp_path):
     code, said = gsjax_parts("--cameras", "1", "--frames", "0:3")
     assert code == 2

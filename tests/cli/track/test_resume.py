@@ -73,6 +73,20 @@ def test_other_options_are_no_resuming(pristine, gsjax_track, still, tmp_path):
 
 
 @pytest.mark.thorough
+def test_a_run_that_cannot_be_resumed_stays_as_it_was(pristine, gsjax_track, still, tmp_path):
+    assert gsjax_track(pristine, "--cameras", "0")[0] == 0
+    run = tmp_path / "run"
+    (run / "resume").mkdir()
+    for name in ("metrics.json", "resume/state.npz"):  # as if it had been stopped
+        (run / name).write_text('{"complete": false}')
+    before = {file: file.read_bytes() for file in run.rglob("*.*") if file.is_file()}
+    code, said = gsjax_track(pristine, "--cameras", "0", "--resume")
+    assert code == 2
+    assert "state.npz: expected a checkpoint, found a file that cannot be read as one" in said
+    assert {file: file.read_bytes() for file in run.rglob("*.*") if file.is_file()} == before
+
+
+@pytest.mark.thorough
 def test_a_full_disk_is_said_and_tracking_goes_on(pristine, gsjax_track, still, monkeypatch):
     def full(path, *_):
         raise OSError(errno.ENOSPC, "No space left on device", str(path))
