@@ -276,7 +276,7 @@ def load_run(folder: Path, run: Run, progress: Progress) -> tuple[Run, Progress]
     if not saved and (other := sorted(folder.glob("*.npz"))):
         raise CheckpointError(
             f"{other[0]}: expected a checkpoint step-*.npz, found one of another version of gsjax; start "
-            "again without --resume"
+            "again with --overwrite in place of --resume"
         )
     for path in reversed(saved):
         try:

@@ -14,6 +14,7 @@ from gsjax.io.checkpoints import CheckpointError, load_checkpoint, save_checkpoi
 from gsjax.methods.track import Pose, Track, TrackConfig, first_pose
 
 _PER_UPDATE = ("visible", "lost", "turn_known", "agrees")
+_AGAIN = "start again with --overwrite in place of --resume"
 
 
 class Saver:
@@ -63,14 +64,12 @@ def load(folder: Path, config: TrackConfig) -> Tracking:
     path = folder / "state.npz"
     if not path.is_file():
         raise ValueError(
-            f"--resume: {folder.parent} was stopped before its first update, so nothing was saved; start "
-            "again with --overwrite in place of it"
+            f"--resume: {folder.parent} was stopped before its first update, so nothing was saved; {_AGAIN}"
         )
     tree, found = load_checkpoint(path)
     if missing := [name for name in _PER_UPDATE if name not in found]:
         raise CheckpointError(
-            f"{path}: expected {missing[0]} of each update, found a run of another version of gsjax; start "
-            "again without --resume"
+            f"{path}: expected {missing[0]} of each update, found a run of another version of gsjax; {_AGAIN}"
         )
     scene, run = tree["scene"], tree["run"]
     chosen = run.kept.chosen
@@ -96,12 +95,12 @@ def _saved_poses(folder: Path, frames: int, like: Pose) -> list[Pose]:
     poses = []
     for path in _parts(folder):
         if _frames_of(path) <= frames:
-            part = read_arrays(path, ("means", "quats"), "start again without --resume")
+            part = read_arrays(path, ("means", "quats"), _AGAIN)
             rows = zip(part["means"], part["quats"], strict=True)  # on the host, as `follow` keeps them
             poses.extend(jax.tree.unflatten(jax.tree.structure(like), row) for row in rows)
     if len(poses) != frames - 1:
         raise CheckpointError(
-            f"{folder}: expected the poses of {frames - 1} updates, found {len(poses)}; parts are missing. "
-            "Start again without --resume"
+            f"{folder}: expected the poses of {frames - 1} updates, found {len(poses)}; parts are missing; "
+            f"{_AGAIN}"
         )
     return poses
