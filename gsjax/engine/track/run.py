@@ -173,7 +173,7 @@ def _evaluate(
     notes: Notes,
     console: Console,
     budget_ms: float | None,
-) -> tuple[dict[str, Any], dict[str, list[Media]], Exception | None]:
+) -> tuple[dict[str, Any], dict[str, list[Media]], BaseException | None]:
     """Render and score what was tracked. Ctrl-C or an error ends it; what was scored by then counts.
 
     Returns:
@@ -190,12 +190,12 @@ def _evaluate(
     except (KeyboardInterrupt, Exception) as error:
         scored = f"{scores.num_frames} of {tracking.num_frames} frames"
         notes.warn(f"scoring was stopped after {scored} by {reason(error)}")
-        failed = error if isinstance(error, Exception) else None
+        failed = error
     true_labels = first_labels(tracking, recording)
     motion = score_motion(tracking, recording, true_labels)
     names = object_names(tracking, recording, values)
     seconds["evaluation"] = perf_counter() - begun
-    found = _run_metrics(tracking, recording, mask, scores, budget_ms)
+    found = _run_metrics(tracking, recording, mask, scores, budget_ms, tracking.stopped or failed)
     found |= metrics(tracking, recording, mask, scores, motion, values, true_labels)
     _note_unscored(found, tracking, recording, mask, values, notes)
     _note_lost(found, tracking, values, names, notes)
@@ -207,7 +207,12 @@ def _evaluate(
 
 
 def _run_metrics(
-    tracking: Tracking, recording: Recording, mask: FirstMask, scores: Scores, budget_ms: float | None
+    tracking: Tracking,
+    recording: Recording,
+    mask: FirstMask,
+    scores: Scores,
+    budget_ms: float | None,
+    stopped: BaseException | None,
 ) -> dict[str, Any]:
     """The part of metrics.json about what ran, and how fast."""
     sequence, updates = recording.tracked, np.asarray(tracking.update_s[1:]) * 1e3
@@ -222,8 +227,7 @@ def _run_metrics(
     return {
         "kind": "track",
         "dataset": sequence.name,
-        **completion(tracking.stopped),
-        "complete": tracking.stopped is None and scores.num_frames == tracking.num_frames,
+        **completion(stopped),
         "frames": {
             "tracked": tracking.num_frames,
             "asked": sequence.num_frames,
