@@ -17,6 +17,7 @@ from gsjax.engine.files import read_drawable
 from gsjax.engine.fit.run import Options as FitOptions
 from gsjax.engine.fit.run import run as run_fit
 from gsjax.engine.folder import RunFolder, expect_dataset, expect_run, is_finished, is_run
+from gsjax.engine.inputs import Inputs, recording_digest
 from gsjax.engine.locks import releasing_locks
 from gsjax.engine.messages import Notes, counted, stage
 from gsjax.engine.options import RESUME_MAY_CHANGE, OfRecording, SamWeights, Seeded, checked
@@ -87,9 +88,10 @@ def run(options: Options) -> int:
             folder.check_config(settings, but=RESUME_MAY_CHANGE)
         scene = None if options.scene is None else _ply_of(options.scene)
         tracked = recording.tracked
+        data = recording_digest(tracked, tracked.frame(0))
         if options.resume:  # what cannot be resumed stays as it was
             fitted = folder.path / _CANONICAL / "scene.ply" if scene is None else scene
-            load_run(folder.resume, Run(None, None), Progress(_inputs(fitted)))
+            load_run(folder.resume, Run(None, None), Progress(_inputs(data, fitted)))
         gaussians = None if scene is None else _read_scene(scene, tracked, notes)
         seconds: dict[str, float] = {}
         with stage(console, "detecting motion"):
@@ -115,7 +117,7 @@ def run(options: Options) -> int:
         method = Parts(options.parts)
         problem, first = method.start(tracked, start)
         seconds["discovery"] = perf_counter() - at
-        progress = Progress(_inputs(scene))
+        progress = Progress(_inputs(data, scene))
         if options.resume:
             first, progress = load_run(folder.resume, first, progress)
             followed = int(method.result(problem, first).done.sum())
@@ -134,9 +136,9 @@ def run(options: Options) -> int:
     return exit_code(progress.stopped)
 
 
-def _inputs(scene: Path) -> dict[str, str | None]:
-    """Digests of what a run starts from, by their descriptions."""
-    return {"the canonical scene": digest(scene)}
+def _inputs(data: str, scene: Path) -> Inputs:
+    """Digests of what a run is given, by their descriptions."""
+    return {"the recording": data, "the canonical scene": digest(scene)}
 
 
 def _check(options: Options, recording: Recording) -> None:

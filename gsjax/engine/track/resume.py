@@ -8,6 +8,7 @@ import numpy as np
 from gsjax.engine import saving
 from gsjax.engine.drive import Tick
 from gsjax.engine.files import read_arrays
+from gsjax.engine.inputs import Inputs, expect_same
 from gsjax.engine.track.loop import Tracking
 from gsjax.io.atomic import write_npz
 from gsjax.io.checkpoints import CheckpointError, load_checkpoint, save_checkpoint
@@ -22,11 +23,13 @@ class Saver:
 
     Args:
         folder: RUN/resume.
+        about: digests of the run's inputs, by their descriptions.
         saved: number of frames stored there already.
     """
 
-    def __init__(self, folder: Path, saved: int = 0):
-        self._folder, self._saved, self._save = folder, saved, saving.Saver("tracking")
+    def __init__(self, folder: Path, about: Inputs, saved: int = 0):
+        self._folder, self._about, self._saved = folder, about, saved
+        self._save = saving.Saver("tracking")
 
     def __call__(self, tracking: Tracking, *, last: bool) -> None:
         """Save if the last save is long enough ago or this is the last one; warn if it cannot be written."""
@@ -43,6 +46,7 @@ class Saver:
             part = self._folder / f"poses_{tracking.num_frames:06d}.npz"  # up to this many frames
             write_npz(part, {"means": poses.means, "quats": poses.quats})
         metadata = {
+            "about": dict(self._about),
             "frames": tracking.num_frames,
             "joined": tracking.joined,
             "update_s": tracking.update_s,
@@ -55,11 +59,17 @@ class Saver:
         self._saved = tracking.num_frames
 
 
-def load(folder: Path, config: TrackConfig) -> Tracking:
+def load(folder: Path, config: TrackConfig, about: Inputs) -> Tracking:
     """The tracking saved in a folder RUN/resume by a run with this config.
 
+    Args:
+        folder: RUN/resume.
+        config: the settings of the tracker.
+        about: digests of the inputs, by their descriptions.
+
     Raises:
-        ValueError: nothing was saved there, or it is damaged, or of another version of gsjax.
+        ValueError: nothing was saved there, or it is damaged, or of another version of gsjax; or the run was
+            started with other inputs.
     """
     path = folder / "state.npz"
     if not path.is_file():
@@ -71,6 +81,7 @@ def load(folder: Path, config: TrackConfig) -> Tracking:
         raise CheckpointError(
             f"{path}: expected {missing[0]} of each update, found a run of another version of gsjax; {_AGAIN}"
         )
+    expect_same(found.pop("about", {}), about, folder.parent)
     scene, run = tree["scene"], tree["run"]
     chosen = run.kept.chosen
     start = jax.device_get(first_pose(scene))

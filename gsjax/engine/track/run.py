@@ -20,6 +20,7 @@ from gsjax.engine.first_mask import (
     without_own_objects,
 )
 from gsjax.engine.folder import RunFolder, expect_dataset
+from gsjax.engine.inputs import recording_digest
 from gsjax.engine.locks import releasing_locks
 from gsjax.engine.machine import describe as describe_machine
 from gsjax.engine.messages import FITTING, Notes, counted, reason, stage
@@ -102,13 +103,14 @@ def run(options: Options) -> int:
         kept = folder.path / KEPT_MASK
         masks = kept if options.resume and isinstance(options.masks, Path) else settings.masks
         mask = first_mask(recording.tracked, options.mask_camera, masks, options.scale)
-        tracking = load(folder.resume, options.track) if options.resume else None
+        first = recording.tracked.frame(0)
+        about = {"the recording": recording_digest(recording.tracked, first)}
+        tracking = load(folder.resume, options.track, about) if options.resume else None
         folder.write_config(settings)  # from here on an earlier run is gone
         if mask.source == PICTURE and mask.labels is not None:
             recording = without_own_objects(recording)
             write_png(kept, mask.labels.astype(np.uint16))
         seconds = {"preparing": perf_counter() - begun}
-        first = recording.tracked.frame(0)
         rehearsal = Rehearsal(
             first, options.track, options.budget_ms is not None, needed=recording.tracked.num_frames > 1
         )
@@ -118,7 +120,7 @@ def run(options: Options) -> int:
             with drawing_ahead(recording):
                 scene, seconds["start"] = _start(recording, mask, rehearsal, console, notes)
             tracking = begin(scene)
-        saver = Saver(folder.resume, tracking.resumed)
+        saver = Saver(folder.resume, about, tracking.resumed)
         drawing = perf_counter()
         draw_ahead(recording, console)
         seconds["preparing"] += perf_counter() - drawing

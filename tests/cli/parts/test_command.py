@@ -11,9 +11,11 @@ import gsjax.engine.parts.run
 from gsjax.cli import main
 from gsjax.data.video import describe_video
 from gsjax.engine.drive import Drive
+from gsjax.engine.progress import Progress, save_run
 from gsjax.engine.recording import chosen_recording
 from gsjax.io.ply import read_ply
 from gsjax.methods.parts import order_of_frames
+from gsjax.optim.method import Run
 from gsjax.viz.colors import label_color
 
 SCENE = "simulated:hard_parts?case=small&amount=0.05&width=96&height=72&cameras=4"
@@ -152,13 +154,12 @@ def test_a_run_that_cannot_be_resumed_stays_as_it_was(gsjax_parts, tmp_path, mon
     monkeypatch.setattr(gsjax.engine.parts.run, "run_fit", lambda options: 130)
     run, given = tmp_path / "run", (*QUICK, "--anchor", "0")
     assert gsjax_parts(*given)[0] == 130
-    (run / "resume").mkdir()
-    for name in ("resume/parts.npz", "report.html"):
-        (run / name).write_text("of another version")
+    (run / "report.html").touch()
+    save_run(run / "resume", Run(None, None), Progress({"the recording": "another"}))
     before = {file: file.read_bytes() for file in run.rglob("*.*") if file.is_file()}
     code, said = gsjax_parts(*given, "--resume")
     assert code == 2, said
-    assert "found one of another version of gsjax" in " ".join(said.split())
+    assert "the recording: expected the same as when the run in" in " ".join(said.split())
     assert {file: file.read_bytes() for file in run.rglob("*.*") if file.is_file()} == before
 
 
