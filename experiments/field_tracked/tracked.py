@@ -13,6 +13,7 @@ from experiments.shared.recordings import recorded
 from gsjax.data.simulated.flawed_masks import Flaws
 from gsjax.engine.distill.scene import scene_of_run
 from gsjax.engine.distill.scores import ClassScores, class_maps
+from gsjax.engine.folder import is_finished
 from gsjax.engine.track.saved import open_run
 from gsjax.methods.distill import DistillConfig, FeatureField, features_of, frozen_views
 from gsjax.methods.track import place
@@ -25,7 +26,7 @@ def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
     """Track a recording with the field of its first frame, and score labels and features against the true
     masks of a held-out camera; for comparison, the same with Gaussians that never move."""
     path = folder.parents[1] / "field_scenes" / f"{options['recording']}_all"
-    if not (path / "report.html").is_file():
+    if not is_finished(path):
         words = ["track", recorded(options["recording"]), "--out", path, "--overwrite"]
         words += [
             "--preset",

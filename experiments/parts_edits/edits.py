@@ -11,6 +11,7 @@ import numpy as np
 
 from experiments.shared.discoveries import Options, canonical_of, run_parts
 from experiments.shared.recordings import recorded
+from gsjax.engine.folder import is_finished
 from gsjax.engine.parts.saved import PartsRun, open_parts_run, read_parts
 from gsjax.geometry.cameras import Camera
 from gsjax.io.video import VideoWriter
@@ -178,7 +179,7 @@ def _rigid(center: Any, at: Moment, part: int) -> np.ndarray:
 def _discovered(folder: Path) -> Path:
     """A run of `gsjax parts`, made once for all edits."""
     path = folder.parent / "discovered"
-    if not (path / "report.html").is_file():
+    if not is_finished(path):
         options = Options(str(recorded("articulated_0")), path, eval_cameras=HELD_OUT, anchor=ANCHOR)
         run_parts(replace(options, overwrite=True, scene=canonical_of(options, folder)))
     return path

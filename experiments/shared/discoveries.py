@@ -16,6 +16,7 @@ from jaxtyping import Float, Int
 from gsjax.data import Sequence
 from gsjax.engine.fit.run import Options as FitOptions
 from gsjax.engine.fit.run import run as run_fit
+from gsjax.engine.folder import is_finished
 from gsjax.engine.parts.run import Options
 from gsjax.engine.parts.run import run as run_parts
 from gsjax.engine.parts.saved import open_parts_run
@@ -44,7 +45,7 @@ def canonical_of(options: Options, folder: Path) -> Path:
     wanted = f"{options.dataset} {options.cameras} {options.eval_cameras} {frame} {options.fit}"
     wanted += f" {options.scale} {options.read}"
     path = folder.parent / f"canonical-{hashlib.sha256(wanted.encode()).hexdigest()[:8]}"
-    if not (path / "report.html").is_file():
+    if not is_finished(path):
         run_fit(
             FitOptions(
                 options.dataset,

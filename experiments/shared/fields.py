@@ -20,6 +20,7 @@ from gsjax.engine.distill.scores import ClassScores, class_maps, classes_of
 from gsjax.engine.drive import drive
 from gsjax.engine.fit.run import Options as FitOptions
 from gsjax.engine.fit.run import run as run_fit
+from gsjax.engine.folder import is_finished
 from gsjax.geometry.cameras import pixels_of
 from gsjax.methods.distill import (
     Distill,
@@ -52,7 +53,7 @@ def fitted(
 ) -> FieldScene:
     """The first frame of a recording, fitted by `gsjax fit` once for all experiments."""
     path = folder.parents[1] / "field_scenes" / name
-    if not (path / "report.html").is_file():
+    if not is_finished(path):
         options.setdefault("fit", PRESETS[preset])
         run_fit(FitOptions(str(recorded(name)), path, eval_cameras=eval_cameras, overwrite=True, **options))
     return scene_of_run(path)
@@ -63,7 +64,7 @@ def first_tracked(
 ) -> FieldScene:
     """The scene that `gsjax track` starts from, for few cameras: one Gaussian for each depth point."""
     path = folder.parents[1] / "field_scenes" / f"{name}_tracked"
-    if not (path / "report.html").is_file():
+    if not is_finished(path):
         words = ["track", recorded(name), "--out", path, "--frames", "0:2", "--overwrite"]
         words += [
             "--preset",

@@ -12,7 +12,7 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
-from typing import Any, no_type_check
+from typing import Any, NoReturn, no_type_check
 
 UNINTERRUPTIBLE = frozenset({"called_by_xla", "shielded"})
 """Functions that Ctrl-C waits for: callbacks of XLA, which drops exceptions, and `shielded` calls."""
@@ -20,6 +20,7 @@ RETRY_S = 0.01
 _SIGNALS = ("SIGINT", "SIGTERM", "SIGHUP")
 _waiting = threading.Event()  # one per process, as signals are
 _newest = ["SIGINT"]
+_raised: list[str] = []  # the signal of each KeyboardInterrupt so far
 
 
 @no_type_check  # a type-checking wrapper could be interrupted after the call has ended
@@ -34,8 +35,26 @@ def raise_if_interrupted() -> None:
     """Raises KeyboardInterrupt if Ctrl-C is pending: the gaps between shielded calls are too short for the
     timer."""
     if _waiting.is_set():
-        _clear()
-        raise KeyboardInterrupt(*_newest)
+        _raise()
+
+
+def _raise() -> NoReturn:
+    """Raises KeyboardInterrupt with the name of the newest signal."""
+    _clear()
+    _raised.append(*_newest)
+    raise KeyboardInterrupt(*_newest)
+
+
+@contextmanager
+def raised_again() -> Iterator[None]:
+    """Raises KeyboardInterrupt at the end of the block if one was raised in it, even if it was caught there,
+    as a run does to write what it has."""
+    before = len(_raised)
+    try:
+        yield
+    finally:
+        if len(_raised) > before:
+            raise KeyboardInterrupt(_raised[-1])
 
 
 def _clear() -> None:
@@ -75,8 +94,7 @@ def handled_interrupts() -> Iterator[None]:
         if is_uninterruptible(frame):
             try_again()
         else:
-            _clear()
-            raise KeyboardInterrupt(*_newest)
+            _raise()
 
     def try_again() -> None:
         _waiting.set()

@@ -108,6 +108,22 @@ def lock(folder: Path, *, shared: bool = False) -> None:
     _scope.get().enter_context(locked(folder, shared=shared))
 
 
+def share(folder: Path) -> None:
+    """Share a folder that this process has locked. Those who add to it may then write too; those who want it
+    for themselves are still refused.
+
+    Args:
+        folder: the folder.
+
+    Raises:
+        BlockingIOError: another process locked it meanwhile, since a lock is released before it is shared.
+    """
+    path = folder.resolve() / LOCK
+    held = _held[path]
+    held.writer = replace(held.writer, shared=True)
+    _claim(held.file, folder, path, held.writer)
+
+
 @contextmanager
 def locked(folder: Path, part: str = "", *, shared: bool = False) -> Iterator[None]:
     """Lock a folder, or a part of it, while the block runs. A process may take the same lock twice.

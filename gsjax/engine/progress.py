@@ -20,6 +20,7 @@ from gsjax.engine.budget import Budget
 from gsjax.engine.drive import COMPILING, Drive, Tick
 from gsjax.engine.ending import completion
 from gsjax.engine.folder import RunFolder
+from gsjax.engine.inputs import Inputs, expect_same
 from gsjax.engine.interrupts import raise_if_interrupted, shielded
 from gsjax.engine.messages import Notes, counted, reason
 from gsjax.engine.saving import Saver
@@ -52,7 +53,7 @@ class Progress:
         pace: recent steps per second; 0 before any is known.
     """
 
-    about: Mapping[str, str | None] = field(default_factory=dict)
+    about: Inputs = field(default_factory=dict)
     rows: list[dict[str, Any]] = field(default_factory=list)
     recent: list[dict[str, Any]] = field(default_factory=list)
     seconds: float = 0.0
@@ -276,7 +277,7 @@ def load_run(folder: Path, run: Run, progress: Progress) -> tuple[Run, Progress]
     if not saved and (other := sorted(folder.glob("*.npz"))):
         raise CheckpointError(
             f"{other[0]}: expected a checkpoint step-*.npz, found one of another version of gsjax; start "
-            "again without --resume"
+            "again with --overwrite in place of --resume"
         )
     for path in reversed(saved):
         try:
@@ -285,16 +286,10 @@ def load_run(folder: Path, run: Run, progress: Progress) -> tuple[Run, Progress]
             wrong = error
             damaged.append(path)
             continue
-        about = stored.pop("about")
-        others = [what for what, digest in progress.about.items() if about.get(what) != digest]
-        if others:
-            raise ValueError(
-                f"--resume: {' and '.join(others)}: expected the same as when the run in {folder.parent} was "
-                "started, found a change; undo it, or replace the run with --overwrite instead"
-            )
+        expect_same(stored.pop("about"), progress.about, folder.parent)
         for later in damaged:  # otherwise they would count among the newest
             later.unlink()
-        return found, Progress(about, **stored)
+        return found, Progress(progress.about, **stored)
     if wrong is not None:
         raise wrong
     return run, progress

@@ -20,7 +20,7 @@ from gsjax.engine.distill.scene import FieldScene, SceneOptions, open_field_scen
 from gsjax.engine.drive import Tick, drive
 from gsjax.engine.ending import exit_code, finish
 from gsjax.engine.folder import RunFolder, plain
-from gsjax.engine.locks import releasing_locks
+from gsjax.engine.locks import releasing_locks, share
 from gsjax.engine.machine import describe as describe_machine
 from gsjax.engine.messages import Notes, counted, stage
 from gsjax.engine.options import RESUME_MAY_CHANGE, Common, Resuming, Seeded, Timed, checked
@@ -114,6 +114,7 @@ def run(options: Options) -> int:
             budget.check_exceeds(progress.used_seconds)
             notes.add(f"Resumed after {counted(run.step, 'step')} of an earlier run.")
         folder.write_config(settings)  # from here on an earlier field is gone
+        share(out)  # with queries of the first answer
         ticks = drive(method, problem, run)
         total, losses = method.total(problem), means_of("rec", "cos", "contrast", "tv")
         schedule = Schedule("distilling", total, losses, _words)

@@ -13,6 +13,7 @@ from typing import Any
 from gsjax.engine import machine
 from gsjax.engine.experiments.records import read_record
 from gsjax.engine.experiments.sweep import RESERVED, Cell, Experiment
+from gsjax.engine.interrupts import raised_again
 from gsjax.engine.locks import locked
 from gsjax.engine.messages import describe
 from gsjax.io.atomic import write_json
@@ -61,7 +62,8 @@ def run_cell(
     forget_programs()  # of earlier cells
     result, error, trace, begun = None, None, [], perf_counter()
     try:
-        result = script_run(copy.deepcopy(cell.options), cell.seed, folder)
+        with raised_again():  # by a run in the script, which catches Ctrl-C
+            result = script_run(copy.deepcopy(cell.options), cell.seed, folder)
         _check_result(result, cell)
     except (Exception, SystemExit) as failure:
         if debug:

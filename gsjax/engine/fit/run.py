@@ -23,6 +23,7 @@ from gsjax.engine.fit.sizes import Sizes
 from gsjax.engine.fit.start import start_from
 from gsjax.engine.fit.tensorboard import TensorBoard
 from gsjax.engine.folder import RunFolder
+from gsjax.engine.inputs import photographs_digest
 from gsjax.engine.locks import releasing_locks
 from gsjax.engine.machine import describe as describe_machine
 from gsjax.engine.messages import Notes, counted
@@ -97,7 +98,8 @@ def run(options: Options) -> int:
             differ = is_default and (folder.setting("minutes") is None) != (options.minutes is None)
             may_change = [name for name in _MAY_CHANGE if not (differ and name == "minutes")]
             folder.check_config(settings, but=tuple(may_change))
-        frames, progress = read_frames(photographs, console), Progress()
+        frames = read_frames(photographs, console)
+        progress = Progress({"the photographs": photographs_digest(photographs, chosen, frames)})
         fitted = [frames[i] for i in chosen]
         width, height = photographs.sizes[photographs.sizes.prod(1).argmax()].tolist()
         config = options.fit

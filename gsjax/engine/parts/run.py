@@ -17,6 +17,7 @@ from gsjax.engine.files import read_drawable
 from gsjax.engine.fit.run import Options as FitOptions
 from gsjax.engine.fit.run import run as run_fit
 from gsjax.engine.folder import RunFolder, expect_dataset, expect_run, is_finished, is_run
+from gsjax.engine.inputs import Inputs, recording_digest
 from gsjax.engine.locks import releasing_locks
 from gsjax.engine.messages import Notes, counted, stage
 from gsjax.engine.options import RESUME_MAY_CHANGE, OfRecording, SamWeights, Seeded, checked
@@ -36,11 +37,13 @@ from gsjax.methods.parts import (
     masks_from_labels,
 )
 from gsjax.methods.protocols import Segmenter
+from gsjax.optim.method import Run
 from gsjax.perception.sam import load_sam
 from gsjax.perception.segmenters import PieceSegmenter
 from gsjax.scene.gaussians import Gaussians
 from gsjax.scene.origin import rebased
 
+_CANONICAL = "canonical"  # the run of the canonical scene, within that of the parts
 _MOST_MOVES = 0.6  # fraction of pixels that change above which everything seems to move
 
 
@@ -85,6 +88,10 @@ def run(options: Options) -> int:
             folder.check_config(settings, but=RESUME_MAY_CHANGE)
         scene = None if options.scene is None else _ply_of(options.scene)
         tracked = recording.tracked
+        data = recording_digest(tracked, tracked.frame(0))
+        if options.resume:  # what cannot be resumed stays as it was
+            fitted = folder.path / _CANONICAL / "scene.ply" if scene is None else scene
+            load_run(folder.resume, Run(None, None), Progress(_inputs(data, fitted)))
         gaussians = None if scene is None else _read_scene(scene, tracked, notes)
         seconds: dict[str, float] = {}
         with stage(console, "detecting motion"):
@@ -110,7 +117,7 @@ def run(options: Options) -> int:
         method = Parts(options.parts)
         problem, first = method.start(tracked, start)
         seconds["discovery"] = perf_counter() - at
-        progress = Progress({"the canonical scene": digest(scene)})
+        progress = Progress(_inputs(data, scene))
         if options.resume:
             first, progress = load_run(folder.resume, first, progress)
             followed = int(method.result(problem, first).done.sum())
@@ -127,6 +134,11 @@ def run(options: Options) -> int:
         found["notes"] = notes.all
         finish(folder, found, summarize)
     return exit_code(progress.stopped)
+
+
+def _inputs(data: str, scene: Path) -> Inputs:
+    """Digests of what a run is given, by their descriptions."""
+    return {"the recording": data, "the canonical scene": digest(scene)}
 
 
 def _check(options: Options, recording: Recording) -> None:
@@ -182,7 +194,7 @@ def _fitted(
     options: Options, folder: RunFolder, anchor: Anchor, recording: Recording, console: Console
 ) -> Path | None:
     """The file of the scene at the anchor frame; None if the fit was stopped by Ctrl-C."""
-    path = folder.path / "canonical"
+    path = folder.path / _CANONICAL
     if not is_finished(path):
         console.print("[bold]canonical scene[/]  fitted to the anchor frame", soft_wrap=True)
         code = run_fit(_fit_options(options, path, anchor, recording))

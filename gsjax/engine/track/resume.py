@@ -8,12 +8,14 @@ import numpy as np
 from gsjax.engine import saving
 from gsjax.engine.drive import Tick
 from gsjax.engine.files import read_arrays
+from gsjax.engine.inputs import Inputs, expect_same
 from gsjax.engine.track.loop import Tracking
 from gsjax.io.atomic import write_npz
 from gsjax.io.checkpoints import CheckpointError, load_checkpoint, save_checkpoint
 from gsjax.methods.track import Pose, Track, TrackConfig, first_pose
 
 _PER_UPDATE = ("visible", "lost", "turn_known", "agrees")
+_AGAIN = "start again with --overwrite in place of --resume"
 
 
 class Saver:
@@ -21,11 +23,13 @@ class Saver:
 
     Args:
         folder: RUN/resume.
+        about: digests of the run's inputs, by their descriptions.
         saved: number of frames stored there already.
     """
 
-    def __init__(self, folder: Path, saved: int = 0):
-        self._folder, self._saved, self._save = folder, saved, saving.Saver("tracking")
+    def __init__(self, folder: Path, about: Inputs, saved: int = 0):
+        self._folder, self._about, self._saved = folder, about, saved
+        self._save = saving.Saver("tracking")
 
     def __call__(self, tracking: Tracking, *, last: bool) -> None:
         """Save if the last save is long enough ago or this is the last one; warn if it cannot be written."""
@@ -42,6 +46,7 @@ class Saver:
             part = self._folder / f"poses_{tracking.num_frames:06d}.npz"  # up to this many frames
             write_npz(part, {"means": poses.means, "quats": poses.quats})
         metadata = {
+            "about": dict(self._about),
             "frames": tracking.num_frames,
             "joined": tracking.joined,
             "update_s": tracking.update_s,
@@ -54,24 +59,29 @@ class Saver:
         self._saved = tracking.num_frames
 
 
-def load(folder: Path, config: TrackConfig) -> Tracking:
+def load(folder: Path, config: TrackConfig, about: Inputs) -> Tracking:
     """The tracking saved in a folder RUN/resume by a run with this config.
 
+    Args:
+        folder: RUN/resume.
+        config: the settings of the tracker.
+        about: digests of the inputs, by their descriptions.
+
     Raises:
-        ValueError: nothing was saved there, or it is damaged, or of another version of gsjax.
+        ValueError: nothing was saved there, or it is damaged, or of another version of gsjax; or the run was
+            started with other inputs.
     """
     path = folder / "state.npz"
     if not path.is_file():
         raise ValueError(
-            f"--resume: {folder.parent} was stopped before its first update, so nothing was saved; start "
-            "again with --overwrite in place of it"
+            f"--resume: {folder.parent} was stopped before its first update, so nothing was saved; {_AGAIN}"
         )
     tree, found = load_checkpoint(path)
     if missing := [name for name in _PER_UPDATE if name not in found]:
         raise CheckpointError(
-            f"{path}: expected {missing[0]} of each update, found a run of another version of gsjax; start "
-            "again without --resume"
+            f"{path}: expected {missing[0]} of each update, found a run of another version of gsjax; {_AGAIN}"
         )
+    expect_same(found.pop("about", {}), about, folder.parent)
     scene, run = tree["scene"], tree["run"]
     chosen = run.kept.chosen
     start = jax.device_get(first_pose(scene))
@@ -96,12 +106,12 @@ def _saved_poses(folder: Path, frames: int, like: Pose) -> list[Pose]:
     poses = []
     for path in _parts(folder):
         if _frames_of(path) <= frames:
-            part = read_arrays(path, ("means", "quats"), "start again without --resume")
+            part = read_arrays(path, ("means", "quats"), _AGAIN)
             rows = zip(part["means"], part["quats"], strict=True)  # on the host, as `follow` keeps them
             poses.extend(jax.tree.unflatten(jax.tree.structure(like), row) for row in rows)
     if len(poses) != frames - 1:
         raise CheckpointError(
-            f"{folder}: expected the poses of {frames - 1} updates, found {len(poses)}; parts are missing. "
-            "Start again without --resume"
+            f"{folder}: expected the poses of {frames - 1} updates, found {len(poses)}; parts are missing; "
+            f"{_AGAIN}"
         )
     return poses

@@ -20,6 +20,7 @@ from gsjax.engine.first_mask import (
     without_own_objects,
 )
 from gsjax.engine.folder import RunFolder, expect_dataset
+from gsjax.engine.inputs import recording_digest
 from gsjax.engine.locks import releasing_locks
 from gsjax.engine.machine import describe as describe_machine
 from gsjax.engine.messages import FITTING, Notes, counted, reason, stage
@@ -102,23 +103,24 @@ def run(options: Options) -> int:
         kept = folder.path / KEPT_MASK
         masks = kept if options.resume and isinstance(options.masks, Path) else settings.masks
         mask = first_mask(recording.tracked, options.mask_camera, masks, options.scale)
+        first = recording.tracked.frame(0)
+        about = {"the recording": recording_digest(recording.tracked, first)}
+        tracking = load(folder.resume, options.track, about) if options.resume else None
         folder.write_config(settings)  # from here on an earlier run is gone
         if mask.source == PICTURE and mask.labels is not None:
             recording = without_own_objects(recording)
             write_png(kept, mask.labels.astype(np.uint16))
         seconds = {"preparing": perf_counter() - begun}
-        first = recording.tracked.frame(0)
         rehearsal = Rehearsal(
             first, options.track, options.budget_ms is not None, needed=recording.tracked.num_frames > 1
         )
-        if options.resume:
-            tracking = load(folder.resume, options.track)
+        if tracking is not None:
             notes.add(f"Resumed after {counted(tracking.resumed, 'frame')} of an earlier run.")
         else:
             with drawing_ahead(recording):
                 scene, seconds["start"] = _start(recording, mask, rehearsal, console, notes)
             tracking = begin(scene)
-        saver = Saver(folder.resume, tracking.resumed)
+        saver = Saver(folder.resume, about, tracking.resumed)
         drawing = perf_counter()
         draw_ahead(recording, console)
         seconds["preparing"] += perf_counter() - drawing
@@ -173,7 +175,7 @@ def _evaluate(
     notes: Notes,
     console: Console,
     budget_ms: float | None,
-) -> tuple[dict[str, Any], dict[str, list[Media]], Exception | None]:
+) -> tuple[dict[str, Any], dict[str, list[Media]], BaseException | None]:
     """Render and score what was tracked. Ctrl-C or an error ends it; what was scored by then counts.
 
     Returns:
@@ -190,12 +192,12 @@ def _evaluate(
     except (KeyboardInterrupt, Exception) as error:
         scored = f"{scores.num_frames} of {tracking.num_frames} frames"
         notes.warn(f"scoring was stopped after {scored} by {reason(error)}")
-        failed = error if isinstance(error, Exception) else None
+        failed = error
     true_labels = first_labels(tracking, recording)
     motion = score_motion(tracking, recording, true_labels)
     names = object_names(tracking, recording, values)
     seconds["evaluation"] = perf_counter() - begun
-    found = _run_metrics(tracking, recording, mask, scores, budget_ms)
+    found = _run_metrics(tracking, recording, mask, scores, budget_ms, tracking.stopped or failed)
     found |= metrics(tracking, recording, mask, scores, motion, values, true_labels)
     _note_unscored(found, tracking, recording, mask, values, notes)
     _note_lost(found, tracking, values, names, notes)
@@ -207,7 +209,12 @@ def _evaluate(
 
 
 def _run_metrics(
-    tracking: Tracking, recording: Recording, mask: FirstMask, scores: Scores, budget_ms: float | None
+    tracking: Tracking,
+    recording: Recording,
+    mask: FirstMask,
+    scores: Scores,
+    budget_ms: float | None,
+    stopped: BaseException | None,
 ) -> dict[str, Any]:
     """The part of metrics.json about what ran, and how fast."""
     sequence, updates = recording.tracked, np.asarray(tracking.update_s[1:]) * 1e3
@@ -222,8 +229,7 @@ def _run_metrics(
     return {
         "kind": "track",
         "dataset": sequence.name,
-        **completion(tracking.stopped),
-        "complete": tracking.stopped is None and scores.num_frames == tracking.num_frames,
+        **completion(stopped),
         "frames": {
             "tracked": tracking.num_frames,
             "asked": sequence.num_frames,

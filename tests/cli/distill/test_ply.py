@@ -2,7 +2,10 @@
 what it learned. test_query.py tests what else `gsjax query` does."""
 
 import json
+import os
 import shutil
+import subprocess
+import sys
 
 import cv2
 import numpy as np
@@ -106,16 +109,26 @@ def test_a_field_without_descent_takes_passes_over_the_views(gsjax, pristine, sc
 
 @pytest.mark.slow
 def test_the_solution_can_be_asked_while_it_is_trained(gsjax, pristine, scene, tmp_path, monkeypatch):
+    """By another process, as a user does; a second distillation into the folder is refused meanwhile."""
     write, written = distill_run.write_field, []
+    out, told = tmp_path / "field", ("--preset", "field", "--distill.iterations", 3)
+    distill = ("distill", scene, "--out", out, *images(pristine), *told)
+
+    def elsewhere(*words) -> subprocess.CompletedProcess[str]:
+        command = [sys.executable, "-m", "gsjax.cli", *map(str, words)]
+        return subprocess.run(command, capture_output=True, text=True)
 
     def watched(path, result):
         write(path, result)
-        written.append((type(result.field.encoding).__name__, gsjax("query", path.parent, "can")[0]))
+        asked, again = elsewhere("query", out, "can", "--no-pictures"), elsewhere(*distill, "--overwrite")
+        assert (asked.returncode, again.returncode) == (0, 2), asked.stderr + again.stderr
+        assert f"found process {os.getpid()}, which has been writing there" in " ".join(again.stderr.split())
+        written.append(type(result.field.encoding).__name__)
 
     monkeypatch.setattr(distill_run, "write_field", watched)
-    out, told = tmp_path / "field", ("--preset", "field", "--distill.iterations", 3)
-    assert gsjax("distill", scene, "--out", out, *images(pristine), *told)[0] == 0
-    assert written == [("ArrayImpl", 0), ("FeatureGrid", 0)]
+    code, said = gsjax(*distill)
+    assert code == 0, said
+    assert written == ["ArrayImpl", "FeatureGrid"]
 
 
 @pytest.mark.thorough

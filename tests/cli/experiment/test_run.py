@@ -71,6 +71,26 @@ def test_ctrl_c_keeps_what_is_done_and_the_next_run_does_the_rest(toy, gsjax):
     assert len(results(folder)["rows"]) == 4
 
 
+@pytest.mark.skipif(os.name != "posix", reason="signals")
+@pytest.mark.parametrize("then", ["pass", "raise KeyError('test')"])
+def test_ctrl_c_that_a_script_catches_stops_the_sweep_too(toy, gsjax, then):
+    """A fit within a cell writes what it has and returns; that is no result of the cell."""
+    caught = f"""try:
+            signal.raise_signal(signal.SIGINT)
+        except KeyboardInterrupt:
+            {then}"""
+    toy(stopping(caught))
+    Path("stop").touch()
+    code, _, err = gsjax("run", "toy")
+    assert code == 130
+    assert "stopped: by Ctrl-C after 2 of 4 cells; the same command continues from there" in err
+    assert len(cell_files()) == 2
+    Path("stop").unlink()
+    calls()
+    assert gsjax("run", "toy")[0] == 0
+    assert calls() == ["640 fast 0", "640 exact 0"]
+
+
 def test_ctrl_c_in_a_fresh_run_does_not_bring_back_what_it_forgot(toy, gsjax):
     toy(stopping("raise KeyboardInterrupt"))
     gsjax("run", "toy")

@@ -264,6 +264,22 @@ def test_a_damaged_checkpoint_leaves_the_one_before(gsjax_fit, tmp_path, monkeyp
 
 
 @pytest.mark.thorough
+def test_other_photographs_are_no_resuming(photographs, gsjax_fit, tmp_path, monkeypatch):
+    def stopped(self, tick):
+        raise KeyboardInterrupt
+
+    fewer = Path(shutil.copytree(photographs, tmp_path / "photographs"))
+    with monkeypatch.context() as context:
+        context.setattr(Progress, "add", stopped)
+        assert gsjax_fit(*QUICK, dataset=fewer)[0] == 130
+    (fewer / "images" / "11.png").unlink()
+    code, said = gsjax_fit(*QUICK, "--resume", dataset=fewer)
+    assert code == 2
+    assert "the photographs: expected the same as when the run in" in " ".join(said.split())
+    assert (tmp_path / "run" / "report.html").is_file()
+
+
+@pytest.mark.thorough
 def test_it_stops_when_held_out_views_are_seen_as_well_as_asked(gsjax_fit, tmp_path):
     code, said = gsjax_fit(*QUICK, "--until-psnr", "1")
     assert code == 0, said

@@ -11,9 +11,11 @@ import gsjax.engine.parts.run
 from gsjax.cli import main
 from gsjax.data.video import describe_video
 from gsjax.engine.drive import Drive
+from gsjax.engine.progress import Progress, save_run
 from gsjax.engine.recording import chosen_recording
 from gsjax.io.ply import read_ply
 from gsjax.methods.parts import order_of_frames
+from gsjax.optim.method import Run
 from gsjax.viz.colors import label_color
 
 SCENE = "simulated:hard_parts?case=small&amount=0.05&width=96&height=72&cameras=4"
@@ -145,6 +147,20 @@ def test_a_run_that_was_stopped_goes_on_to_the_same_bits(gsjax_parts, tmp_path, 
     _, said = stopped_after(3 * 30 + 1, "late")
     assert "refined for 1 of 5 steps, then stopped by Ctrl-C" in said
     resumed("late")
+
+
+@pytest.mark.thorough
+def test_a_run_that_cannot_be_resumed_stays_as_it_was(gsjax_parts, tmp_path, monkeypatch):
+    monkeypatch.setattr(gsjax.engine.parts.run, "run_fit", lambda options: 130)
+    run, given = tmp_path / "run", (*QUICK, "--anchor", "0")
+    assert gsjax_parts(*given)[0] == 130
+    (run / "report.html").touch()
+    save_run(run / "resume", Run(None, None), Progress({"the recording": "another"}))
+    before = {file: file.read_bytes() for file in run.rglob("*.*") if file.is_file()}
+    code, said = gsjax_parts(*given, "--resume")
+    assert code == 2, said
+    assert "the recording: expected the same as when the run in" in " ".join(said.split())
+    assert {file: file.read_bytes() for file in run.rglob("*.*") if file.is_file()} == before
 
 
 @pytest.mark.thorough

@@ -11,7 +11,7 @@ import sys
 import pytest
 
 from gsjax.engine import locks
-from gsjax.engine.locks import LOCK, Writer, lock, locked, releasing_locks
+from gsjax.engine.locks import LOCK, Writer, lock, locked, releasing_locks, share
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="locks of files")
 
@@ -82,6 +82,20 @@ def test_who_is_refused_a_folder_alone_still_shares_it(tmp_path, written):
         with pytest.raises(BlockingIOError):
             fcntl.flock(third, fcntl.LOCK_EX | fcntl.LOCK_NB)
         os.close(third)
+
+
+def test_a_writer_may_let_others_add_to_its_folder_but_not_replace_it(tmp_path, written):
+    with locked(tmp_path):
+        share(tmp_path)
+        other = written(tmp_path, shared=True)
+        listed = [json.loads(line) for line in (tmp_path / LOCK).read_text().splitlines()]
+        assert [(one["pid"], one["shared"]) for one in listed] == [(os.getpid(), True), (other.pid, True)]
+        other.communicate("")
+        third = os.open(tmp_path / LOCK, os.O_RDWR)
+        with pytest.raises(BlockingIOError):
+            fcntl.flock(third, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        os.close(third)
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_parts_of_a_folder_are_locked_apart(tmp_path, written):

@@ -54,10 +54,22 @@ def test_what_a_version_before_saved_is_refused(tmp_path):
     assert load_run(tmp_path, run, progress)[0].step == 3
 
 
+def test_inputs_that_changed_are_refused_unless_the_version_before_did_not_look_at_them(tmp_path):
+    run, now = Run(jnp.zeros(2), None), Progress({"the scene": "1", "the data": "2"})
+    save_run(tmp_path, run.having(step=1), Progress({"the scene": "1"}))
+    loaded, progress = load_run(tmp_path, run, now)
+    assert loaded.step == 1
+    save_run(tmp_path, run.having(step=2), progress)
+    for then in (now, Progress({"another scene": "1", "the data": "2"})):
+        save_run(tmp_path, run.having(step=3), then)
+        with pytest.raises(ValueError, match="expected the same as when the run in"):
+            load_run(tmp_path, run, Progress({"the scene": "1", "the data": "3"}))
+
+
 @pytest.mark.parametrize("name", ["state.npz", "parts.npz"])
 def test_what_was_saved_under_another_name_is_refused(name, tmp_path):
     (tmp_path / name).write_bytes(b"of another version")
-    with pytest.raises(CheckpointError, match=rf"{name}: expected a checkpoint step-\*.npz"):
+    with pytest.raises(CheckpointError, match=rf"{name}: expected a checkpoint step-\*.npz.* --overwrite in"):
         load_run(tmp_path, Run(jnp.zeros(2), None), Progress({}))
 
 

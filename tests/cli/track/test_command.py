@@ -159,10 +159,11 @@ def test_ctrl_c_while_scoring_keeps_what_was_scored(pristine, tmp_path, gsjax_tr
 
     monkeypatch.setattr(Sequence, "frame", interrupted)
     code, said = gsjax_track(pristine, "--cameras", "0", "1", "--eval-cameras", "2")
-    assert code == 0
+    assert code == 130
     assert "scoring was stopped after 3 of 4 frames by Ctrl-C" in said
     found = json.loads((tmp_path / "run" / "metrics.json").read_text())
-    assert (found["frames"]["tracked"], found["frames"]["scored"], found["complete"]) == (4, 3, False)
+    assert (found["frames"]["tracked"], found["frames"]["scored"]) == (4, 3)
+    assert (found["complete"], found["stopped"]) == (False, "Ctrl-C")
 
 
 @pytest.mark.thorough

@@ -1,11 +1,14 @@
 """A run that was stopped resumes where it was, and ends as if it had not been stopped."""
 
 import errno
+import itertools
 import json
+import shutil
 import warnings
 from types import SimpleNamespace
 from unittest.mock import Mock
 
+import cv2
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -13,6 +16,8 @@ import pytest
 import gsjax.engine.saving
 import gsjax.engine.track.loop
 import gsjax.engine.track.resume
+from gsjax.data import write_panoptic
+from gsjax.data.simulated import tabletop
 from gsjax.engine.track.loop import Tracking
 from gsjax.engine.track.tracking import track
 from gsjax.io.checkpoints import CheckpointError
@@ -73,6 +78,46 @@ def test_other_options_are_no_resuming(pristine, gsjax_track, still, tmp_path):
 
 
 @pytest.mark.thorough
+def test_a_run_that_cannot_be_resumed_stays_as_it_was(pristine, gsjax_track, still, tmp_path):
+    assert gsjax_track(pristine, "--cameras", "0")[0] == 0
+    run = tmp_path / "run"
+    (run / "resume").mkdir()
+    for name in ("metrics.json", "resume/state.npz"):  # as if it had been stopped
+        (run / name).write_text('{"complete": false}')
+    before = {file: file.read_bytes() for file in run.rglob("*.*") if file.is_file()}
+    code, said = gsjax_track(pristine, "--cameras", "0", "--resume")
+    assert code == 2
+    assert "state.npz: expected a checkpoint, found a file that cannot be read as one" in said
+    assert {file: file.read_bytes() for file in run.rglob("*.*") if file.is_file()} == before
+
+
+def fewer_frames(recording):
+    shutil.rmtree(recording)
+    recording.mkdir()
+    write_panoptic(tabletop(frames=1, width=80, height=60), recording)
+
+
+def another_picture(recording):
+    picture, *_ = sorted((recording / "ims" / "0").iterdir())
+    cv2.imwrite(str(picture), 255 - cv2.imread(str(picture)))
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("changed", [fewer_frames, another_picture])
+def test_another_recording_is_no_resuming(recording, gsjax_track, still, tmp_path, monkeypatch, changed):
+    def stopped(*arguments, **options):
+        yield from itertools.islice(still(*arguments, **options), 1)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(gsjax.engine.track.loop, "track", stopped)
+    assert gsjax_track(recording, "--cameras", "0")[0] == 130
+    changed(recording)
+    code, said = gsjax_track(recording, "--cameras", "0", "--resume")
+    assert code == 2
+    assert "the recording: expected the same as when the run in" in " ".join(said.split())
+
+
+@pytest.mark.thorough
 def test_a_full_disk_is_said_and_tracking_goes_on(pristine, gsjax_track, still, monkeypatch):
     def full(path, *_):
         raise OSError(errno.ENOSPC, "No space left on device", str(path))
@@ -100,7 +145,7 @@ def test_parts_whose_state_did_not_follow_are_written_again(tmp_path, monkeypatc
     def full(path, *_):
         raise OSError(errno.ENOSPC, "No space left on device", str(path))
 
-    saver, written = gsjax.engine.track.resume.Saver(tmp_path), []
+    saver, written = gsjax.engine.track.resume.Saver(tmp_path, {}), []
     for frames, save in ((10, written.append), (20, full), (30, written.append)):
         monkeypatch.setattr(
             gsjax.engine.track.resume, "save_checkpoint", lambda path, *_, save=save: save(path)
@@ -119,5 +164,6 @@ def test_a_run_of_another_version_is_refused(monkeypatch, tmp_path):
     saved = {"frames": 1, "visible": [], "lost": [], "turn_known": []}
     monkeypatch.setattr(gsjax.engine.track.resume, "load_checkpoint", lambda path: (tree, saved))
     (tmp_path / "state.npz").touch()
-    with pytest.raises(CheckpointError, match=r"state\.npz: expected agrees of each update, found a run of"):
-        gsjax.engine.track.resume.load(tmp_path, TrackConfig())
+    says = r"state\.npz: expected agrees of each update, found a run of .*; start again with --overwrite in"
+    with pytest.raises(CheckpointError, match=says):
+        gsjax.engine.track.resume.load(tmp_path, TrackConfig(), {})
