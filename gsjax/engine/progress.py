@@ -4,6 +4,7 @@
 """
 
 import json
+import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -16,12 +17,13 @@ from rich.console import Console
 from rich.progress import BarColumn, TextColumn, TimeRemainingColumn
 from rich.progress import Progress as Bar
 
+from gsjax.data.errors import DataWarning
 from gsjax.engine.budget import Budget
 from gsjax.engine.drive import COMPILING, Drive, Tick
 from gsjax.engine.ending import completion
 from gsjax.engine.folder import RunFolder
 from gsjax.engine.interrupts import raise_if_interrupted, shielded
-from gsjax.engine.messages import Notes, counted, reason
+from gsjax.engine.messages import Notes, counted, describe, reason
 from gsjax.engine.saving import Saver
 from gsjax.engine.streams import say_error
 from gsjax.io.atomic import atomic_write
@@ -308,15 +310,19 @@ def _saved(folder: Path) -> list[Path]:
 def _add_row(
     now: Tick, progress: Progress, schedule: Schedule, folder: RunFolder, more: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """Add a row, and write it to metrics.jsonl at once."""
+    """Add a row, and write it to metrics.jsonl at once; warn if it cannot be written, as by a full disk."""
     infos = jax.device_get(progress.recent)
     sound = [info for info in infos if not info["skipped"]]
     progress.skipped += len(infos) - len(sound)
     progress.recent = []
     row = {"step": now.step, "seconds": progress.used_seconds, **schedule.row(now, sound), **more}
     progress.rows.append(row)
-    with atomic_write(folder.metrics_lines) as temporary:
-        temporary.write_text("".join(json.dumps(one) + "\n" for one in progress.rows), encoding="utf-8")
+    try:
+        with atomic_write(folder.metrics_lines) as temporary:
+            temporary.write_text("".join(json.dumps(one) + "\n" for one in progress.rows), encoding="utf-8")
+    except OSError as error:  # it is written with the next row
+        message = f"could not log a row ({describe(error)}); {schedule.doing} goes on"
+        warnings.warn(message, DataWarning, stacklevel=2)
     return row
 
 

@@ -1,5 +1,6 @@
 """What is noted of a run that ended early, and which resume folders are refused."""
 
+import errno
 import json
 from io import StringIO
 
@@ -8,6 +9,8 @@ import numpy as np
 import pytest
 from rich.console import Console
 
+import gsjax.engine.progress
+from gsjax.data.errors import DataWarning
 from gsjax.engine.drive import drive
 from gsjax.engine.folder import RunFolder
 from gsjax.engine.messages import Notes
@@ -77,6 +80,21 @@ def test_a_log_says_when_a_later_step_compiles(tmp_path):
         "Warning: 1 step produced non-finite numbers and changed nothing; if they are many, try lower "
         "learning rates"
     ]
+
+
+def test_a_row_that_a_full_disk_refuses_is_written_with_the_next(tmp_path, monkeypatch):
+    def full(path):
+        monkeypatch.undo()
+        raise OSError(errno.ENOSPC, "No space left on device", str(path))
+
+    monkeypatch.setattr(gsjax.engine.progress, "atomic_write", full)
+    schedule, folder = Schedule("walking", 8, means_of(), str, every=2), RunFolder(tmp_path / "run")
+    said = r"could not log a row \(.*metrics\.jsonl: no space left on device\); walking goes on"
+    with pytest.warns(DataWarning, match=said):
+        progress = watch(walked(), Progress(), schedule, folder, Console(quiet=True))
+    assert progress.stopped is None
+    rows = [json.loads(line)["step"] for line in folder.metrics_lines.read_text().splitlines()]
+    assert rows == [2, 4, 6, 8]
 
 
 def test_a_loss_that_is_lost_is_mended_counted_and_told(tmp_path):
