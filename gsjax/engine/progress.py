@@ -51,6 +51,8 @@ class Progress:
         returns: number of returns to the best parameters, because the loss grew.
         is_settled: whether the result is the best parameters rather than the latest.
         stopped: what ended the run early, or None.
+        begun: start time of the command, by `time.perf_counter`, less the time of earlier commands, up to the
+            checkpoint that is resumed.
         pace: recent steps per second; 0 before any is known.
     """
 
@@ -63,12 +65,18 @@ class Progress:
     returns: int = 0
     is_settled: bool = False
     stopped: BaseException | None = None
+    begun: float = field(default_factory=perf_counter)
     pace: float = field(default=0.0, init=False)
 
     @property
     def used_seconds(self) -> float:
         """Time of steps and of compiling."""
         return self.seconds + self.compile_seconds
+
+    @property
+    def total_seconds(self) -> float:
+        """Time of the command, and of the earlier commands that it resumes."""
+        return perf_counter() - self.begun
 
     def add(self, tick: Tick) -> None:
         """Record a step."""
@@ -89,16 +97,11 @@ class Progress:
     def metadata(self) -> dict[str, Any]:
         """The metadata of a checkpoint."""
         recent = [{name: float(a) for name, a in info.items()} for info in jax.device_get(self.recent)]
-        kept = ("rows", "seconds", "compile_seconds", "skipped")
+        kept = ("rows", "seconds", "compile_seconds", "skipped", "total_seconds")
         return {name: getattr(self, name) for name in kept} | {"about": dict(self.about), "recent": recent}
 
-    def found(self, steps: int, begun: float) -> dict[str, Any]:
-        """The part of metrics.json about the progress.
-
-        Args:
-            steps: number of steps.
-            begun: start time of the command, by `time.perf_counter`.
-        """
+    def found(self, steps: int) -> dict[str, Any]:
+        """The part of metrics.json about the progress, after a number of `steps`."""
         return {
             **completion(self.stopped),
             "steps": steps,
@@ -106,7 +109,7 @@ class Progress:
             "seconds": {
                 "steps": self.seconds,
                 "compile": self.compile_seconds,
-                "total": perf_counter() - begun,
+                "total": self.total_seconds,
             },
             "curve": self.rows,
         }
@@ -296,7 +299,8 @@ def load_run(folder: Path, run: Run, progress: Progress) -> tuple[Run, Progress]
             )
         for later in damaged:  # otherwise they would count among the newest
             later.unlink()
-        return found, Progress(about, **stored)
+        begun = progress.begun - stored.pop("total_seconds", 0.0)  # which older checkpoints do not have
+        return found, Progress(about, begun=begun, **stored)
     if wrong is not None:
         raise wrong
     return run, progress

@@ -97,7 +97,7 @@ def run(options: Options) -> int:
             differ = is_default and (folder.setting("minutes") is None) != (options.minutes is None)
             may_change = [name for name in _MAY_CHANGE if not (differ and name == "minutes")]
             folder.check_config(settings, but=tuple(may_change))
-        frames, progress = read_frames(photographs, console), Progress()
+        frames, progress = read_frames(photographs, console), Progress(begun=begun)
         fitted = [frames[i] for i in chosen]
         width, height = photographs.sizes[photographs.sizes.prod(1).argmax()].tolist()
         config = options.fit
@@ -154,7 +154,7 @@ def run(options: Options) -> int:
             },
             "size": photographs.sizes.max(0),
             "start": problem.start,
-            "seconds": seconds | {"total": perf_counter() - begun},
+            "seconds": seconds | {"total": progress.total_seconds},
             "machine": describe_machine(),
             "test": scores.mean() if judged and scores.rows else None,
             "views": scores.rows,

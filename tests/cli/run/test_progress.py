@@ -3,6 +3,7 @@
 import errno
 import json
 from io import StringIO
+from time import perf_counter
 
 import jax.numpy as jnp
 import numpy as np
@@ -57,6 +58,13 @@ def test_what_a_version_before_saved_is_refused(tmp_path):
     assert load_run(tmp_path, run, progress)[0].step == 3
 
 
+def test_the_time_of_a_resumed_run_is_that_of_all_its_commands(tmp_path):
+    run = Run(jnp.zeros(2), None)
+    save_run(tmp_path, run, Progress(begun=perf_counter() - 3600))
+    _, progress = load_run(tmp_path, run, Progress(begun=perf_counter() - 60))
+    assert progress.found(0)["seconds"]["total"] == pytest.approx(3660, abs=5)
+
+
 @pytest.mark.parametrize("name", ["state.npz", "parts.npz"])
 def test_what_was_saved_under_another_name_is_refused(name, tmp_path):
     (tmp_path / name).write_bytes(b"of another version")
@@ -104,8 +112,8 @@ def test_a_loss_that_is_lost_is_mended_counted_and_told(tmp_path):
     progress = watch(ticks, Progress(), schedule, RunFolder(tmp_path / "run"), Console(quiet=True))
     assert progress.stopped is None
     assert progress.returns == ticks.run.guard.returns >= 1
-    assert progress.found(1000, 0.0)["returns"] == progress.returns
-    assert progress.found(1000, 0.0)["settled"] == ticks.run.guard.is_settled
+    assert progress.found(1000)["returns"] == progress.returns
+    assert progress.found(1000)["settled"] == ticks.run.guard.is_settled
     notes = Notes(Console(quiet=True))
     warn_of_mishaps(progress, notes)
     assert "continued from its best parameters" in notes.all[-1]
