@@ -50,6 +50,7 @@ class Progress:
         skipped: number of steps up to the last row that changed nothing, because a number was not finite.
         returns: number of returns to the best parameters, because the loss grew.
         is_settled: whether the result is the best parameters rather than the latest.
+        shrink: factor by which `gsjax fit --minutes` downscales photographs; 0 before its first step.
         stopped: what ended the run early, or None.
         begun: start time of the command, by `time.perf_counter`, less the time of earlier commands, up to the
             checkpoint that is resumed.
@@ -64,6 +65,7 @@ class Progress:
     skipped: int = 0
     returns: int = 0
     is_settled: bool = False
+    shrink: int = 0
     stopped: BaseException | None = None
     begun: float = field(default_factory=perf_counter)
     pace: float = field(default=0.0, init=False)
@@ -97,7 +99,7 @@ class Progress:
     def metadata(self) -> dict[str, Any]:
         """The metadata of a checkpoint."""
         recent = [{name: float(a) for name, a in info.items()} for info in jax.device_get(self.recent)]
-        kept = ("rows", "seconds", "compile_seconds", "skipped", "total_seconds")
+        kept = ("rows", "seconds", "compile_seconds", "skipped", "shrink", "total_seconds")
         return {name: getattr(self, name) for name in kept} | {"about": dict(self.about), "recent": recent}
 
     def found(self, steps: int) -> dict[str, Any]:
