@@ -186,16 +186,23 @@ def watch(
     def save(last: bool) -> None:
         saver(lambda: save_run(folder.resume, ticks.run, progress), last=last)
 
+    def step() -> tuple[Tick, dict[str, Any] | None] | None:
+        """The next step, if any, and its row, if it gets one. Ctrl-C waits for both: a resumed run begins
+        after the step, and would lack its row."""
+        if (now := next(ticks, None)) is None:
+            return None
+        progress.add(now)
+        last = now.step == schedule.total or budget.is_over  # before evaluating, which takes time
+        more = None if evaluate is None else evaluate(now)
+        due = now.step % schedule.every == 0 or last or more is not None
+        return now, _add_row(now, progress, schedule, folder, more or {}) if due else None
+
     with _Display(console, schedule, progress, ticks, budget) as display:
         try:
-            while not budget.is_over and (now := _next(ticks, progress)) is not None:
-                last = now.step == schedule.total or budget.is_over  # before evaluating, which takes time
-                more = None if evaluate is None else evaluate(now)
-                row = None
-                if now.step % schedule.every == 0 or last or more is not None:
-                    row = shielded(_add_row, now, progress, schedule, folder, more or {})
-                    for listen in listeners:
-                        listen(row)
+            while not budget.is_over and (taken := shielded(step)) is not None:
+                now, row = taken
+                for listen in listeners if row is not None else ():
+                    listen(row)
                 display.show()
                 if row is not None and enough is not None and (is_enough := enough(now, row)):
                     break
@@ -216,15 +223,6 @@ def watch(
     if (guard := ticks.run.guard) is not None:
         progress.returns, progress.is_settled = guard.returns, guard.is_settled
     return progress
-
-
-def _next(ticks: Drive, progress: Progress) -> Tick | None:
-    """The next step, if any; it is recorded even if Ctrl-C follows."""
-    before = ticks.tick
-    now = next(ticks, None)
-    if now is not None and now is not before:
-        progress.add(now)
-    return now
 
 
 def note_if_cut_short(progress: Progress, schedule: Schedule, steps: int, notes: Notes) -> None:

@@ -209,8 +209,10 @@ def _fitted(
     goal, steps = options.until_psnr, method.config.steps
 
     def is_met(run: Run) -> bool:
-        """Whether the wanted PSNR is reached: by the views evaluated last, and then by all held-out views."""
-        if goal is None or not any(row["test_psnr"] >= goal for row in evaluated(progress.rows)[-1:]):
+        """Whether the wanted PSNR is reached: by the views evaluated after the newest step, if they were, and
+        then by all held-out views."""
+        rows = [row for row in evaluated(progress.rows)[-1:] if row["step"] == run.step]
+        if goal is None or not any(row["test_psnr"] >= goal for row in rows):
             return False
         found = judge(run.params.gaussians, judged).mean()["psnr"]
         return found is not None and found >= goal

@@ -2,6 +2,8 @@
 
 import errno
 import json
+import signal
+import threading
 from io import StringIO
 from time import perf_counter
 
@@ -103,6 +105,21 @@ def test_a_row_that_a_full_disk_refuses_is_written_with_the_next(tmp_path, monke
     assert progress.stopped is None
     rows = [json.loads(line)["step"] for line in folder.metrics_lines.read_text().splitlines()]
     assert rows == [2, 4, 6, 8]
+
+
+@pytest.mark.skipif(threading.current_thread() is not threading.main_thread(), reason="signals")
+def test_ctrl_c_waits_for_the_row_of_a_step(tmp_path):
+    def evaluate(now):
+        if now.step == 3:
+            signal.raise_signal(signal.SIGINT)
+        return {"seen": now.step} if now.step == 3 else None
+
+    schedule, folder = Schedule("walking", 8, means_of(), str), RunFolder(tmp_path / "run")
+    ticks = walked()
+    progress = watch(ticks, Progress(), schedule, folder, Console(quiet=True), evaluate=evaluate)
+    assert isinstance(progress.stopped, KeyboardInterrupt)
+    assert ticks.run.step == 3
+    assert [row["seen"] for row in progress.rows] == [3]
 
 
 def test_a_loss_that_is_lost_is_mended_counted_and_told(tmp_path):
