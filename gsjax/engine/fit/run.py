@@ -100,9 +100,10 @@ def run(options: Options) -> int:
         frames, progress = read_frames(photographs, console), Progress(begun=begun)
         fitted = [frames[i] for i in chosen]
         width, height = photographs.sizes[photographs.sizes.prod(1).argmax()].tolist()
-        config = options.fit
+        config, in_time = options.fit, None
         if options.minutes is not None and is_default:
-            config = _settings_within_minutes(config, (width, height), options.minutes, notes, console)
+            config, in_time = settings_within(config, (width, height), options.minutes)
+            config = replace(config, steps=_UNLIMITED)
         config, cloud = start_from(photographs, fitted, config, console)
         method = Fit(config)
         problem, run = method.start(fitted, cloud, photographs.background)
@@ -113,6 +114,8 @@ def run(options: Options) -> int:
             if is_default:  # the slots that an earlier run chose for its minutes are kept
                 config = replace(config, cap=run.params.gaussians.num)
                 method = Fit(config)
+        if in_time is not None:
+            _tell_settings(config, None if options.resume else in_time, notes, console)
         folder.write_config(settings)  # from here on an earlier run is gone
         if options.minutes is not None:
             sizes = Sizes(config, (width, height), budget, progress, notes, console)
@@ -181,18 +184,15 @@ def _at_scale(photographs: Photographs, scale: float | None, notes: Notes, conso
     return scaled
 
 
-def _settings_within_minutes(
-    config: FitConfig, size: tuple[int, int], minutes: float, notes: Notes, console: Console
-) -> FitConfig:
-    """The settings that pay off in these minutes; also prints and notes them."""
-    found, steps = settings_within(config, size, minutes)
-    words = (
-        f"up to {found.cap:,} Gaussians with colours of degree {found.sh_degree}, as there should be time "
-        f"for {steps:,} steps"
-    )
+def _tell_settings(config: FitConfig, steps: int | None, notes: Notes, console: Console) -> None:
+    """Print and note the settings that --minutes chose for a number of steps; None in a resumed run, which
+    has the Gaussians that were chosen at its start."""
+    most, colours = f"up to {config.cap:,} Gaussians", f"with colours of degree {config.sh_degree}"
+    words = f"{most}, as when the run was started, {colours}"
+    if steps is not None:
+        words = f"{most} {colours}, as there should be time for {steps:,} steps"
     console.print(words, soft_wrap=True)
     notes.add(f"U{words[1:]} (--minutes).")
-    return replace(found, steps=_UNLIMITED)
 
 
 def _fitted(

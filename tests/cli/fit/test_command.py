@@ -138,9 +138,12 @@ def test_what_minutes_decided_holds_when_a_run_is_resumed(gsjax_fit, tmp_path, m
     assert "was started with minutes 0.2, now it is None" in " ".join(said.split())
     code, said = gsjax_fit("--resume", "--minutes", "0.9")
     assert code == 0, said
+    words = "p to 7,400 Gaussians, as when the run was started, with colours of degree"
+    assert f"u{words}" in " ".join(said.split())
     found = json.loads((tmp_path / "run" / "metrics.json").read_text())
     assert found["steps"] > 1
     assert found["num_gaussians"] <= 7_400
+    assert any(note.startswith(f"U{words}") for note in found["notes"])
 
 
 @pytest.mark.thorough
