@@ -104,7 +104,8 @@ class Drive(Iterator[Tick]):
     """Iterates over the steps of a method; see `drive`.
 
     Attributes:
-        run: the newest run. Ctrl-C interrupts between steps only, so it is always valid.
+        run: the newest run. Ctrl-C interrupts between steps only (in a loop of one's own, before the next
+            one), so it is always valid.
         tick: the newest tick; None before the first step.
     """
 

@@ -28,12 +28,19 @@ def shielded(call: Callable[..., Any], *arguments: Any) -> Any:
     """The result of `call`. Ctrl-C waits until it has returned, and is raised by `raise_if_interrupted` at
     the latest. It is for steps that donate the buffers they replace: an interrupt in the middle of one would
     lose both the old and the new."""
-    return call(*arguments)
+    in_main = threading.current_thread() is threading.main_thread()
+    if not in_main or signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
+        return call(*arguments)  # in `handled_interrupts`, or Ctrl-C is the business of something else
+    signal.signal(signal.SIGINT, lambda *_: _waiting.set())
+    try:
+        return call(*arguments)
+    finally:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def raise_if_interrupted() -> None:
     """Raises KeyboardInterrupt if Ctrl-C is pending: the gaps between shielded calls are too short for the
-    timer."""
+    timer, and outside of `handled_interrupts` there is none."""
     if _waiting.is_set():
         _raise()
 

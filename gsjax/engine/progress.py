@@ -4,6 +4,7 @@
 """
 
 import json
+import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -16,13 +17,14 @@ from rich.console import Console
 from rich.progress import BarColumn, TextColumn, TimeRemainingColumn
 from rich.progress import Progress as Bar
 
+from gsjax.data.errors import DataWarning
 from gsjax.engine.budget import Budget
 from gsjax.engine.drive import COMPILING, Drive, Tick
 from gsjax.engine.ending import completion
 from gsjax.engine.folder import RunFolder
 from gsjax.engine.inputs import Inputs, expect_same
 from gsjax.engine.interrupts import raise_if_interrupted, shielded
-from gsjax.engine.messages import Notes, counted, reason
+from gsjax.engine.messages import Notes, counted, describe, reason
 from gsjax.engine.saving import Saver
 from gsjax.engine.streams import say_error
 from gsjax.io.atomic import atomic_write
@@ -49,7 +51,10 @@ class Progress:
         skipped: number of steps up to the last row that changed nothing, because a number was not finite.
         returns: number of returns to the best parameters, because the loss grew.
         is_settled: whether the result is the best parameters rather than the latest.
+        shrink: factor by which `gsjax fit --minutes` downscales photographs; 0 before its first step.
         stopped: what ended the run early, or None.
+        begun: start time of the command, by `time.perf_counter`, less the time of earlier commands, up to the
+            checkpoint that is resumed.
         pace: recent steps per second; 0 before any is known.
     """
 
@@ -61,13 +66,20 @@ class Progress:
     skipped: int = 0
     returns: int = 0
     is_settled: bool = False
+    shrink: int = 0
     stopped: BaseException | None = None
+    begun: float = field(default_factory=perf_counter)
     pace: float = field(default=0.0, init=False)
 
     @property
     def used_seconds(self) -> float:
         """Time of steps and of compiling."""
         return self.seconds + self.compile_seconds
+
+    @property
+    def total_seconds(self) -> float:
+        """Time of the command, and of the earlier commands that it resumes."""
+        return perf_counter() - self.begun
 
     def add(self, tick: Tick) -> None:
         """Record a step."""
@@ -88,16 +100,11 @@ class Progress:
     def metadata(self) -> dict[str, Any]:
         """The metadata of a checkpoint."""
         recent = [{name: float(a) for name, a in info.items()} for info in jax.device_get(self.recent)]
-        kept = ("rows", "seconds", "compile_seconds", "skipped")
+        kept = ("rows", "seconds", "compile_seconds", "skipped", "shrink", "total_seconds")
         return {name: getattr(self, name) for name in kept} | {"about": dict(self.about), "recent": recent}
 
-    def found(self, steps: int, begun: float) -> dict[str, Any]:
-        """The part of metrics.json about the progress.
-
-        Args:
-            steps: number of steps.
-            begun: start time of the command, by `time.perf_counter`.
-        """
+    def found(self, steps: int) -> dict[str, Any]:
+        """The part of metrics.json about the progress, after a number of `steps`."""
         return {
             **completion(self.stopped),
             "steps": steps,
@@ -105,7 +112,7 @@ class Progress:
             "seconds": {
                 "steps": self.seconds,
                 "compile": self.compile_seconds,
-                "total": perf_counter() - begun,
+                "total": self.total_seconds,
             },
             "curve": self.rows,
         }
@@ -180,16 +187,23 @@ def watch(
     def save(last: bool) -> None:
         saver(lambda: save_run(folder.resume, ticks.run, progress), last=last)
 
+    def step() -> tuple[Tick, dict[str, Any] | None] | None:
+        """The next step, if any, and its row, if it gets one. Ctrl-C waits for both: a resumed run begins
+        after the step, and would lack its row."""
+        if (now := next(ticks, None)) is None:
+            return None
+        progress.add(now)
+        last = now.step == schedule.total or budget.is_over  # before evaluating, which takes time
+        more = None if evaluate is None else evaluate(now)
+        due = now.step % schedule.every == 0 or last or more is not None
+        return now, _add_row(now, progress, schedule, folder, more or {}) if due else None
+
     with _Display(console, schedule, progress, ticks, budget) as display:
         try:
-            while not budget.is_over and (now := _next(ticks, progress)) is not None:
-                last = now.step == schedule.total or budget.is_over  # before evaluating, which takes time
-                more = None if evaluate is None else evaluate(now)
-                row = None
-                if now.step % schedule.every == 0 or last or more is not None:
-                    row = shielded(_add_row, now, progress, schedule, folder, more or {})
-                    for listen in listeners:
-                        listen(row)
+            while not budget.is_over and (taken := shielded(step)) is not None:
+                now, row = taken
+                for listen in listeners if row is not None else ():
+                    listen(row)
                 display.show()
                 if row is not None and enough is not None and (is_enough := enough(now, row)):
                     break
@@ -210,15 +224,6 @@ def watch(
     if (guard := ticks.run.guard) is not None:
         progress.returns, progress.is_settled = guard.returns, guard.is_settled
     return progress
-
-
-def _next(ticks: Drive, progress: Progress) -> Tick | None:
-    """The next step, if any; it is recorded even if Ctrl-C follows."""
-    before = ticks.tick
-    now = next(ticks, None)
-    if now is not None and now is not before:
-        progress.add(now)
-    return now
 
 
 def note_if_cut_short(progress: Progress, schedule: Schedule, steps: int, notes: Notes) -> None:
@@ -289,7 +294,8 @@ def load_run(folder: Path, run: Run, progress: Progress) -> tuple[Run, Progress]
         expect_same(stored.pop("about"), progress.about, folder.parent)
         for later in damaged:  # otherwise they would count among the newest
             later.unlink()
-        return found, Progress(progress.about, **stored)
+        begun = progress.begun - stored.pop("total_seconds", 0.0)  # which older checkpoints do not have
+        return found, Progress(progress.about, begun=begun, **stored)
     if wrong is not None:
         raise wrong
     return run, progress
@@ -303,15 +309,19 @@ def _saved(folder: Path) -> list[Path]:
 def _add_row(
     now: Tick, progress: Progress, schedule: Schedule, folder: RunFolder, more: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """Add a row, and write it to metrics.jsonl at once."""
+    """Add a row, and write it to metrics.jsonl at once; warn if it cannot be written, as by a full disk."""
     infos = jax.device_get(progress.recent)
     sound = [info for info in infos if not info["skipped"]]
     progress.skipped += len(infos) - len(sound)
     progress.recent = []
     row = {"step": now.step, "seconds": progress.used_seconds, **schedule.row(now, sound), **more}
     progress.rows.append(row)
-    with atomic_write(folder.metrics_lines) as temporary:
-        temporary.write_text("".join(json.dumps(one) + "\n" for one in progress.rows), encoding="utf-8")
+    try:
+        with atomic_write(folder.metrics_lines) as temporary:
+            temporary.write_text("".join(json.dumps(one) + "\n" for one in progress.rows), encoding="utf-8")
+    except OSError as error:  # it is written with the next row
+        message = f"could not log a row ({describe(error)}); {schedule.doing} goes on"
+        warnings.warn(message, DataWarning, stacklevel=2)
     return row
 
 

@@ -2,6 +2,7 @@
 
 import signal
 import threading
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -167,22 +168,26 @@ def test_buffers_are_given_away():
     assert not ticks.run.params.is_deleted()
 
 
-def test_ctrl_c_waits_for_the_end_of_a_step():
-    class Interrupted(Walk):
-        def between(self, problem, run, progress):
-            if run.step == 3:
-                signal.raise_signal(signal.SIGINT)
-            return super().between(problem, run, progress)
+@pytest.mark.parametrize("handled", [interrupts.handled_interrupts, nullcontext])
+def test_ctrl_c_waits_for_the_end_of_a_step(handled):
+    asked = []
+
+    def progress(step):  # first asked for a step at the end of the one before
+        asked.append(step)
+        if asked.count(4) == 1 and step == 4:
+            signal.raise_signal(signal.SIGINT)
+        return step / 8
 
     if threading.current_thread() is not threading.main_thread():
         pytest.skip("signals reach the main thread")
-    method = Interrupted()
-    ticks = drive(method, *method.start())
-    with interrupts.handled_interrupts(), pytest.raises(KeyboardInterrupt):
-        for _ in ticks:
-            pass
-    assert ticks.run.step in (3, 4)
-    assert not ticks.run.params.is_deleted()
+    ticks, taken = walked(progress=progress), []
+    with handled(), pytest.raises(KeyboardInterrupt):
+        taken.extend(ticks)
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    assert ticks.tick is not None
+    assert ticks.tick.step == ticks.run.step == 4
+    assert handled is interrupts.handled_interrupts or taken[-1] is ticks.tick
+    assert len(ticks.result) == 2
     *_, last = Drive(Walk(), None, ticks.run)
     np.testing.assert_array_equal(last.result, list(walked())[-1].result)
 

@@ -8,8 +8,9 @@ from rich.console import Console
 from gsjax.engine.budget import Budget
 from gsjax.engine.fit.sizes import Sizes
 from gsjax.engine.messages import Notes
-from gsjax.engine.progress import Progress
+from gsjax.engine.progress import Progress, load_run, save_run
 from gsjax.methods.fit import FitConfig
+from gsjax.optim.method import Run
 
 CONSOLE = Console(quiet=True)
 
@@ -89,9 +90,21 @@ def test_nothing_is_decided_before_a_step_is_measured():
     assert factor(0.7) == 2
 
 
-def test_a_resumed_fit_goes_on_at_its_size():
-    progress = Progress(rows=[{"shrink": 2}])
+@pytest.mark.parametrize("shrink", [2, 0])  # in the checkpoint; an older one has it only in rows
+def test_a_resumed_fit_goes_on_at_its_size(shrink):
+    progress = Progress(rows=[{"shrink": 4 if shrink else 2}], shrink=shrink)
     assert sizes(1000.0, (480, 270), progress=progress)[0](0.6) == 2
+
+
+def test_a_size_chosen_since_the_last_row_is_kept(tmp_path):
+    factor, progress, _ = sizes(1000.0, (480, 270))
+    assert factor(0.1) == 4
+    progress.rows.append({"shrink": factor.now})
+    progress.pace = 20.0
+    assert factor(0.2) == 2
+    save_run(tmp_path, Run(None, None), progress)
+    _, progress = load_run(tmp_path, Run(None, None), Progress())
+    assert sizes(1000.0, (480, 270), progress=progress)[0](0.2) == 2
 
 
 def test_what_an_interrupted_fit_decided_is_not_decided_again():

@@ -123,7 +123,7 @@ def run(options: Options, by_preset: Callable[[str], Options]) -> int:
                 background=sequence.background,
                 hull=source == "hull",
             )
-        progress = Progress({"frames, depth, masks, poses and features": data.digest()})
+        progress = Progress({"frames, depth, masks, poses and features": data.digest()}, begun=begun)
         if options.resume:
             run, progress = load_run(folder.resume, run, progress)
             budget.check_exceeds(progress.used_seconds)
@@ -156,7 +156,7 @@ def run(options: Options, by_preset: Callable[[str], Options]) -> int:
             "names": data.names,
             "depth": {"source": source, "metric": metric},
             "poses": refined,
-            **progress.found(run.step, begun),
+            **progress.found(run.step),
             "machine": describe_machine(),
             **judged,
             "notes": notes.all,

@@ -107,7 +107,8 @@ def run(options: Options) -> int:
             {
                 str(scene.file.resolve()): sha256,
                 "the teacher's features of photographs, and their poses": teaching.digest(),
-            }
+            },
+            begun=begun,
         )
         if options.resume:
             run, progress = load_run(folder.resume, run, progress)
@@ -156,7 +157,7 @@ def run(options: Options) -> int:
             "views": {"taught": len(problem.views), "held_out": len(scene.held_out)},
             "size": photographs.sizes.max(0),
             "encoded": {"anew": cache.asked, "from_cache": cache.found},
-            **progress.found(steps, begun),
+            **progress.found(steps),
             "machine": describe_machine(),
             **judged,
             "notes": notes.all,

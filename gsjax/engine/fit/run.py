@@ -99,12 +99,13 @@ def run(options: Options) -> int:
             may_change = [name for name in _MAY_CHANGE if not (differ and name == "minutes")]
             folder.check_config(settings, but=tuple(may_change))
         frames = read_frames(photographs, console)
-        progress = Progress({"the photographs": photographs_digest(photographs, chosen, frames)})
+        progress = Progress({"the photographs": photographs_digest(photographs, chosen, frames)}, begun=begun)
         fitted = [frames[i] for i in chosen]
         width, height = photographs.sizes[photographs.sizes.prod(1).argmax()].tolist()
-        config = options.fit
+        config, in_time = options.fit, None
         if options.minutes is not None and is_default:
-            config = _settings_within_minutes(config, (width, height), options.minutes, notes, console)
+            config, in_time = settings_within(config, (width, height), options.minutes)
+            config = replace(config, steps=_UNLIMITED)
         config, cloud = start_from(photographs, fitted, config, console)
         method = Fit(config)
         problem, run = method.start(fitted, cloud, photographs.background)
@@ -115,6 +116,8 @@ def run(options: Options) -> int:
             if is_default:  # the slots that an earlier run chose for its minutes are kept
                 config = replace(config, cap=run.params.gaussians.num)
                 method = Fit(config)
+        if in_time is not None:
+            _tell_settings(config, None if options.resume else in_time, notes, console)
         folder.write_config(settings)  # from here on an earlier run is gone
         if options.minutes is not None:
             sizes = Sizes(config, (width, height), budget, progress, notes, console)
@@ -156,7 +159,7 @@ def run(options: Options) -> int:
             },
             "size": photographs.sizes.max(0),
             "start": problem.start,
-            "seconds": seconds | {"total": perf_counter() - begun},
+            "seconds": seconds | {"total": progress.total_seconds},
             "machine": describe_machine(),
             "test": scores.mean() if judged and scores.rows else None,
             "views": scores.rows,
@@ -183,18 +186,15 @@ def _at_scale(photographs: Photographs, scale: float | None, notes: Notes, conso
     return scaled
 
 
-def _settings_within_minutes(
-    config: FitConfig, size: tuple[int, int], minutes: float, notes: Notes, console: Console
-) -> FitConfig:
-    """The settings that pay off in these minutes; also prints and notes them."""
-    found, steps = settings_within(config, size, minutes)
-    words = (
-        f"up to {found.cap:,} Gaussians with colours of degree {found.sh_degree}, as there should be time "
-        f"for {steps:,} steps"
-    )
+def _tell_settings(config: FitConfig, steps: int | None, notes: Notes, console: Console) -> None:
+    """Print and note the settings that --minutes chose for a number of steps; None in a resumed run, which
+    has the Gaussians that were chosen at its start."""
+    most, colours = f"up to {config.cap:,} Gaussians", f"with colours of degree {config.sh_degree}"
+    words = f"{most}, as when the run was started, {colours}"
+    if steps is not None:
+        words = f"{most} {colours}, as there should be time for {steps:,} steps"
     console.print(words, soft_wrap=True)
     notes.add(f"U{words[1:]} (--minutes).")
-    return replace(found, steps=_UNLIMITED)
 
 
 def _fitted(
@@ -211,8 +211,10 @@ def _fitted(
     goal, steps = options.until_psnr, method.config.steps
 
     def is_met(run: Run) -> bool:
-        """Whether the wanted PSNR is reached: by the views evaluated last, and then by all held-out views."""
-        if goal is None or not any(row["test_psnr"] >= goal for row in evaluated(progress.rows)[-1:]):
+        """Whether the wanted PSNR is reached: by the views evaluated after the newest step, if they were, and
+        then by all held-out views."""
+        rows = [row for row in evaluated(progress.rows)[-1:] if row["step"] == run.step]
+        if goal is None or not any(row["test_psnr"] >= goal for row in rows):
             return False
         found = judge(run.params.gaussians, judged).mean()["psnr"]
         return found is not None and found >= goal

@@ -39,30 +39,31 @@ class Sizes:
         """
         self._config, self._size, self._budget, self._progress = config, size, budget, progress
         self._notes, self._console = notes, console
-        self._now = progress.rows[-1]["shrink"] if progress.rows else 0
-        self._resumed, coarse = bool(progress.rows), config.coarse_until
+        if progress.rows and not progress.shrink:  # of an older checkpoint
+            progress.shrink = progress.rows[-1]["shrink"]
+        self._resumed, coarse = bool(progress.shrink), config.coarse_until
         self._times = [t for t in (coarse / 3, coarse, (1 + coarse) / 2) if coarse]
 
     @property
     def now(self) -> int:
         """The current factor; 0 before the first step."""
-        return self._now
+        return self._progress.shrink
 
     def __call__(self, progress: float) -> int:
-        if not self._now:
-            self._now = self._first()
+        if not self.now:
+            self._progress.shrink = self._first()
         if self._resumed:  # earlier decisions are not made again
             self._times, self._resumed = [t for t in self._times if t > progress], False
-        if self._now > 1 and self._times and progress >= self._times[0] and (pace := self._progress.pace):
+        if self.now > 1 and self._times and progress >= self._times[0] and (pace := self._progress.pace):
             self._times.pop(0)
             last = not self._times
             left = int((self._budget.steps_s - _COMPILING_S) * pace / _COST_RATIO)
             if left >= LEAST_STEPS:
-                self._now //= 2
+                self._progress.shrink //= 2
                 self._progress.pace = 0.0  # unknown at the new size
             elif last:
                 self._say(max(0, left))
-        return self._now
+        return self.now
 
     def _first(self) -> int:
         """The initial factor: four times that of the largest size for which there should be time."""
@@ -73,8 +74,8 @@ class Sizes:
     def _say(self, left: int) -> None:
         width, height = self._size
         words = (
-            f"photographs stay at {width // self._now}x{height // self._now}: of {2 * width // self._now}x"
-            f"{2 * height // self._now} there would be time for {left} steps"
+            f"photographs stay at {width // self.now}x{height // self.now}: of {2 * width // self.now}x"
+            f"{2 * height // self.now} there would be time for {left} steps"
         )
         self._console.print(words, soft_wrap=True)
         self._notes.add(f"P{words[1:]}, and {LEAST_STEPS} are needed to gain by it (--minutes).")

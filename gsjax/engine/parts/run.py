@@ -117,7 +117,7 @@ def run(options: Options) -> int:
         method = Parts(options.parts)
         problem, first = method.start(tracked, start)
         seconds["discovery"] = perf_counter() - at
-        progress = Progress(_inputs(data, scene))
+        progress = Progress(_inputs(data, scene), begun=begun)
         if options.resume:
             first, progress = load_run(folder.resume, first, progress)
             followed = int(method.result(problem, first).done.sum())
@@ -130,7 +130,7 @@ def run(options: Options) -> int:
         last = method.brought_up_to_date(problem, loop.run)
         outcome = method.result(problem, last)
         found = write_outputs(folder, recording, start, last, outcome, progress, seconds, notes, console)
-        found["seconds"]["total"] = perf_counter() - begun
+        found["seconds"]["total"] = progress.total_seconds
         found["notes"] = notes.all
         finish(folder, found, summarize)
     return exit_code(progress.stopped)

@@ -21,6 +21,7 @@ import gsjax.engine.photographs
 from gsjax.cli import main
 from gsjax.data.video import describe_video
 from gsjax.engine.fit.ablation import ablate_time
+from gsjax.engine.fit.judge import Scores
 from gsjax.engine.fit.schedule import Evaluation
 from gsjax.engine.messages import Notes
 from gsjax.engine.progress import Progress
@@ -137,9 +138,12 @@ def test_what_minutes_decided_holds_when_a_run_is_resumed(gsjax_fit, tmp_path, m
     assert "was started with minutes 0.2, now it is None" in " ".join(said.split())
     code, said = gsjax_fit("--resume", "--minutes", "0.9")
     assert code == 0, said
+    words = "p to 7,400 Gaussians, as when the run was started, with colours of degree"
+    assert f"u{words}" in " ".join(said.split())
     found = json.loads((tmp_path / "run" / "metrics.json").read_text())
     assert found["steps"] > 1
     assert found["num_gaussians"] <= 7_400
+    assert any(note.startswith(f"U{words}") for note in found["notes"])
 
 
 @pytest.mark.thorough
@@ -296,6 +300,20 @@ def test_it_stops_only_when_all_held_out_views_are(gsjax_fit, tmp_path, monkeypa
     code, said = gsjax_fit(*QUICK, "--until-psnr", "90")
     assert code == 0, said
     assert json.loads((tmp_path / "run" / "metrics.json").read_text())["steps"] == 24
+
+
+@pytest.mark.thorough
+def test_a_resumed_fit_is_judged_only_where_it_would_be(gsjax_fit, tmp_path, monkeypatch, interrupted):
+    goal, mean = ("--until-psnr", "90"), Scores.mean
+    with interrupted(12), monkeypatch.context() as context:
+        context.setattr(
+            Evaluation, "__call__", lambda self, now: {"test_psnr": 99.0} if now.step == 8 else None
+        )
+        assert gsjax_fit(*QUICK, *goal)[0] == 130
+    monkeypatch.setattr(Scores, "mean", lambda self: mean(self) | {"psnr": 99.0})
+    code, said = gsjax_fit(*QUICK, *goal, "--resume")
+    assert code == 0, said
+    assert json.loads((tmp_path / "run" / "metrics.json").read_text())["steps"] == 16
 
 
 @pytest.mark.thorough

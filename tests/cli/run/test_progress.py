@@ -1,13 +1,19 @@
 """What is noted of a run that ended early, and which resume folders are refused."""
 
+import errno
 import json
+import signal
+import threading
 from io import StringIO
+from time import perf_counter
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from rich.console import Console
 
+import gsjax.engine.progress
+from gsjax.data.errors import DataWarning
 from gsjax.engine.drive import drive
 from gsjax.engine.folder import RunFolder
 from gsjax.engine.messages import Notes
@@ -66,6 +72,13 @@ def test_inputs_that_changed_are_refused_unless_the_version_before_did_not_look_
             load_run(tmp_path, run, Progress({"the scene": "1", "the data": "3"}))
 
 
+def test_the_time_of_a_resumed_run_is_that_of_all_its_commands(tmp_path):
+    run = Run(jnp.zeros(2), None)
+    save_run(tmp_path, run, Progress(begun=perf_counter() - 3600))
+    _, progress = load_run(tmp_path, run, Progress(begun=perf_counter() - 60))
+    assert progress.found(0)["seconds"]["total"] == pytest.approx(3660, abs=5)
+
+
 @pytest.mark.parametrize("name", ["state.npz", "parts.npz"])
 def test_what_was_saved_under_another_name_is_refused(name, tmp_path):
     (tmp_path / name).write_bytes(b"of another version")
@@ -91,6 +104,36 @@ def test_a_log_says_when_a_later_step_compiles(tmp_path):
     ]
 
 
+def test_a_row_that_a_full_disk_refuses_is_written_with_the_next(tmp_path, monkeypatch):
+    def full(path):
+        monkeypatch.undo()
+        raise OSError(errno.ENOSPC, "No space left on device", str(path))
+
+    monkeypatch.setattr(gsjax.engine.progress, "atomic_write", full)
+    schedule, folder = Schedule("walking", 8, means_of(), str, every=2), RunFolder(tmp_path / "run")
+    said = r"could not log a row \(.*metrics\.jsonl: no space left on device\); walking goes on"
+    with pytest.warns(DataWarning, match=said):
+        progress = watch(walked(), Progress(), schedule, folder, Console(quiet=True))
+    assert progress.stopped is None
+    rows = [json.loads(line)["step"] for line in folder.metrics_lines.read_text().splitlines()]
+    assert rows == [2, 4, 6, 8]
+
+
+@pytest.mark.skipif(threading.current_thread() is not threading.main_thread(), reason="signals")
+def test_ctrl_c_waits_for_the_row_of_a_step(tmp_path):
+    def evaluate(now):
+        if now.step == 3:
+            signal.raise_signal(signal.SIGINT)
+        return {"seen": now.step} if now.step == 3 else None
+
+    schedule, folder = Schedule("walking", 8, means_of(), str), RunFolder(tmp_path / "run")
+    ticks = walked()
+    progress = watch(ticks, Progress(), schedule, folder, Console(quiet=True), evaluate=evaluate)
+    assert isinstance(progress.stopped, KeyboardInterrupt)
+    assert ticks.run.step == 3
+    assert [row["seen"] for row in progress.rows] == [3]
+
+
 def test_a_loss_that_is_lost_is_mended_counted_and_told(tmp_path):
     method = Descent(DescentConfig(steep_after=430))
     schedule = Schedule("descending", 1000, means_of(), lambda row: f"loss {row['loss']}")  # None where lost
@@ -98,8 +141,8 @@ def test_a_loss_that_is_lost_is_mended_counted_and_told(tmp_path):
     progress = watch(ticks, Progress(), schedule, RunFolder(tmp_path / "run"), Console(quiet=True))
     assert progress.stopped is None
     assert progress.returns == ticks.run.guard.returns >= 1
-    assert progress.found(1000, 0.0)["returns"] == progress.returns
-    assert progress.found(1000, 0.0)["settled"] == ticks.run.guard.is_settled
+    assert progress.found(1000)["returns"] == progress.returns
+    assert progress.found(1000)["settled"] == ticks.run.guard.is_settled
     notes = Notes(Console(quiet=True))
     warn_of_mishaps(progress, notes)
     assert "continued from its best parameters" in notes.all[-1]
