@@ -11,6 +11,7 @@ from gsjax.engine.options import HeldOutFrames
 from gsjax.engine.photographs import split
 from gsjax.io.atomic import atomic_write
 from gsjax.scene.initialize import points_from_rgbd
+from gsjax.scene.origin import cameras_in_world, in_world
 
 _DEPTHS, _PIXELS = 12, 3000  # if the data have no points: depth images to use, and points from each
 _MOST_COLORS = 8
@@ -46,17 +47,18 @@ def write_picture(path: Path, photographs: Photographs, groups: Groups) -> None:
         return "#{:02x}{:02x}{:02x}".format(*(BACKGROUND if name == _OTHERS else label_color(number + 1)))
 
     points, colors = scene_points(photographs)
+    viewmats = cameras_in_world(photographs.viewmats, photographs.origin)
     figure = cameras_and_points(
         {
             name: CameraGroup(
-                photographs.viewmats[chosen],
+                viewmats[chosen],
                 photographs.Ks[chosen],
                 photographs.sizes[chosen],
                 color(number, name),
             )
             for number, (name, chosen) in enumerate(groups.items())
         },
-        points,
+        None if points is None else in_world(points, photographs.origin),
         colors,
         unit="m" if photographs.load_depth is not None else "units of the data",
         title=photographs.name,

@@ -4,13 +4,14 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from rich.console import Console
+from rich.measure import Measurement
 from rich.table import Table as Grid
 from rich.text import Text
 
 from gsjax.engine.summary import ARROWS, Card, Column, Summary, Table
 
 _WIDE = 130  # columns of a terminal that has room for every column of a table
-_LOG_WIDTH = 200
+_ENDLESS = 10_000  # columns of a log: programs search it, so it keeps its lines whole
 
 
 def print_summary(
@@ -24,15 +25,13 @@ def print_summary(
         notes: print its notes too.
         titles: print the titles of its tables too.
     """
-    console = Console(highlight=False)
-    if not console.is_terminal:  # a log has room, and programs search it
-        console.width = _LOG_WIDTH
+    console = _console()
     console.print()
     for table in summary.tables:
         if table.brief and table.rows:
             if titles:
                 console.print(Text(table.title, style="bold"))
-            console.print(_grid(table, console.width))
+            _print_columns(console, table)
     if summary.cards:
         console.print(_cards(summary.cards))
     if summary.subtitle:
@@ -49,14 +48,14 @@ def print_summary(
 
 def print_table(table: Table) -> None:
     """Print a table on stdout, below its title."""
-    console = Console(highlight=False)
+    console = _console()
     console.print(Text(f"\n{table.title}", style="bold"))
-    console.print(_grid(table, console.width))
+    _print_columns(console, table)
 
 
 def print_facts(facts: Mapping[str, str], title: str = "") -> None:
     """Print facts on stdout below a title, a line each, with their names in bold."""
-    console = Console(highlight=False)
+    console = _console()
     if title:
         console.print(Text(title, style="bold cyan"))
     console.print(_facts(facts))
@@ -78,16 +77,39 @@ def _cards(cards: Sequence[Card]) -> Grid:
     return _facts({card.head: f"{card.text} {card.unit}".strip() for card in cards})
 
 
-def _grid(table: Table, width: int) -> Grid:
+def _console() -> Console:
+    console = Console(highlight=False)
+    if not console.is_terminal:
+        console.width = _ENDLESS
+    return console
+
+
+def _print_columns(console: Console, table: Table) -> None:
+    """Print a table; columns for which there is no room follow below, beside the first column again."""
+    room = console.width
+    columns = [column for column in table.shown if room >= _WIDE or not column.wide]
+    first, others = columns[:1], columns[1:]
+    endless = console.options.update_width(_ENDLESS)
+    while True:
+        for count in range(len(others), -1, -1):
+            grid = _grid(table, [*first, *others[:count]], room)
+            if count <= 1 or Measurement.get(console, endless, grid).maximum <= room:
+                break
+        console.print(grid)
+        others = others[count:]
+        if not others:
+            return
+
+
+def _grid(table: Table, columns: Sequence[Column], room: int) -> Grid:
     grid = Grid(box=None, pad_edge=False, padding=(0, 2, 0, 0), header_style="bold")
-    columns = [column for column in table.shown if width >= _WIDE or not column.wide]
     units = any(column.unit or column.better for column in columns)
     for column in columns:
         grid.add_column(
             _head(column, units),
             justify="right" if table.is_numeric(column) else "left",
-            no_wrap=column is not columns[0],
             overflow="fold",
+            max_width=room // 2 if column is columns[0] and len(columns) > 1 else None,
         )
     for i, row in enumerate(table.rows):
         styles = ("bold green" if (i, column.key) in table.best else "" for column in columns)

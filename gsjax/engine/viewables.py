@@ -1,6 +1,6 @@
 """The scenes that `gsjax view` opens: any run, a file of Gaussians or a folder of numbered files."""
 
-from dataclasses import fields, replace
+from dataclasses import fields
 from pathlib import Path
 from typing import Literal
 
@@ -279,9 +279,9 @@ def _of_parts(path: Path, notes: Notes) -> Viewable:
     else:
         if not saved.complete:
             notes.warn("a partial run: it has only the frames that were followed, and no cameras")
-    filmed = _filmed(path, layer, names, blend_of(path) if saved is None else saved.blend, saved)
-    scene = filmed.viewable((layer,), None if saved is None else editing_of(saved, filmed))
-    return replace(scene, origin=origin)
+    blend = blend_of(path) if saved is None else saved.blend
+    filmed = _filmed(path, layer, names, blend, origin, saved)
+    return filmed.viewable((layer,), None if saved is None else editing_of(saved, filmed))
 
 
 def _of_film(path: Path, notes: Notes) -> Viewable:
@@ -291,15 +291,17 @@ def _of_film(path: Path, notes: Notes) -> Viewable:
     film, doubts = edited(script, saved)
     for doubt in doubts:
         notes.warn(doubt)
-    filmed = _filmed(path, saved.layer, saved.names, saved.blend, saved)
-    return replace(filmed.viewable(film), origin=saved.recording.judged.origin)
+    origin = saved.recording.judged.origin
+    return _filmed(path, saved.layer, saved.names, saved.blend, origin, saved).viewable(film)
 
 
-def _filmed(path: Path, layer: Layer, names: Names, blend: Blend, saved: PartsRun | None) -> Filmed:
+def _filmed(
+    path: Path, layer: Layer, names: Names, blend: Blend, origin: np.ndarray | None, saved: PartsRun | None
+) -> Filmed:
     """What the films of a run have in common, with its cameras if it is complete."""
     times = np.asarray(layer.trajectory.times)
     shots = None if saved is None or not saved.complete else _shots_of_recording(saved.recording)
-    return Filmed(path.absolute().name, names, blend, times - times[0], shots)
+    return Filmed(path.absolute().name, names, blend, times - times[0], shots, origin)
 
 
 def _shots_of(photographs: Photographs) -> Shots:

@@ -10,6 +10,7 @@ import shutil
 import subprocess
 import zlib
 from dataclasses import replace
+from pathlib import Path
 
 import cv2
 import equinox as eqx
@@ -17,6 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import gsjax.io.page
 from gsjax.geometry.cameras import Camera, intrinsics
 from gsjax.io.page import Film
 from gsjax.io.scene_file import columns_of
@@ -173,6 +175,25 @@ def test_what_cannot_be_played_is_refused(tmp_path, monkeypatch):
     with pytest.raises(ValueError, match=r"film: expected a format that has it \(.html\), found"):
         write_gaussians(tmp_path / "scene.spz", scene, film=film)
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.skipif(shutil.which("node") is None, reason="there is no Node.js")
+def test_one_gaussian_far_away_leaves_the_others_in_order():
+    page = (Path(gsjax.io.page.__file__).parent / "page.html").read_text()
+    sorter = re.search(r"function sorter\(\) \{.*?\n\}\n", page, re.DOTALL)[0]
+    depths = np.random.default_rng(0).uniform(-1, 1, 300)
+    depths[:3] = 1e5, -3.5, -2.95  # far away, behind the eye, and nearer than the near plane
+    points = np.stack([0 * depths, 0 * depths, depths], 1)
+    data = "{ forward: [0, 0, 1], eye: -3, near: 0.1, turn: 0 }"
+    script = f"""{sorter} sorter();
+        globalThis.postMessage = ({{ order, drawn }}) => console.log(JSON.stringify([[...order], drawn]));
+        onmessage({{ data: {{ points: new Float32Array({points.ravel().tolist()}) }} }});
+        onmessage({{ data: {data} }});"""
+    told = subprocess.run(["node", "-e", script], capture_output=True, text=True, timeout=60, check=True)
+    order, drawn = json.loads(told.stdout)
+    assert drawn == 298
+    assert {*order[drawn:]} == {1, 2}
+    assert (np.diff(depths[order[:drawn]]) < 1e-3).all()
 
 
 def browse(*arguments) -> str:

@@ -102,6 +102,13 @@ def test_a_pick_is_described_in_full():
     assert "Nothing there" in markup.describe_pick(scene, None, 0)
 
 
+def test_the_centre_of_a_pick_is_in_the_coordinates_of_the_data():
+    scene = Viewable("x", cloud(), origin=np.array([500_000.0, 5_000_000.0, 300.0]))
+    x, y, z = np.asarray(scene.gaussians.means, float)[7] + scene.origin
+    table = markup.describe_pick(scene, Picked(7, 1, np.zeros(3), 1, 1), 0)
+    assert f"| centre | {x:.3f}, {y:.3f}, {z:.3f} |" in table
+
+
 def test_legends_name_what_colours_mean():
     scene = Viewable("x", cloud(), np.arange(24) % 3, {1: "<b>mug</b>"}, unit="m")
     html = markup.legend(scene, "label", None, [0, 1, 2])

@@ -214,6 +214,10 @@ def test_a_page_from_the_first_picture_to_the_last_screenshot(scene):
         page._visited.value = "left"
         until(lambda: not page._photograph.visible)
         np.testing.assert_allclose(page._client.camera.position, (-4, 0, 0), atol=1e-6)
+        # A click on the frustum that was visited last leads back there.
+        page._go(page._start)
+        page._shots._go(1)
+        until(lambda: np.allclose(page._client.camera.position, (-4, 0, 0), atol=1e-6))
         # What is shown can be saved.
         page._save_screenshot("render", page._picture)
         assert saved.pictures[0][0] == "render"

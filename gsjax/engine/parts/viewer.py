@@ -33,6 +33,7 @@ class Filmed:
         blend: how rotations are blended.
         times: times of the recording, seconds from its start.
         shots: its photographs at these times; None if they are not available.
+        origin: the point that positions are relative to; None if it is 0.
     """
 
     title: str
@@ -40,6 +41,7 @@ class Filmed:
     blend: Blend
     times: np.ndarray
     shots: Shots | None
+    origin: np.ndarray | None
 
     def viewable(self, film: Film, editing: Editing | None = None) -> Viewable:
         """A film to view. Gaussians that change come first; each frame is computed when it is shown."""
@@ -57,6 +59,7 @@ class Filmed:
             times=times,
             shots=None if self.shots is None else _at_times(self.shots, self.times, times - times[0]),
             unit="m",
+            origin=self.origin,
             editing=editing,
         )
 

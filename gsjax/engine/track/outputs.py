@@ -127,7 +127,10 @@ def write_plots(
         keep("psnr", plots.psnr_over_frames(tracked, held_out), "PSNR of rendered pictures")
     if moved:
         paths = _centroids(tracking, names, group_labels)
-        figure = plots.trajectories(paths, labels, _true_paths(recording, tracking, paths, names))
+        both = paths, _true_paths(recording, tracking, paths, names)
+        origin = recording.tracked.origin
+        found, true = ({name: in_world(path, origin) for name, path in each.items()} for each in both)
+        figure = plots.trajectories(found, labels, true)
         keep("paths", figure, "Centroids along x, y and z; ring: start, dot: end; thin lines: the truth")
     return written
 

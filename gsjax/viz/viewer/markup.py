@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from gsjax.scene.origin import in_world
 from gsjax.viz.colors import label_color
 from gsjax.viz.viewer.pick import Picked
 from gsjax.viz.viewer.viewable import Coloring, Viewable
@@ -64,7 +65,7 @@ def describe_pick(scene: Viewable, picked: Picked | None, frame: int) -> str:
     if picked is None:
         return NOTHING_THERE
     gaussians, row = scene.at(frame), picked.index
-    center = np.asarray(gaussians.means)[row]
+    center = in_world(np.asarray(gaussians.means)[row], scene.origin)
     scales = np.exp(np.asarray(gaussians.log_scales, np.float64)[row])
     opacity = 1 / (1 + np.exp(-float(gaussians.logit_opacities[row])))
     unit = f" {scene.unit}" if scene.unit else ""

@@ -176,6 +176,7 @@ class Page:
         self._names = unique(shots.names)
 
         def go(shot: int) -> None:
+            self._visited.value = "..."  # viser ignores a value that is already set
             self._visited.value = self._names[shot]  # its callback moves the camera
 
         return ShotNodes(self._client.scene, shots, frustum_size(self._shared.scene), go)

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from dataclasses import replace
 
 import cv2
 import equinox as eqx
@@ -11,7 +12,9 @@ import pytest
 import gsjax
 from gsjax.cli import main
 from gsjax.data import DataWarning, Photographs, open_photographs, open_sequence, photographs_of
-from gsjax.engine.info_picture import by_camera, by_split, scene_points
+from gsjax.data.origin import relative_to_origin
+from gsjax.data.photographs import Cloud
+from gsjax.engine.info_picture import by_camera, by_split, scene_points, write_picture
 from gsjax.engine.info_scene import describe_scene
 from gsjax.io.ply import write_ply
 from gsjax.io.scenes import write_gaussians
@@ -70,6 +73,23 @@ def test_a_picture_shows_what_becomes_of_each_photograph(photographs, capfd, tmp
     assert counts == {"fitted": 7, "held out": 2}
     assert drawn["points"] is None
     assert drawn["unit"] == "units of the data"
+
+
+def test_a_picture_is_in_the_coordinates_of_the_data(photographs, tmp_path, monkeypatch):
+    drawn = {}
+
+    def draw(groups, points, colors, **words):
+        drawn.update(groups=groups, points=points)
+        return cameras_and_points(groups, points, colors, **words)
+
+    monkeypatch.setattr("gsjax.viz.cameras.cameras_and_points", draw)
+    with pytest.warns(DataWarning):
+        data = open_photographs(photographs)
+    cloud = Cloud(np.eye(3), np.zeros((3, 3)))
+    moved = relative_to_origin(replace(data, cloud=cloud), np.array([500_000.0, 5_000_000.0, 300.0]))
+    write_picture(tmp_path / "a.svg", moved, {"all": np.arange(data.num)})
+    np.testing.assert_allclose(drawn["groups"]["all"].viewmats, data.viewmats, atol=1e-6)
+    np.testing.assert_allclose(drawn["points"], np.eye(3), atol=1e-6)
 
 
 def test_the_split_of_the_data_is_shown_too(photographs, tmp_path, monkeypatch):

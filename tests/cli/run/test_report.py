@@ -1,14 +1,16 @@
 import base64
 import os
 import re
+from functools import partial
 from html.parser import HTMLParser
 
 import numpy as np
 import pytest
+from rich.console import Console
 
 from gsjax.engine.report import write_report
 from gsjax.engine.summary import Card, Column, Media, Summary, Table, format_number
-from gsjax.engine.terminal import print_summary
+from gsjax.engine.terminal import print_summary, print_table
 
 VOID = {"meta", "img", "br"}
 
@@ -154,6 +156,23 @@ def test_the_terminal_shows_what_the_report_does(capsys, tmp_path):
     assert "A note." not in lines
     print_summary(summary, None, notes=True, titles=True)
     assert "A note." in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("width", [60, 80, 120, None])
+def test_every_name_and_figure_of_a_table_is_whole_in_a_terminal_of_any_width(width, monkeypatch, capsys):
+    terminal = partial(Console, force_terminal=width is not None, color_system=None, width=width)
+    monkeypatch.setattr("gsjax.engine.terminal.Console", terminal)
+    heads = [f"mean error of what is seen {number}" for number in range(8)]
+    columns = [Column("run", "name"), *(Column(head, head, "mm", 2) for head in heads)]
+    rows = [{"name": name, **{head: 12345.25 for head in heads}} for name in ("runs/" + "a" * 20, "runs/b")]
+    print_table(Table("Scores", columns, rows))
+    text = capsys.readouterr().out
+    parts = text.count("runs/b")
+    assert text.count("runs/" + "a" * 20) == parts
+    assert (parts == 1) == (width is None), "only a log has room for all columns beside each other"
+    assert text.count("12\u202f345.25") == 16
+    assert text.count("error of what is seen") == 8
+    assert max(map(len, text.splitlines())) <= (width or 1000)
 
 
 @pytest.mark.parametrize(
