@@ -108,7 +108,9 @@ def list_photographs(folder: Path) -> list[str]:
     """
     if not folder.is_dir():
         raise DataError(folder, "a folder of photographs or a video", "nothing there", "Check the path.")
-    files = [path for path in folder.rglob("*") if path.is_file()]
+    inside = (path.relative_to(folder) for path in folder.rglob("*"))
+    shown = [name for name in inside if not any(part.startswith(".") for part in name.parts)]  # no thumbnails
+    files = [folder / name for name in shown if (folder / name).is_file()]
     names = sorted(path.relative_to(folder).as_posix() for path in files if is_picture(path))
     expected = f"{_SMALLEST_MODEL} photographs or more ({', '.join(SUFFIXES)})"
     reject_unread(folder, expected, files, others=len(names))

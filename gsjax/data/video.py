@@ -186,7 +186,7 @@ class Video:
 def _opened(path: Path) -> cv2.VideoCapture:
     if not path.exists():
         raise _no_such_video(path)
-    capture = cv2.VideoCapture(str(path))
+    capture = cv2.VideoCapture(str(path.absolute()))
     if not capture.isOpened():
         raise _not_a_video(path)
     return capture

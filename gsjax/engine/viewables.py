@@ -274,7 +274,7 @@ def _of_parts(path: Path, notes: Notes) -> Viewable:
     saved = None
     try:
         saved = open_parts_run(path)
-    except ValueError as error:
+    except (ValueError, OSError) as error:
         notes.warn(f"its recording is not shown, and nothing can be edited: {error}")
     else:
         if not saved.complete:

@@ -92,7 +92,7 @@ class _Encoder:
         self._messages = tempfile.TemporaryFile()  # noqa: SIM115  (`finish` closes it)
         # imageio-ffmpeg's own writer forks with a `preexec_fn`, which may deadlock with JAX's threads.
         self._process = subprocess.Popen(
-            [_ffmpeg(), "-y", "-loglevel", "error", *source, *target, str(path)],
+            [_ffmpeg(), "-y", "-loglevel", "error", *source, *target, f"file:{path}"],
             stdin=subprocess.PIPE,
             stderr=self._messages,
             **_own_process_group(),
@@ -132,7 +132,7 @@ def read_video_frames(path: str | os.PathLike) -> UInt8[np.ndarray, "T H W 3"]:
     """
     if not Path(path).is_file():
         raise FileNotFoundError(f"{path}: expected a video, found no file. Check the path")
-    capture, frames = cv2.VideoCapture(str(path)), []
+    capture, frames = cv2.VideoCapture(str(Path(path).absolute())), []
     while (grabbed := capture.read())[0]:
         frames.append(cv2.cvtColor(grabbed[1], cv2.COLOR_BGR2RGB))
     capture.release()

@@ -31,6 +31,13 @@ def test_frames_come_back_in_order_and_colour(tmp_path):
     assert os.listdir(path.parent) == ["a.mp4"]
 
 
+def test_a_colon_in_a_relative_path_is_no_protocol(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with VideoWriter("12:30/a.mp4", fps=10) as video:
+        video.write(ramp(0))
+    assert len(read_video_frames("12:30/a.mp4")) == 1
+
+
 def test_odd_sizes_are_padded_and_bytes_taken(tmp_path):
     with VideoWriter(tmp_path / "a.mp4", fps=29.97) as video:
         video.write(np.full((17, 33, 3), 200, np.uint8))

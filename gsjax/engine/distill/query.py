@@ -6,7 +6,6 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import cv2
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -15,6 +14,8 @@ from jaxtyping import Array, Bool, Float
 from rich.console import Console
 from rich.progress import track
 
+from gsjax.data.errors import DataError
+from gsjax.data.files import picture_size, read_rgba
 from gsjax.data.photographs import Photographs
 from gsjax.engine.distill.file import NAME, read_field
 from gsjax.engine.distill.saved import FieldRun, short_names
@@ -203,17 +204,15 @@ class QueryableField(Queryable):
 
     def _of_image(self, path: Path) -> np.ndarray:
         """The vector of a picture."""
-        picture = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
-        if picture is None:
-            found = "a file of another kind" if path.exists() else "nothing"
-            raise ValueError(f"--image {path}: expected a picture, found {found}")
-        if picture.ndim == 2:
-            picture = np.repeat(picture[..., None], 3, axis=2)
+        try:
+            picture = read_rgba(path, *picture_size(path))
+        except DataError as error:
+            raise ValueError(f"--image {error}") from error
         opaque = picture[..., 3] > 127 if picture.shape[2] == 4 else np.ones(picture.shape[:2], bool)
         if not opaque.any():
             raise ValueError(f"--image {path}: expected something opaque in it, found nothing")
         label = max(self._source.names, default=0) + 1  # without a name: encoded by its appearance
-        image = np.ascontiguousarray(picture[..., 2::-1])
+        image = np.ascontiguousarray(picture[..., :3])
         labels = np.where(opaque, label, 0).astype(np.int32)
         return np.asarray(self.run.encoder.embed_objects(image, labels, label))[-1]
 

@@ -121,13 +121,23 @@ def scene_of_run(path: Path, images: str | None = None, read_scene: Read | None 
             f"{path}: expected a scene.ply, found none: the run is still going on, or failed"
         )
     gaussians, report = _read(file) if read_scene is None else read_scene
-    if record.kind == "track":
+    if record.kind in ("track", "parts"):
         if images is not None:
-            raise ValueError("--images: a run of `gsjax track` knows its recording; leave it out")
+            raise ValueError(f"--images: a run of `gsjax {record.kind}` knows its recording; leave it out")
         recording, _ = reopen(path / "config.yml", _AGAIN)
-        first = relative_to_scene(recording, report.origin).judged.select(frames=slice(0, 1))
+        at = (
+            0
+            if record.kind == "track"
+            else int(read_arrays(path / "parts.npz", ("anchor",), _AGAIN)["anchor"])
+        )
+        first = relative_to_scene(recording, report.origin).judged.select(frames=slice(at, at + 1))
         indices, count = list(range(first.num_cameras)), recording.tracked.num_cameras
         return FieldScene(file, gaussians, photographs_of(first), indices[:count], indices[count:])
+    if record.kind != "fit":
+        raise ValueError(
+            f"{path}: expected a run of `gsjax fit`, `gsjax track` or `gsjax parts`, found one of `gsjax "
+            f"{record.kind}`; name another, or its scene.ply with --images"
+        )
     photographs = photographs_of_run(record.config, images)
     photographs = relative_to_origin(with_learned_poses(photographs, path), report.origin)
     mode = "antialiased" if record.config["fit"].get("antialiased") else "classic"

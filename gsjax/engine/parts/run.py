@@ -227,6 +227,7 @@ def _fit_options(options: Options, path: Path, anchor: Anchor, recording: Record
         frames=f"{frame}:{frame + 1}",
         cameras=options.cameras,
         eval_cameras=options.eval_cameras,
+        test_every=0,
         scale=options.scale,
         resume=is_run(path),
         read=options.read,

@@ -15,6 +15,15 @@ from gsjax.io.ply import read_ply, write_ply
 from tests.cli.distill.conftest import SMALL, metrics
 
 
+def test_a_run_without_photographs_of_one_scene_is_refused(gsjax, scene, tmp_path):
+    settings = {"dataset": "simulated:tissue", "deform": {}, "tools": "draw"}
+    (tmp_path / "config.yml").write_text("# gsjax run\n" + yaml.safe_dump(settings))
+    shutil.copy(scene, tmp_path / "scene.ply")
+    code, said = gsjax("distill", tmp_path)
+    assert code == 2
+    assert "found one of `gsjax deform`" in said
+
+
 @pytest.mark.thorough
 @pytest.mark.parametrize("place", ["", "canonical"])
 def test_a_field_never_replaces_its_scene(gsjax, pristine, scene, tmp_path, place):

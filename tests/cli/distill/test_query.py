@@ -269,10 +269,14 @@ def test_a_picture_of_a_red_thing_means_red_things(gsjax, closed, scene, tmp_pat
     picture = np.zeros((20, 20, 3), np.uint8)
     picture[..., 2] = 200
     cv2.imwrite(str(tmp_path / "red.png"), picture)
-    code, said = gsjax("query", field, "--image", tmp_path / "red.png")
-    assert code == 0, said
-    scores = found_of(field)["all_scores"]
-    assert scene[1][scores.argmax()] == CARTON
+    cv2.imwrite(str(tmp_path / "deep.png"), picture.astype(np.uint16) * 257)
+    answers = []
+    for name in ("red.png", "deep.png"):  # 8 and 16 bits
+        code, said = gsjax("query", field, "--image", tmp_path / name)
+        assert code == 0, said
+        answers.append(found_of(field)["all_scores"])
+    np.testing.assert_array_equal(*answers)
+    assert scene[1][answers[0].argmax()] == CARTON
     assert CARTON in scene[1][found_of(field)["indices"]]
     code, said = gsjax("query", field, "spoon")
     assert code == 2

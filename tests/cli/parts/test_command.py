@@ -11,6 +11,7 @@ import gsjax.engine.parts.run
 from gsjax.cli import main
 from gsjax.data.video import describe_video
 from gsjax.engine.drive import Drive
+from gsjax.engine.photographs import choose_photographs, split
 from gsjax.engine.progress import Progress, save_run
 from gsjax.engine.recording import chosen_recording
 from gsjax.io.ply import read_ply
@@ -99,6 +100,17 @@ def test_a_run_from_a_scene_to_a_report(gsjax_parts, tmp_path):
     code, said = gsjax_parts(*QUICK)
     assert code == 2
     assert "holds a finished run" in said
+
+
+def test_all_cameras_that_are_not_held_out_take_part_in_the_canonical_scene(tmp_path, monkeypatch):
+    """Regression test: every eighth was left out, that is camera 0."""
+    fits = []
+    monkeypatch.setattr(gsjax.engine.parts.run, "run_fit", lambda options: fits.append(options) or 130)
+    told = ("parts", "simulated:articulated?width=64&height=48", "--out", str(tmp_path / "run"))
+    main([*told, "--frames", "0:16:5", "--cameras", "0", "1"])
+    (options,) = fits
+    chosen = choose_photographs(options.dataset, frames=options.frames, cameras=options.cameras)
+    assert len(split(chosen, options.test_every)[0]) == 2
 
 
 @pytest.mark.slow
