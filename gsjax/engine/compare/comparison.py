@@ -243,22 +243,27 @@ def _incomparable(
     for names, keys in MUST_SHARE.get(kind, {}).items():
         judged = [label for label in members if any(scores[label][key] is not None for key in keys)]
         settings = [_resolved(members[label]) for label in judged]
-        if differing := [n for n in names if len({repr(one.get(n)) for one in settings}) > 1]:
+        # Other versions lack some settings, which `_differing` notes.
+        values = {n: {repr(one[n]) for one in settings if n in one} for n in names}
+        if differing := [n for n in names if len(values[n]) > 1]:
             options = ", ".join(f"--{name.replace('_', '-')}" for name in differing)
             known = [
                 s for s in SCORES[kind] if s.key in keys and any(scores[n][s.key] is not None for n in judged)
             ]
             heads = ", ".join(score.head for score in known)
-            notes.append(f"{', '.join(judged)}: different {options}; not compared: {heads}.")
+            notes.append(f"{', '.join(judged)} differ in {options}, so they are not compared by {heads}.")
             apart |= {*keys}
     return apart
 
 
 def _resolved(record: Record) -> dict[str, Any]:
-    """The settings of a run by their options, with the features that "auto" stood for."""
-    settings = flattened(record.config)
+    """The settings of a run by their options; where the data decided, what was used."""
+    settings, found = flattened(record.config), record.metrics or {}
+    settings |= {name: found[name] for name in ("masks", "tools") if name in found}
     if settings.get("features") == "auto":
-        settings["features"] = (record.metrics or {}).get("features")
+        settings["features"] = found.get("features")
+    if "depth" in found:
+        settings["depth"] = found["depth"]["source"]
     return settings
 
 

@@ -24,6 +24,7 @@ _TEACHER = ("features", "masks", "level", "sam", "weights")
 MUST_SHARE: dict[Kind, dict[tuple[str, ...], tuple[str, ...]]] = {
     "deform": {
         ("tools", "tool_values"): _OF_PIXELS,
+        ("depth",): ("depth_mm",),
         _TEACHER: ("f_psnr", "iou"),
         ("deform.channels",): ("f_psnr",),
     },

@@ -153,6 +153,8 @@ def run(options: Options, by_preset: Callable[[str], Options]) -> int:
             "frames": {"learned": len(data.train), "held_out": len(data.test)},
             "size": (data.sequence.width, data.sequence.height),
             "features": "none" if data.meaning is None else data.meaning.source.kind,
+            "masks": "none" if data.taught is None else data.taught.masks,
+            "tools": options.tools if data.sequence.has_masks else "draw",
             "names": data.names,
             "depth": {"source": source, "metric": metric},
             "poses": refined,

@@ -49,11 +49,13 @@ class Taught(NamedTuple):
         lesson: labels of the training frames.
         held_out: labels of held-out frames, by their index; frames without any are left out.
         digest: of everything taught other than the ids of frames, in hexadecimal.
+        masks: source of the masks, as `Teaching.masks`.
     """
 
     lesson: Lesson
     held_out: Mapping[int, Labels]
     digest: str
+    masks: str
 
 
 def taught_by_classes(
@@ -94,7 +96,7 @@ def taught_by_classes(
 
     lesson = Lesson([ids_of(masks[t]) for t in train], meaning.codebook, meaning)
     held_out = {t: Labels(ids_of(masks[t]), meaning.codebook) for t in test}
-    return Taught(lesson, held_out, content_digest(f"classes {meaning.names}", {}))
+    return Taught(lesson, held_out, content_digest(f"classes {meaning.names}", {}), "files")
 
 
 def taught_by_features(
@@ -151,7 +153,7 @@ def taught_by_features(
     if failed:
         which = ", ".join(map(str, failed))
         notes.warn(f"not compared with the teacher: frames {which} ({next(iter(failed.values()))})")
-    return Taught(lesson, held_out, teaching.digest())
+    return Taught(lesson, held_out, teaching.digest(), teaching.masks)
 
 
 def basis_of(

@@ -16,8 +16,15 @@ MACHINE = {
 }
 CONFIG = {
     "parts": {"parts": {"seed": 0}, "anchor": 0, "fit": {"steps": 9}, "eval_cameras": [3]},
-    "distill": {"distill": {"seed": 0}, "features": "auto"},
-    "deform": {"deform": {"seed": 0}, "tools": "draw", "features": "auto", "eval_cameras": []},
+    "distill": {"distill": {"seed": 0}, "features": "auto", "masks": "auto"},
+    "deform": {
+        "deform": {"channels": 16},
+        "tools": "draw",
+        "depth": "auto",
+        "features": "auto",
+        "masks": "auto",
+        "eval_cameras": [],
+    },
 }
 
 

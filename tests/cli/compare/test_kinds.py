@@ -8,6 +8,9 @@ from gsjax.cli import main
 from gsjax.engine.compare.data import SCORES
 from tests.cli.compare.made_up_runs import write_run
 
+_OF_PIXELS = "PSNR masked, SSIM, depth error, f-PSNR, IoU of classes"
+_COMPARED = {"deform": {*_OF_PIXELS.split(", ")}, "distill": {"cosine to the teacher"}}
+
 
 @pytest.mark.parametrize(
     ("kind", "key", "better"),
@@ -34,34 +37,35 @@ def test_scores_of_parts_are_means_over_those_whose_truth_is_known(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("kind", "settings", "says"),
+    ("kind", "settings", "used", "option", "scores"),
     [
-        ("deform", {"deform": {"channels": 32}}, "--deform.channels; not compared: f-PSNR."),
-        ("deform", {"features": "clip"}, "--features; not compared: f-PSNR, IoU of classes."),
-        (
-            "deform",
-            {"tools": "leave-out"},
-            "--tools; not compared: PSNR masked, SSIM, depth error, f-PSNR, IoU of classes.",
-        ),
-        ("distill", {"features": "clip"}, "--features; not compared: cosine to the teacher."),
-        ("distill", {"features": "classes"}, None),  # what "auto" stands for here
+        ("deform", {"deform": {"channels": 32}}, {}, "deform.channels", "f-PSNR"),
+        ("deform", {"features": "clip"}, {}, "features", "f-PSNR, IoU of classes"),
+        ("deform", {"tools": "leave-out"}, {}, "tools", _OF_PIXELS),
+        ("deform", {"tools": "leave-out"}, {"tools": "draw"}, None, ""),  # the recording has no masks
+        ("deform", {"depth": "stereo"}, {"depth": {"source": "stereo"}}, "depth", "depth error"),
+        ("deform", {"depth": "data"}, {}, None, ""),
+        ("deform", {"level": "large"}, {}, None, ""),  # the other run is of a version without the option
+        ("distill", {"features": "clip"}, {}, "features", "cosine to the teacher"),
+        ("distill", {"features": "classes", "masks": "files"}, {}, None, ""),
     ],
 )
-def test_scores_of_other_pixels_channels_or_teachers_are_not_compared(tmp_path, kind, settings, says):
+def test_scores_of_other_pixels_depth_channels_or_teachers_are_not_compared(
+    tmp_path, kind, settings, used, option, scores
+):
     runs = [write_run(tmp_path / "a", kind, 20.0), write_run(tmp_path / "b", kind, 25.0, **settings)]
     for run, shift in zip(runs, (0.0, 0.1), strict=True):
         found = json.loads((run / "metrics.json").read_text())
-        scores = found["test"] | ({"f_psnr": 26.0, "iou": 0.5} if kind == "deform" else {})
-        found |= {"features": "classes", "test": {key: value + shift for key, value in scores.items()}}
+        test = found["test"] | ({"f_psnr": 26.0, "iou": 0.5} if kind == "deform" else {})
+        found |= {"features": "classes", "masks": "files", "depth": {"source": "data"}}
+        found |= {"test": {key: value + shift for key, value in test.items()}} | (used if shift else {})
         (run / "metrics.json").write_text(json.dumps(found))
     assert main(["compare", *map(str, runs), "--out", str(tmp_path / "out")]) == 0
     found = json.loads((tmp_path / "out" / "comparison.json").read_text())
-    heads = {score.head for score in SCORES[kind] if score.key in found["groups"][0]["best"]}
-    if says is None:
-        assert heads == {"cosine to the teacher"}
-    else:
-        assert f"a, b: different {says}" in found["notes"]
-        assert not {head for head in heads if head in says}
+    compared = {score.head for score in SCORES[kind] if score.key in found["groups"][0]["best"]}
+    apart = [note for note in found["notes"] if "they are not compared by" in note]
+    assert apart == ([f"a, b differ in --{option}, so they are not compared by {scores}."] if option else [])
+    assert compared == _COMPARED[kind] - {*scores.split(", ")}
 
 
 def test_kinds_are_not_mixed_and_time_means_minutes_of_steps_and_compiling(tmp_path, capfd):

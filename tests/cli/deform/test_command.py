@@ -35,6 +35,7 @@ def test_what_a_run_writes(deformed):
     assert (found["kind"], found["complete"], found["steps"], found["skipped"]) == ("deform", True, 30, 0)
     assert found["frames"] == {"learned": 8, "held_out": 2}  # frames 1 and 9
     assert found["names"] == ["tissue", "tool"]
+    assert (found["masks"], found["tools"]) == ("files", "draw")
     assert found["test"]["psnr_masked"] > 15
     assert found["test"]["fps"] > 0
     assert found["tracks"]["points"] > 50
