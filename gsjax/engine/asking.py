@@ -1,6 +1,5 @@
 """Queries of a run from the viewer's page."""
 
-import re
 import threading
 from itertools import count
 from pathlib import Path
@@ -11,6 +10,7 @@ from jaxtyping import Bool
 from gsjax.engine.query import Queryable, Question, select, write_part
 from gsjax.io.atomic import write_new
 from gsjax.methods.query import Prompt
+from gsjax.perception.codebook import plain_name
 from gsjax.viz.viewer import Answer, Asking
 
 _EXTRACTED = "extracted"  # folder, within the run's, of the parts that the viewer saved
@@ -43,7 +43,7 @@ def asking_of(run: Queryable) -> Asking:
         folder = run.path / _EXTRACTED
         folder.mkdir(exist_ok=True)
         called = name if run.frame_ids is None else f"{name} frame {run.frame_ids[frame]}"
-        stem = "_".join(re.findall(r"[^\W_]+", called.lower())) or "selection"
+        stem = plain_name(called).replace(" ", "_") or "selection"
         files = (folder / (f"{stem}.ply" if number == 1 else f"{stem}_{number}.ply") for number in count(1))
         gaussians = run.at(frame)
         return write_new(files, lambda path: write_part(path, run, gaussians, selected))

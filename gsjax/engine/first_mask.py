@@ -1,7 +1,5 @@
 """The mask of the first frame, which defines the objects to track."""
 
-import re
-from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
@@ -17,6 +15,7 @@ from gsjax.data.masks import read_mask
 from gsjax.data.pictures import is_picture
 from gsjax.engine.messages import Notes
 from gsjax.engine.recording import Recording
+from gsjax.perception.codebook import distinct_names
 
 KEPT_MASK = "mask.png"
 """File in which a run keeps the picture that defined its objects."""
@@ -151,13 +150,10 @@ def _check_not_empty(labels: np.ndarray, tracked: Sequence, c: int) -> None:
 
 
 def label_names(recording: Recording, source: str) -> dict[int, str]:
-    """The name of each mask value that has one; only the recording's own do. Names that differ in case or
-    punctuation at most have the value added, as in "cup (3)", because scores and queries go by name."""
+    """The name of each mask value that has one; only the recording's own do. They are distinct,
+    because scores and queries go by name."""
     own = recording.tracked.names_of_labels if source in OWN_MASKS else {}
-    plain = {value: " ".join(re.findall(r"[^\W_]+", name.lower())) for value, name in own.items()}
-    uses = Counter(plain.values())
-    names = {value: f"{name} ({value})" if uses[plain[value]] > 1 else name for value, name in own.items()}
-    return {0: "background"} | names
+    return distinct_names(own, ("background", "unlabelled"))
 
 
 def warn_of_missing(recording: Recording, mask: FirstMask, scene_ids: tuple[int, ...], notes: Notes) -> None:

@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, Num
 from skimage.color import rgb2lab
 
+from gsjax.perception.codebook import plain_name
 from gsjax.perception.pictures import unit_floats
 
 COLORS = ("black", "white", "grey", "red", "orange", "yellow", "green", "blue", "purple", "pink", "brown")
@@ -63,7 +64,7 @@ class ClosedVocabulary:
         Raises:
             ValueError: two labels have the same name.
         """
-        self._names = {label: " ".join(_words(name)) for label, name in sorted((names or {}).items())}
+        self._names = {label: plain_name(name) for label, name in sorted((names or {}).items())}
         if len(set(self._names.values())) < len(self._names):
             raise ValueError(f"names: expected distinct names, found {list(self._names.values())}")
         self._aspects = {name: words for name, words in ASPECTS.items() if sizes or name != "size"}
@@ -133,7 +134,7 @@ class ClosedVocabulary:
 
     def _parse(self, text: str) -> tuple[set[tuple[str, str]], list[str]]:
         """The (aspect, word) pairs named in a text, and its words that are not in the vocabulary."""
-        rest = f" {' '.join(_words(text))} "
+        rest = f" {plain_name(text)} "
         named = set()
         # Names first, longest first: "red bull" must not match a colour, nor "object 12" match "object 1".
         for name in sorted(self._names.values(), key=len, reverse=True):
@@ -198,7 +199,3 @@ def _filled(parts: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n+1"]:
     length = np.linalg.norm(parts)
     parts = parts / max(length, 1.0)
     return np.append(parts, np.sqrt(max(0.0, 1 - np.sum(parts**2))))
-
-
-def _words(text: str) -> list[str]:
-    return re.findall(r"[^\W_]+", text.lower())

@@ -6,7 +6,8 @@ model recognised them.
 
 import hashlib
 import re
-from collections.abc import Mapping
+from collections import Counter
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from jaxtyping import Float, Int, Num
@@ -36,7 +37,7 @@ class ClassCodebook:
         """
         if not names:
             raise ValueError("names: expected a name for at least one label, found none")
-        self._names = {label: _plain(name) for label, name in sorted(names.items())}
+        self._names = {label: plain_name(name) for label, name in sorted(names.items())}
         if len(set(self._names.values())) < len(self._names):
             raise ValueError(f"names: expected distinct names, found {list(self._names.values())}")
         self._dimension = dimension
@@ -69,7 +70,7 @@ class ClassCodebook:
         Raises:
             ValueError: it is not one of the names.
         """
-        name = _plain(text)
+        name = plain_name(text)
         if name not in self.names:
             raise ValueError(
                 f"no class {text!r}; these features know only names: {', '.join(self.names)}. For "
@@ -80,7 +81,7 @@ class ClassCodebook:
 
     def others(self, text: str) -> tuple[str, ...]:
         """All names except this one."""
-        return tuple(name for name in self.names if name != _plain(text))
+        return tuple(name for name in self.names if name != plain_name(text))
 
     def _vector(self, name: str) -> Float[np.ndarray, "D"]:
         seed = int.from_bytes(hashlib.sha256(name.encode()).digest()[:8], "little")
@@ -88,6 +89,26 @@ class ClassCodebook:
         return (vector / np.linalg.norm(vector)).astype(np.float32)
 
 
-def _plain(name: str) -> str:
-    """The words in lower case, separated by single spaces."""
+def distinct_names(names: Mapping[int, str], rest: Sequence[str]) -> dict[int, str]:
+    """Names that tell labels apart: those that differ in case or punctuation at most have the label added, as
+    in "cup (3)".
+
+    Args:
+        names: the name of each label.
+        rest: names for label 0, if it has none; it gets the first that is free.
+    """
+    taken = {*map(plain_name, names.values())}
+    free = next((name for name in rest if plain_name(name) not in taken), rest[0])
+    found = {0: free} | {**names}
+    while len(uses := Counter(map(plain_name, found.values()))) < len(found):
+        found |= {v: f"{name} ({v})" for v, name in found.items() if uses[plain_name(name)] > 1}
+    return found
+
+
+def plain_name(name: str) -> str:
+    """The words of a name in lower case, separated by single spaces.
+
+    Args:
+        name: the name.
+    """
     return " ".join(re.findall(r"[^\W_]+", name.lower()))

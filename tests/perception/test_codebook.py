@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from gsjax.methods.protocols import LanguageEncoder
-from gsjax.perception.codebook import DIMENSION, ClassCodebook
+from gsjax.perception.codebook import DIMENSION, ClassCodebook, distinct_names
 
 NAMES = {1: "drawer", 2: "laptop_lid", 4: "Faucet Handle"}
 LABELS = np.array([[0, 1, 1], [2, 4, 3]])
@@ -37,3 +37,20 @@ def test_an_unknown_name_is_an_error():
         ClassCodebook({1: "Box", 2: "box"})
     with pytest.raises(ValueError, match="names: expected a name for at least one label, found none"):
         ClassCodebook({})
+
+
+@pytest.mark.parametrize(
+    ("names", "distinct"),
+    [
+        ({3: "cup"}, {0: "tissue", 3: "cup"}),
+        ({0: "wall", 3: "cup"}, {0: "wall", 3: "cup"}),
+        ({3: "cup", 5: "Cup"}, {0: "tissue", 3: "cup (3)", 5: "Cup (5)"}),
+        ({1: "cup 1", 2: "cup_1"}, {0: "tissue", 1: "cup 1 (1)", 2: "cup_1 (2)"}),
+        ({3: "cup", 5: "cup", 7: "cup (3)"}, {0: "tissue", 3: "cup (3) (3)", 5: "cup (5)", 7: "cup (3) (7)"}),
+        ({1: "Tissue."}, {0: "background", 1: "Tissue."}),
+        ({1: "tissue", 2: "_background_"}, {0: "tissue (0)", 1: "tissue (1)", 2: "_background_"}),
+    ],
+)
+def test_names_are_made_distinct_and_label_0_takes_one_that_is_free(names, distinct):
+    assert distinct_names(names, ("tissue", "background")) == distinct
+    assert len(ClassCodebook(distinct).names) == len(distinct)

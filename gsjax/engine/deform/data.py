@@ -21,6 +21,7 @@ from gsjax.engine.teaching.choice import NO_TEACHER, TeacherChoice
 from gsjax.engine.teaching.teaching import Teaching
 from gsjax.geometry.cameras import Camera
 from gsjax.methods.deform import Lesson, Meaning, Timeline, can_start_from, counted_ids
+from gsjax.perception.codebook import distinct_names
 from gsjax.scene.frame import Frame
 
 Tools = Literal["leave-out", "draw"]
@@ -243,9 +244,9 @@ def _counted_names(
     """The mask values that count, with their names; notes which are left out."""
     values = sorted({int(v) for mask in masks if mask is not None for v in np.unique(mask)})
     given = sequence.names_of_labels
-    rest = "background" if "tissue" in map(str.lower, given.values()) else "tissue"
-    names = {TISSUE: rest} | given
-    called = {value: names.get(value, f"object {value}") for value in values if value >= TISSUE}
+    known = {v: given.get(v, f"object {v}") for v in values if v > TISSUE or v in given}
+    names = distinct_names(known, ("tissue", "background", "unlabelled"))
+    called = {value: names[value] for value in values if value >= TISSUE}
     gone = [v for v in called if tools == "leave-out" and _is_tool(v, sequence, tool_values)]
     if gone:
         kept = ", ".join(name for value, name in called.items() if value not in gone) or "nothing"

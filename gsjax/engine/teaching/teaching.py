@@ -19,6 +19,7 @@ from gsjax.engine.teaching.source import ABOUT, Source
 from gsjax.methods.distill import Teacher, teacher_of_maps, teacher_of_objects, with_maps
 from gsjax.methods.distill.teacher import UNKNOWN_ID
 from gsjax.methods.protocols import LanguageEncoder
+from gsjax.perception.codebook import distinct_names
 from gsjax.perception.feature_files import EACH, PictureFeatures, read_feature_folder
 from gsjax.perception.levels import joined_levels, labels_on_level
 from gsjax.perception.outlines import snap_outlines
@@ -343,8 +344,7 @@ def _names(views: list[_View], known: Mapping[int, str]) -> dict[int, str]:
     if there == [1] and not known:
         return {0: "background", 1: "foreground"}
     names = {label: known.get(label, f"object {label}") for label in there}
-    rest = "unlabelled" if "background" in map(str.lower, names.values()) else "background"
-    return {0: rest} | names
+    return distinct_names(names, ("background", "unlabelled"))
 
 
 def _ids(views: list[list[_View]] | None) -> list[np.ndarray] | None:

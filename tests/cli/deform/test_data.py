@@ -51,6 +51,11 @@ def test_a_class_may_be_named_tissue():
     assert data.names == ("background", "Tissue")
 
 
+def test_two_classes_of_one_name_are_told_apart_by_their_values():
+    data, _ = read(recording(names={KIDNEY: "organ", SHAFT: "Organ"}))
+    assert data.names == ("tissue", f"organ ({KIDNEY})", f"Organ ({SHAFT})")
+
+
 def test_tools_may_be_named_by_value():
     data, _ = read(recording(), tool_values=(KIDNEY,))
     assert data.names == ("background-tissue", "instrument-shaft")

@@ -60,6 +60,8 @@ def test_held_out_views_are_asked_about_in_the_terms_of_those_that_taught(featur
     assert one_more.source.names == {1: "background", 2: "foreground"}
     named = taught(photographs([THREE], {1: "Background", 2: "cup"}), [0], TeacherChoice(features))
     assert named.source.names == {1: "unlabelled", 2: "Background", 3: "cup"}
+    alike = taught(photographs([THREE], {1: "cup", 2: "Cup"}), [0], TeacherChoice(features))
+    assert alike.source.names == {1: "background", 2: "cup (1)", 3: "Cup (2)"}
     assert one_more.of(1).dimension == one_more.teacher.dimension
 
 
