@@ -126,12 +126,12 @@ def compare(photographs: Photographs, reference: Photographs) -> dict[str, Any]:
 
 
 def _in_both(names: Sequence[str], reference: Photographs) -> list[tuple[int, int]]:
-    """Pairs of indices of the photographs that both have, matched by name, or else by a file name that occurs
+    """Pairs of indices of the photographs that both have: those whose paths have an end in common that occurs
     once in each."""
-    known = {name: i for i, name in enumerate(reference.names)}
-    ours, theirs = _by_unique_file_name(names), _by_unique_file_name(reference.names)
-    pairs = {ours[name]: theirs[name] for name in ours.keys() & theirs.keys()}
-    pairs |= {i: known[name] for i, name in enumerate(names) if name in known}
+    pairs: dict[int, int] = {}
+    for length in range(1, 1 + max(len(Path(name).parts) for name in (*names, *reference.names))):
+        ours, theirs = _by_unique_end(names, length), _by_unique_end(reference.names, length)
+        pairs |= {ours[end]: theirs[end] for end in ours.keys() & theirs.keys()}
     both = sorted(pairs.items())
     if len(both) < 3:
         raise ValueError(
@@ -141,10 +141,11 @@ def _in_both(names: Sequence[str], reference: Photographs) -> list[tuple[int, in
     return both
 
 
-def _by_unique_file_name(names: Sequence[str]) -> dict[str, int]:
-    files = [Path(name).name for name in names]
-    counts = Counter(files)
-    return {file: i for i, file in enumerate(files) if counts[file] == 1}
+def _by_unique_end(names: Sequence[str], length: int) -> dict[tuple[str, ...], int]:
+    """Indices of paths by their last `length` parts, where these occur once."""
+    ends = [Path(name).parts[-length:] for name in names]
+    counts = Counter(ends)
+    return {end: i for i, end in enumerate(ends) if counts[end] == 1}
 
 
 def _check_out(out: Path, in_place: bool, overwrite: bool) -> None:
@@ -160,8 +161,8 @@ def _check_out(out: Path, in_place: bool, overwrite: bool) -> None:
         )
     if "images" in own and not _has_copies(out):
         raise FileExistsError(
-            f"{out / 'images'}: expected copies made by gsjax poses (copied in {REPORT}), found other "
-            "photographs; name another folder, or move them"
+            f"{out / 'images'}: expected copies made by gsjax poses, and {REPORT} does not say that they are "
+            "(copied); name another folder, or move them"
         )
     if not overwrite:
         raise FileExistsError(f"{out}: found the result of an earlier gsjax poses; --overwrite replaces it")
@@ -192,7 +193,9 @@ def _write(
     write_json(options.out / REPORT, mark)  # marks the folder, whatever happens from here on
     for new, old in ((images, options.out / "images"), (sparse, options.out / "sparse")):
         if new.exists():
-            if old.exists():
+            if old.is_symlink():
+                old.unlink()
+            elif old.exists():
                 shutil.rmtree(old)
             os.replace(new, old)
 

@@ -222,10 +222,18 @@ def test_photographs_that_were_used_in_place_are_never_replaced(unplaced, say, t
         code, said = say(tmp_path / "others", "--out", mine.parent, *more)
         assert contents(mine) == before
         assert code == 2
-        assert "images: expected copies made by gsjax poses (copied in poses.json), found other" in said
+        assert "images: expected copies made by gsjax poses, and poses.json does not say" in said
     out = tmp_path / "out"
     squares(tmp_path / "first", 100)
     assert say(tmp_path / "first", "--out", out)[0] == 0
+    (out / "images").rename(tmp_path / "disk")
+    (out / "images").symlink_to(tmp_path / "disk")
+    copies = contents(tmp_path / "disk")
+    assert say(tmp_path / "others", "--out", out, "--overwrite")[0] == 0
+    assert contents(out / "images") == others
+    assert contents(tmp_path / "disk") == copies  # only the link was replaced
+    (out / "images").rename(tmp_path / "more")
+    (out / "images").symlink_to(tmp_path / "gone")
     assert say(tmp_path / "others", "--out", out, "--overwrite")[0] == 0
     assert contents(out / "images") == others
 
@@ -250,6 +258,8 @@ def test_names_that_repeat_in_subfolders_are_told_apart():
         (1, 1),
         (2, 0),
     ]
+    below = replace(rig, names=tuple(f"images/{name}" for name in reversed(names)))
+    assert poses._in_both(names, below) == [(i, 5 - i) for i in range(6)]
     with pytest.raises(ValueError, match="found 0 of the same name"):
         poses._in_both([f"{i}.png" for i in range(3)], rig)
 
