@@ -68,9 +68,10 @@ def editing_of(saved: PartsRun, filmed: Filmed) -> Editing:
     """What the viewer needs for editing a run: the operations, parts and cameras, a preview, and saving."""
     cameras = camera_names(saved.recording)
     first = saved.camera(None)
-    called = {part: name for name, part in {"background": BACKGROUND, **saved.names}.items()}
+    known = {"background": BACKGROUND, **saved.names}
+    called = {BACKGROUND: "background"} | {part: name for name, part in saved.names.items()}
     ordered = sorted(called, key=lambda part: (part == BACKGROUND, part))
-    parts = {f"{called[part]} ({part})": _word_for(part, called[part]) for part in ordered}
+    parts = {f"{called[part]} ({part})": _word_for(part, called[part], known) for part in ordered}
 
     def preview(lines: Sequence[str]) -> Preview:
         film, doubts = edited(script_of(lines), saved)
@@ -117,8 +118,10 @@ def camera_names(recording: Recording) -> dict[str, int]:
     return {f"camera {c}" + (" (held out)" if c in held_out else ""): c for c in recording.judged.camera_ids}
 
 
-def _word_for(part: int, name: str) -> str:
+def _word_for(part: int, name: str, known: Names) -> str:
     """The name of a part in a line of edits; its number, if a line would read the name as something else."""
+    if name == ALL or known[name] != part:
+        return str(part)
     try:
         return name if parse_op(f"freeze:parts={name}").parts == (name,) else str(part)
     except ValueError:

@@ -79,7 +79,7 @@ def test_what_is_offered(run):
     assert editing.begin("speed", "drawer") == "speed:parts=drawer,factor=2"
 
 
-@pytest.mark.parametrize("name", ["1", "on", "a,b"])
+@pytest.mark.parametrize("name", ["1", "on", "a,b", "all"])
 def test_a_part_whose_name_reads_as_something_else_is_offered_by_its_number(run, name):
     """`parts=1` is part 1, whatever the name of part 2."""
     found = json.loads((run / "metrics.json").read_text())
@@ -87,6 +87,14 @@ def test_a_part_whose_name_reads_as_something_else_is_offered_by_its_number(run,
     (run / "metrics.json").write_text(json.dumps(found))
     parts = opened(run).editing.parts
     assert (parts["drawer (1)"], parts[f"{name} (2)"]) == ("drawer", "2")
+
+
+def test_a_part_called_background_does_not_hide_the_background(run):
+    found = json.loads((run / "metrics.json").read_text())
+    found["parts"][1]["true_name"] = "Background"
+    (run / "metrics.json").write_text(json.dumps(found))
+    parts = opened(run).editing.parts
+    assert (parts["background (2)"], parts["background (0)"]) == ("background", "0")
 
 
 @pytest.mark.thorough
