@@ -321,8 +321,8 @@ def follow(options: Options, source: Source, log: Log, console: Console) -> Base
             if perf_counter() - begun > 60 * options.minutes:
                 return
         if _camera(options.source):
-            offered = newest.counts.offered
-            raise StreamStalled(f"{options.source}: no frame after the first {offered}; check its connection")
+            came = counted(1 + newest.counts.offered, "frame")  # with that from which the scene starts
+            raise StreamStalled(f"{options.source}: it delivered {came} and no more; check its connection")
 
     try:
         console.print(MEASURING)

@@ -149,6 +149,7 @@ def test_only_a_recording_may_end_by_itself(monkeypatch, source, ends):
     stopped = engine.follow(options, stream, log, Console(quiet=True))
     assert log.counts["offered"] == 2
     assert isinstance(stopped, StreamStalled) == ends, stopped
+    assert not ends or str(stopped).startswith("camera:0: it delivered 3 frames and no more")
 
 
 @pytest.mark.thorough
