@@ -238,6 +238,11 @@ def is_photographs(path: str | Path) -> bool:
     )
 
 
+def is_only_photographs(path: str | Path, images: str = "images") -> bool:
+    """Whether a path holds photographs and no recording over time; `images` as in `is_recording`."""
+    return is_photographs(path) and not is_recording(path, images)
+
+
 def is_dataset_file(path: Path) -> bool:
     """Whether a file by itself may be a dataset: a video, a recording, a list of photographs."""
     return _is_bag(path) or clip.is_clip(path) or path.suffix.lower() in (".json", ".r3d")

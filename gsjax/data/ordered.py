@@ -5,7 +5,7 @@ import numpy as np
 
 from gsjax.data.errors import DataError
 from gsjax.data.frame_folders import DEFAULT_RATE_HZ, natural_key
-from gsjax.data.open import ReadOptions, is_photographs, is_recording, open_photographs, open_sequence
+from gsjax.data.open import ReadOptions, is_only_photographs, open_photographs, open_sequence
 from gsjax.data.photographs import Photographs
 from gsjax.data.sequence import Sequence
 from gsjax.data.tool_masks import LABEL_NAMES, TISSUE, TOOL
@@ -18,7 +18,7 @@ def open_as_sequence(dataset: str, read: ReadOptions | None = None) -> Sequence:
         DataError: the data cannot be read, or photographs differ in size.
     """
     read = read or ReadOptions()
-    if is_photographs(dataset) and not is_recording(dataset, read.images):
+    if is_only_photographs(dataset, read.images):
         return sequence_of(open_photographs(dataset, read))
     return open_sequence(dataset, read)
 

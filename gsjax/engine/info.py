@@ -16,7 +16,7 @@ from rich.console import Console
 from gsjax.data import Photographs, Sequence, open_photographs, open_sequence, photographs_of
 from gsjax.data.consistency import check_photographs, check_recording
 from gsjax.data.errors import MissingFile
-from gsjax.data.open import SIMULATED_PREFIX, ReadOptions, is_dataset_file, is_photographs, is_recording
+from gsjax.data.open import SIMULATED_PREFIX, ReadOptions, is_dataset_file, is_only_photographs
 from gsjax.data.pictures import warn_of_truncated
 from gsjax.engine.folder import SCRIPT, is_of_run, is_run
 from gsjax.engine.info_picture import by_camera, by_split, write_picture
@@ -70,7 +70,7 @@ def run(options: Options) -> int:
         return 0
     table = None
     with Notes(Console(stderr=True, highlight=False)):
-        if is_photographs(options.path) and not is_recording(options.path, options.read.images):
+        if is_only_photographs(options.path, options.read.images):
             photographs = open_photographs(options.path, options.read)
             photographs.image(0)  # an error if it cannot be read
             check_photographs(photographs)

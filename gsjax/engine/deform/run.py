@@ -14,7 +14,7 @@ from rich.console import Console
 
 from gsjax.data import Photographs, Sequence
 from gsjax.data.consistency import check_recording
-from gsjax.data.open import is_photographs, is_recording, open_photographs
+from gsjax.data.open import is_only_photographs, open_photographs
 from gsjax.data.ordered import open_as_sequence
 from gsjax.engine.budget import Budget, note_if_few
 from gsjax.engine.deform.data import Tools, deform_data
@@ -193,7 +193,7 @@ def _recording(options: Options, notes: Notes) -> tuple[Sequence, DepthSource]:
     chosen = (options.frames, options.read, options.scale)
     whole = open_recording(options.dataset, (), (), *chosen, opened=open_as_sequence).judged
     check_recording(whole)
-    if is_photographs(options.dataset) and not is_recording(options.dataset, options.read.images):
+    if is_only_photographs(options.dataset, options.read.images):
         photographs = open_photographs(options.dataset, options.read)
         notes.add(_of_photographs(photographs, whole.viewmats[0, 0]))
         if photographs.times is None and photographs.splits is not None:

@@ -60,7 +60,7 @@ def read_config(path: Path, root: Path) -> tuple[Config, tuple[Column, ...], Fig
     try:
         found = parse_yaml(text)
     except ValueError as error:
-        raise ValueError(f"{path}: expected YAML, found {error}") from error
+        raise ValueError(f"{path}: expected YAML, found a fault: {error}") from error
     config = _fields(Config, found, f"{path}", ": ")
     for key in ("claim", "source", "script"):
         expect(getattr(config, key).strip(), f"{path}: {key}", "text", "none")

@@ -29,7 +29,7 @@ def read_script(path: Path) -> str:
             return file.read()
     except (SyntaxError, UnicodeDecodeError) as error:
         wanted = "a script in UTF-8, or in the encoding that it declares"
-        raise ValueError(f"{path}: expected {wanted}, found {error}") from error
+        raise ValueError(f"{path}: expected {wanted}, found a fault: {error}") from error
 
 
 def load_script(root: Path, path: Path, text: str, described: bool) -> tuple[Callable, Callable | None]:

@@ -17,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from gsjax.engine.ending import completion
 from gsjax.engine.files import write_scene
 from gsjax.engine.folder import SCRIPT, is_run, read_values
 from gsjax.engine.machine import describe as describe_machine
@@ -214,16 +215,15 @@ def write_film(
                 video.write(shot.image)
                 seconds.append(shot.seconds)
         except KeyboardInterrupt as interrupt:
-            stopped = reason(interrupt)
-            after = f"after {counted(len(seconds), 'frame')} by {stopped}"
+            stopped = interrupt
+            after = f"after {counted(len(seconds), 'frame')} by {reason(stopped)}"
             notes.add(f"This film is not complete: it was stopped {after}.")
     warm = [each for each in seconds if each is not None]
     found = {
         "kind": "edit",
         "dataset": sequence.name,
         "run": str(saved.path.absolute()),
-        "complete": stopped is None,
-        "stopped": stopped,
+        **completion(stopped, report=False),
         "camera": camera,
         "frames": len(seconds),
         "fps": round(fps, 6),

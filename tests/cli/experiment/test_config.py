@@ -116,7 +116,8 @@ def test_a_script_is_in_the_encoding_that_it_declares(toy, gsjax, name):
     path.write_bytes(SCRIPT.encode() + b"# caf\xe9\n")
     code, _, err = gsjax("run", "toy")
     assert code == 2
-    assert f"experiments/toy/{name}: expected a script in UTF-8, or in the encoding" in " ".join(err.split())
+    expected = "expected a script in UTF-8, or in the encoding that it declares, found a fault: "
+    assert f"experiments/toy/{name}: {expected}" in " ".join(err.split())
     path.write_bytes(b"# -*- coding: latin-1 -*-\n" + path.read_bytes())
     assert gsjax("run", "toy")[0] == 0
 

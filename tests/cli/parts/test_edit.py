@@ -317,7 +317,7 @@ def test_a_film_that_is_stopped_can_be_watched(gsjax, run, monkeypatch, signal, 
     folder = run / "edit" / "ops"
     assert describe_video(folder / "video.mp4").frames == 2
     found = json.loads((folder / "metrics.json").read_text())
-    assert (found["complete"], found["frames"]) == (False, 2)
+    assert (found["complete"], found["stopped"], found["frames"]) == (False, by, 2)
 
 
 @pytest.mark.thorough
