@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from gsjax.data.errors import DataError, DataWarning
+from gsjax.geometry.neighbors import valid_depth
 
 ROTATION_TOLERANCE = 1e-2
 """Largest accepted entry of |R^T R - I|; calibrations are often written with few digits."""
@@ -16,8 +17,6 @@ _UNIT_TOLERANCE = 1e-2  # on a quaternion's length: files often have few digits
 
 FARTHEST_MEDIAN_M, NEAREST_MEDIAN_M = 50.0, 0.02
 """A median depth outside this range means a wrong unit rather than an unusual scene."""
-
-_ENDLESS = 1e6  # in any unit; renderers write 1e10 or more where they see nothing
 
 
 def check_shape(name: str, array: np.ndarray, shape: tuple[int, ...]) -> None:
@@ -157,7 +156,7 @@ def check_times(times: Float[np.ndarray, "frames"], *, shared: bool = False) -> 
 
 def usable_depth(depth: Float[np.ndarray, "height width"]) -> Float[np.ndarray, "height width"]:
     """The depth in float32, with pixels set to 0 (invalid) that are not finite, not above 0, or endless."""
-    return np.where((depth > 0) & (depth < _ENDLESS), depth, 0).astype(np.float32)
+    return np.where(valid_depth(depth), depth, 0).astype(np.float32)
 
 
 def check_depth(depth: Float[np.ndarray, "height width"], what: str) -> Float[np.ndarray, "height width"]:

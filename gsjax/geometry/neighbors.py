@@ -1,8 +1,11 @@
 """Neighbour queries on the host, for building point sets; nothing here runs inside a jitted step."""
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
+
+ENDLESS = 1e6
+"""Depth, in any unit, from which on nothing was seen: renderers write 1e10 or more there."""
 
 _AROUND = [(down, right) for down in (-1, 0, 1) for right in (-1, 0, 1) if down or right]
 _SAME_DEPTH = 0.05  # relative: a surface seen at a grazing angle recedes by this from pixel to pixel
@@ -67,18 +70,24 @@ def voxel_thin(points: Float[np.ndarray, "n 3"], voxel: float) -> Int[np.ndarray
     return np.sort(order[first])
 
 
+def valid_depth(depths: Float[np.ndarray, "*n"]) -> Bool[np.ndarray, "*n"]:
+    """Where depth is known: positive, and not infinite or `ENDLESS`."""
+    return (depths > 0) & (depths < ENDLESS)
+
+
 def drop_flying_pixels(depths: Float[np.ndarray, "*c h w"]) -> Float[np.ndarray, "*c h w"]:
     """Depth of the pixels that lie on a surface, else 0.
 
-    A pixel lies on none if its depth is not positive and finite, or if it is a flying pixel: five or more of
-    its eight neighbours have depth and fewer than two of them agree with it within 5 %, or three or four have
-    depth and none agrees. Depth cameras measure flying pixels at edges, in rain and on dark or shiny objects.
+    A pixel lies on none if its depth is not known (`valid_depth`), or if it is a flying pixel: five or more
+    of its eight neighbours have depth and fewer than two of them agree with it within 5 %, or three or four
+    have depth and none agrees. Depth cameras measure flying pixels at edges, in rain and on dark or shiny
+    objects.
     Sparse depth and lines one pixel wide are kept, but depth with more than about 3 % noise is thinned.
 
     Args:
         depths: depth images of any number of cameras, metres.
     """
-    known = np.where(np.isfinite(depths) & (depths > 0), depths, 0)
+    known = np.where(valid_depth(depths), depths, 0)
     height, width = known.shape[-2:]
     padded = np.pad(known, [(0, 0)] * (known.ndim - 2) + [(1, 1), (1, 1)])
     around, alike = np.zeros(known.shape, np.int8), np.zeros(known.shape, np.int8)

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, UInt8
 
 from gsjax.geometry.cameras import Camera, resized
-from gsjax.geometry.neighbors import drop_flying_pixels
+from gsjax.geometry.neighbors import ENDLESS, drop_flying_pixels
 
 Seen = TypeVar("Seen")
 
@@ -105,17 +105,28 @@ def part_of(frame: Frame, cameras: tuple[int, ...] = (), shrink: int = 1) -> Fra
     return Frame(images, picked(frame.depths), smaller, picked(frame.masks), frame.time)
 
 
+def with_black_gaps(frame: Frame) -> Frame:
+    """The frame with black in pixels that do not count and are not finite, as they would spread where images
+    are resized or compared in windows. On the host."""
+    if frame.masks is None or not np.issubdtype(frame.images.dtype, np.floating):
+        return frame
+    gaps = ~np.asarray(frame.masks) & ~np.isfinite(frame.images).all(-1)
+    images = np.where(gaps[..., None], 0, frame.images)
+    return Frame(images, frame.depths, frame.cameras, frame.masks, frame.time)
+
+
 def without_broken(frame: Frame) -> tuple[Frame, Int[Array, ""]]:
-    """The frame with pixels that are not finite set to black and to depth 0, as `Sequence` reads them, and
-    their number. Such a pixel would otherwise turn every sum that it enters into NaN."""
+    """The frame with pixels that are not finite set to black and to depth 0, and depth that is not finite or
+    is `ENDLESS` set to 0, as `Sequence` reads them; and their number. Such a pixel, or the square of its
+    depth, would otherwise turn every sum that it enters into NaN."""
     frame = Frame(frame.colors, frame.depths, frame.cameras, frame.masks, frame.time)
-    broken = ~jnp.isfinite(frame.images).all(-1)
+    broken = dark = ~jnp.isfinite(frame.images).all(-1)
     if frame.depths is not None:
-        broken |= ~jnp.isfinite(frame.depths)
+        broken = dark | ~(jnp.abs(frame.depths) < ENDLESS)
     count = broken.sum()
 
     def mended() -> Frame:
-        images = jnp.where(broken[..., None], 0.0, frame.images)
+        images = jnp.where(dark[..., None], 0.0, frame.images)
         depths = None if frame.depths is None else jnp.where(broken, 0.0, frame.depths)
         return Frame(images, depths, frame.cameras, frame.masks, frame.time)
 

@@ -1,6 +1,7 @@
 """An initial scene from RGB-D: points, and Gaussians on them. All on the host."""
 
 import warnings
+from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
@@ -9,12 +10,14 @@ from jaxtyping import Float, Num
 from scipy.spatial import cKDTree
 
 from gsjax.geometry.cameras import unproject
-from gsjax.geometry.neighbors import neighbor_spacing, voxel_thin
+from gsjax.geometry.neighbors import neighbor_spacing, valid_depth, voxel_thin
 from gsjax.geometry.sight import rays
+from gsjax.scene.frame import Frame
 from gsjax.scene.gaussians import Gaussians, gaussians_from_activated
 
 # Rooms are metres across: a median depth beyond this is almost certainly in millimetres, not metres.
 _SUSPICIOUS_DEPTH = 100.0
+_HIDDEN = 0.5  # share of points before the near plane above which something is wrong
 
 
 def points_from_rgbd(
@@ -172,9 +175,24 @@ def check_depth(depth: np.ndarray) -> None:
         )
 
 
-def valid_depth(depth: np.ndarray) -> np.ndarray:
-    """Mask of the positive and finite values of a depth array of any shape."""
-    return np.isfinite(depth) & (depth > 0)
+def warn_of_hidden(points: Float[np.ndarray, "m 3"], frames: Sequence[Frame]) -> None:
+    """Warns if most of what lies ahead of the cameras is nearer than their near plane, so never drawn.
+
+    Args:
+        points: points of the scene, in the unit of the poses.
+        frames: frames of one camera each, on the host.
+    """
+    axes = np.stack([frame.cameras.viewmat[0][2] for frame in frames])
+    some = points[:: 1 + len(points) // 1000]
+    depths = some @ axes[:, :3].T + axes[:, 3]
+    ahead, near = depths > 0, frames[0].cameras.near
+    if ahead.any() and (depths < near)[ahead].mean() > _HIDDEN:
+        warnings.warn(
+            f"most of the scene is nearer to the cameras than their near plane, {near:g}, and is not drawn: "
+            "is the unit of the poses far larger than the scene? Set near (--read.near) to less than "
+            f"{np.median(depths[ahead]):.2g}",
+            stacklevel=2,
+        )
 
 
 def on_host(function, *arrays):

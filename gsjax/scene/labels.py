@@ -9,7 +9,8 @@ from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import cKDTree
 
 from gsjax.geometry.cameras import project
-from gsjax.scene.initialize import check_depth, on_host, valid_depth
+from gsjax.geometry.neighbors import valid_depth
+from gsjax.scene.initialize import check_depth, on_host
 
 UNKNOWN_LABEL = -1
 BACKGROUND_LABEL = 0

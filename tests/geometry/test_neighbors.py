@@ -77,4 +77,5 @@ def test_surfaces_edges_lines_and_sparse_depth_are_kept():
     assert (kept == np.where(ends, 0, scene)).all()
     lidar = np.where(np.arange(24 * 32).reshape(24, 32) % 3 == 0, np.geomspace(1, 9, 32, dtype=np.float32), 0)
     assert (drop_flying_pixels(lidar) == lidar).all()
-    assert drop_flying_pixels(np.full((5, 5), np.nan)).sum() == 0
+    for endless in (np.nan, np.inf, 1e10):
+        assert drop_flying_pixels(np.full((5, 5), endless)).sum() == 0

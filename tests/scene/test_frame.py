@@ -1,5 +1,7 @@
 """Frames of 8-bit images give the same results as frames of floats."""
 
+from dataclasses import replace
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -34,3 +36,14 @@ def test_bytes_are_never_broken_and_floats_may_be(images):
     found, count = without_broken(frame_of(jnp.asarray(poisoned)))
     assert count == 1
     np.testing.assert_array_equal(found.images[0, 2, 3], 0)
+
+
+@pytest.mark.parametrize("endless", [np.nan, np.inf, np.finfo(np.float32).max])
+def test_where_depth_is_endless_it_is_unknown_and_the_colour_stays(images, endless):
+    """Regression test: its square is infinite, so that the tracker stood still."""
+    depths = np.full(images.shape[:3], 2.0, np.float32)
+    depths[0, 2, 3] = endless
+    found, count = without_broken(replace(frame_of(images), depths=depths))
+    assert count == 1
+    np.testing.assert_array_equal(found.depths, np.where(depths == 2, depths, 0))
+    np.testing.assert_allclose(found.images, images / 255, atol=1e-6)

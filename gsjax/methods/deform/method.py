@@ -26,8 +26,9 @@ from gsjax.optim.method import Run
 from gsjax.optim.step import Step, copied
 from gsjax.rasterize.plan import HEADROOM
 from gsjax.scene.deformation import init_deformation
-from gsjax.scene.frame import Frame
+from gsjax.scene.frame import Frame, with_black_gaps
 from gsjax.scene.gaussians import Gaussians, cull_invalid
+from gsjax.scene.initialize import warn_of_hidden
 from gsjax.scene.render import plan_render
 
 PLAN = "view"
@@ -127,6 +128,7 @@ class Deform:
         """
         config = self.config
         _check(frames, config, lesson)
+        frames = [with_black_gaps(frame) for frame in frames]
         if hull and first is not None:
             raise ValueError(f"first: expected None, as a hull is of all frames, found {first}")
         if hull:
@@ -141,6 +143,7 @@ class Deform:
             gaussians = start_gaussians(posed, first, config.start_pixels)
         scene = _first_scene(gaussians, config, len(frames), lesson is not None)
         means = np.asarray(scene.gaussians.means)
+        warn_of_hidden(means, frames)
         middle = np.median(means, axis=0)
         radius = float(np.quantile(np.linalg.norm(means - middle, axis=1), 0.9))
         if not radius > 0:

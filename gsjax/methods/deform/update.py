@@ -185,7 +185,7 @@ def deform_loss(config: DeformConfig, extra_losses: ExtraLosses = ()) -> Callabl
                 + weights.time_smoothness * sum(second_differences(planes) for planes in time)
                 + weights.time_sparsity * sum(jnp.abs(planes - 1).mean() for planes in time)
             )
-        mse = jnp.square(image - target).mean() / area
+        mse = jnp.square(image - target).mean() / counts.mean()  # NaN if no pixel counts, rather than 0
         meta = drawn.meta
         info = {"psnr": -10 * jnp.log10(mse), "overflow": meta.overflow.any(), "needed": meta.needed.max()}
         if extra_losses:

@@ -15,11 +15,12 @@ from jaxtyping import Float
 
 from gsjax.geometry.cameras import on_device
 from gsjax.geometry.extent import Extent, extent_of
+from gsjax.geometry.neighbors import valid_depth
 from gsjax.losses.extra import ExtraLosses, named_losses
 from gsjax.methods.fit.config import FitConfig
 from gsjax.methods.fit.model import Model, extend_state, model_of, refined, with_degree, with_slots
 from gsjax.methods.fit.padding import with_common_sizes
-from gsjax.methods.fit.start import initial_gaussians, start_points, warn_of_hidden
+from gsjax.methods.fit.start import initial_gaussians, start_points
 from gsjax.methods.fit.update import Batch, fit_step, grow, slots_wanted, split
 from gsjax.methods.sampling import shuffled_index
 from gsjax.optim.compiler import host_jit
@@ -27,8 +28,9 @@ from gsjax.optim.densification import is_alive
 from gsjax.optim.method import Run
 from gsjax.optim.step import Step
 from gsjax.rasterize.plan import HEADROOM, rung
-from gsjax.scene.frame import Frame
+from gsjax.scene.frame import Frame, with_black_gaps
 from gsjax.scene.gaussians import Gaussians, cull_invalid, take
+from gsjax.scene.initialize import warn_of_hidden
 from gsjax.scene.render import plan_render
 
 _BACKGROUND, _GROWTH = 0, 2  # folded into the seed for the keys of these purposes
@@ -99,6 +101,7 @@ class Fit:
             )
         if not any(frame.masks is None or frame.masks.any() for frame in frames):
             raise ValueError("masks: no pixel counts in any of the photographs to fit; are they inverted?")
+        frames = [with_black_gaps(frame) for frame in frames]
         extent = extent_of(np.concatenate([frame.cameras.viewmat for frame in frames]))
         points, colors, source = start_points(frames, cloud, config.start, config.seed)
         warn_of_hidden(points, frames)
@@ -236,7 +239,7 @@ def on_device_at(frames: list[Frame], view: int, shrink: int) -> Frame:
     frame = frames[view]
     image = frame.images[0]
     mask = None if frame.masks is None or _counts_all(frame) else frame.masks[0]
-    depth = None if frame.depths is None else frame.depths[0]
+    depth = None if frame.depths is None else np.where(valid_depth(frame.depths[0]), frame.depths[0], 0)
     if mask is None and not all(map(_counts_all, frames)):
         mask = np.ones(image.shape[:2], bool)
     if depth is None and any(other.depths is not None for other in frames):

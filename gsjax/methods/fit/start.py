@@ -16,7 +16,6 @@ from gsjax.scene.gaussians import Gaussians
 from gsjax.scene.initialize import gaussians_from_points, points_from_rgbd
 
 _MIN_VISIBLE = 0.1  # share of visible points below which something is wrong
-_HIDDEN = 0.5  # share of points before the near plane above which something is wrong
 _FLAT_PX = 1.0  # disparity between cameras below which the points show no depth
 
 
@@ -79,21 +78,6 @@ def _is_seen(points: Float[np.ndarray, "m 3"], frames: list[Frame]) -> bool:
             stacklevel=2,
         )
     return bool(seen.any())
-
-
-def warn_of_hidden(points: Float[np.ndarray, "m 3"], frames: list[Frame]) -> None:
-    """Warns if most of what lies ahead of the cameras is nearer than their near plane, so never drawn."""
-    axes = np.stack([frame.cameras.viewmat[0][2] for frame in frames])
-    some = points[:: 1 + len(points) // 1000]
-    depths = some @ axes[:, :3].T + axes[:, 3]
-    ahead, near = depths > 0, frames[0].cameras.near
-    if ahead.any() and (depths < near)[ahead].mean() > _HIDDEN:
-        warnings.warn(
-            f"most of the scene is nearer to the cameras than their near plane, {near:g}, and is not drawn: "
-            "is the unit of the poses far larger than the scene? Set near (--read.near) to less than "
-            f"{np.median(depths[ahead]):.2g}",
-            stacklevel=2,
-        )
 
 
 def _from_depth(frames, count, random):

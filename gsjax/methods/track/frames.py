@@ -47,7 +47,7 @@ def prepared_first(frame: Frame) -> Frame:
     expect_pinholes(frame)
     frame, broken = without_broken(frame)
     if broken:
-        warnings.warn(f"the first frame has {broken} pixels that are not finite; ignored", stacklevel=3)
+        warnings.warn(f"{broken} pixels of the first frame are not finite or endless; ignored", stacklevel=3)
     return frame
 
 

@@ -10,12 +10,12 @@ from jaxtyping import Array, Bool, Float, Int
 from scipy.cluster.vq import kmeans2
 
 from gsjax.geometry.cameras import camera_centers
-from gsjax.geometry.neighbors import voxel_thin
+from gsjax.geometry.neighbors import valid_depth, voxel_thin
 from gsjax.geometry.rotations import quats_to_matrices
 from gsjax.methods.track.config import StartConfig
 from gsjax.scene.frame import Frame
 from gsjax.scene.gaussians import Gaussians, concatenate, take
-from gsjax.scene.initialize import estimate_normals, gaussians_from_points, points_from_rgbd, valid_depth
+from gsjax.scene.initialize import estimate_normals, gaussians_from_points, points_from_rgbd
 from gsjax.scene.labels import inherit_labels, lift_labels
 
 EMPTY = -30.0

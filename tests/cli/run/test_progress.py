@@ -14,7 +14,7 @@ from rich.console import Console
 
 import gsjax.engine.progress
 from gsjax.data.errors import DataWarning
-from gsjax.engine.drive import drive
+from gsjax.engine.drive import Tick, drive
 from gsjax.engine.folder import RunFolder
 from gsjax.engine.messages import Notes
 from gsjax.engine.progress import (
@@ -84,6 +84,14 @@ def test_what_was_saved_under_another_name_is_refused(name, tmp_path):
     (tmp_path / name).write_bytes(b"of another version")
     with pytest.raises(CheckpointError, match=rf"{name}: expected a checkpoint step-\*.npz.* --overwrite in"):
         load_run(tmp_path, Run(jnp.zeros(2), None), Progress({}))
+
+
+def test_a_row_averages_the_steps_whose_value_is_finite():
+    """Regression test: one frame whose mask hides it entirely left the row without PSNR."""
+    infos = [{"loss": 1.0, "psnr": np.nan}, {"loss": 3.0, "psnr": np.inf}, {"loss": 2.0, "psnr": 20.0}]
+    now = Tick(None, None, Run(jnp.zeros(2), None), {}, 0.0, 0.0)
+    assert means_of("psnr")(now, infos) == {"loss": 2.0, "psnr": 20.0}
+    assert means_of("psnr")(now, infos[:2]) == {"loss": 2.0, "psnr": None}
 
 
 def test_a_log_says_when_a_later_step_compiles(tmp_path):

@@ -15,6 +15,7 @@ from gsjax.methods.deform import (
     PRESETS,
     Deform,
     DeformingScene,
+    DeformWeightsConfig,
     Lesson,
     can_start_from,
     nodes_of,
@@ -113,6 +114,12 @@ class TestStart:
         assert problem.first == 1
 
 
+def test_a_weight_of_dssim_above_one_is_refused():
+    """Regression test: it pushed colours away from the pictures."""
+    with pytest.raises(ValueError, match=r"weights.dssim: expected at least 0 and at most 1, found 2"):
+        DeformWeightsConfig(dssim=2)
+
+
 def test_nodes_blend_to_one_and_follow_what_is_near(frames):
     gaussians = start_gaussians(frames[:1], 0, 1.0)
     nodes, means = jax.device_get((nodes_of(gaussians, 40), gaussians.means))
@@ -173,12 +180,24 @@ class TestLearning:
     @pytest.mark.thorough
     def test_depth_that_is_not_finite_is_unknown(self, frames):
         depths = frames[0].depths.copy()
-        depths[0, 10, 10], depths[0, 11, 11] = np.nan, np.inf
+        depths[0, 10, 10], depths[0, 11, 11], depths[0, :, :9] = np.nan, np.inf, 1e10
         method = Deform(replace(CONFIG, warmup=1, iterations=0))
         ticks = drive(method, *method.start([replace(frames[0], depths=depths)]))
         info = jax.device_get(next(ticks).info)
         assert np.isfinite(info["loss"])
         assert not info["skipped"]
+        assert ticks.problem.radius < 1
+
+    @pytest.mark.thorough
+    def test_pixels_that_do_not_count_may_be_nan(self, frames):
+        """And where none counts, there is no PSNR."""
+        frame = replace(frames[0], images=frames[0].colors, masks=frames[0].masks.copy())
+        frame.images[0, :, :20], frame.masks[0, :, :20] = np.nan, False
+        covered = replace(frame, images=np.full_like(frame.images, np.nan), masks=np.zeros_like(frame.masks))
+        method = Deform(replace(CONFIG, warmup=2, iterations=0, warmup_frames="all"))
+        infos = [jax.device_get(now.info) for now in drive(method, *method.start([frame, covered]))]
+        assert not any(info["skipped"] for info in infos)
+        assert sorted(np.isnan(info["psnr"]) for info in infos) == [False, True]
 
     @pytest.mark.thorough
     def test_rates_decay_over_warm_up_and_joint_steps(self, frames):

@@ -63,6 +63,11 @@ def test_a_scene_starts_there_from_the_first_frame_with_pixels_that_count(frames
     assert (problem.bounds[1] - problem.bounds[0]).min() > 0.01 * problem.radius
 
 
+def test_a_plane_nearer_than_the_near_plane_is_named(frames):
+    with pytest.warns(UserWarning, match=r"nearer to the cameras than their near plane, .* \(--read.near\)"):
+        Deform(replace(TINY, plane_depth=0.005)).start(frames[:1])
+
+
 @pytest.mark.slow
 def test_no_depth_has_no_loss_and_learns(frames):
     method = Deform(TINY)

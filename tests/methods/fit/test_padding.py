@@ -116,6 +116,20 @@ def test_many_sizes_share_the_programs_of_one():
     assert sum(compiled[1:]) == 0
 
 
+@pytest.mark.thorough
+def test_pixels_that_do_not_count_may_be_nan_and_depth_endless():
+    frames, counts = [photograph(32, 24, i) for i in range(3)], np.ones((1, 24, 32), bool)
+    counts[0, :, :7] = False
+    depths = np.full(counts.shape, 3.0)
+    depths[0, :3], depths[0, 3:6] = np.nan, 1e300
+    for i, frame in enumerate(frames):
+        images = np.where(counts[..., None], frame.colors, np.nan)
+        frames[i] = replace(frame, images=images, depths=depths, masks=counts)
+    config = replace(CONFIG, depth_weight=1.0, coarse_until=0.6, start=StartConfig(source="random", count=60))
+    method = Fit(config)
+    assert not any(now.info["skipped"] for now in drive(method, *method.start(frames)))
+
+
 @pytest.mark.slow
 def test_light_in_the_padding_is_no_light():
     frame = photograph(32, 24)
