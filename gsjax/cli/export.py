@@ -155,7 +155,7 @@ def _check(options: Options, out: Path) -> None:
         )
     if out.exists() and out.resolve() in files_of(options.path):
         raise FileExistsError(f"{out}: expected another file than the one that is read; name another OUT")
-    if is_of_run(out, below=True):
+    if is_of_run(out):
         raise FileExistsError(f"{out}: expected another file than one that a run wrote; name another OUT")
     for file in (out, labels_beside(out)) if "labels" in format_of(out).options else (out,):
         if file.exists() and not options.overwrite:

@@ -69,12 +69,9 @@ def is_run(folder: Path) -> bool:
     return config.is_file() and config.read_bytes().startswith(SIGNATURE.encode())
 
 
-def is_of_run(file: Path, *, below: bool = False) -> bool:
-    """Whether a file is one that a run has written into its folder, or, if `below`, into a folder in it."""
-    file = file.absolute()
-    runs = [folder for folder in (file.parents if below else [file.parent]) if is_run(folder)]
-    names = [file.relative_to(run).parts[0] for run in runs]
-    return file.is_file() and any(fnmatch(name, each) for name in names for each in _WRITTEN)
+def is_of_run(file: Path) -> bool:
+    """Whether a file is one that a run has written into its folder."""
+    return file.is_file() and is_run(file.parent) and any(fnmatch(file.name, each) for each in _WRITTEN)
 
 
 def is_finished(folder: Path) -> bool:
