@@ -22,7 +22,7 @@ def photographs_digest(photographs: Photographs, fitted: np.ndarray, frames: lis
 
     Args:
         photographs: the photographs.
-        fitted: indices of those that are fitted.
+        fitted: [N], indices of those that are fitted.
         frames: all of them, in memory.
     """
     return _digest(photographs.names, fitted, frames)
