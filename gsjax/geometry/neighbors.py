@@ -71,7 +71,7 @@ def voxel_thin(points: Float[np.ndarray, "n 3"], voxel: float) -> Int[np.ndarray
 
 
 def valid_depth(depths: Float[np.ndarray, "*n"]) -> Bool[np.ndarray, "*n"]:
-    """Where depth is known: positive, and not infinite or `ENDLESS`."""
+    """Where depth is known: positive, and less than `ENDLESS`."""
     return (depths > 0) & (depths < ENDLESS)
 
 
@@ -81,8 +81,8 @@ def drop_flying_pixels(depths: Float[np.ndarray, "*c h w"]) -> Float[np.ndarray,
     A pixel lies on none if its depth is not known (`valid_depth`), or if it is a flying pixel: five or more
     of its eight neighbours have depth and fewer than two of them agree with it within 5 %, or three or four
     have depth and none agrees. Depth cameras measure flying pixels at edges, in rain and on dark or shiny
-    objects.
-    Sparse depth and lines one pixel wide are kept, but depth with more than about 3 % noise is thinned.
+    objects. Sparse depth and lines one pixel wide are kept, but depth with more than about 3 % noise is
+    thinned.
 
     Args:
         depths: depth images of any number of cameras, metres.

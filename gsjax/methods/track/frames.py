@@ -47,7 +47,8 @@ def prepared_first(frame: Frame) -> Frame:
     expect_pinholes(frame)
     frame, broken = without_broken(frame)
     if broken:
-        warnings.warn(f"{broken} pixels of the first frame are not finite or endless; ignored", stacklevel=3)
+        message = f"the first frame has {broken} pixels that are not finite, or endlessly far; ignored"
+        warnings.warn(message, stacklevel=3)
     return frame
 
 
