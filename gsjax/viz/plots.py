@@ -22,11 +22,16 @@ _SIZE = 6.4, 3.4  # of a plot, inches
 _DASHED, _TARGET_HZ = (0, (5, 3)), 30
 
 
-def update_time(update_s: Float[np.ndarray, "frames"]) -> Figure:
-    """Update times over frames, with their median and 95th percentile, against 30 Hz; NaN is left out."""
+def update_time(update_s: Float[np.ndarray, "frames"], frames: Sequence[int] | None = None) -> Figure:
+    """Update times over frames, with their median and 95th percentile, against 30 Hz; NaN is left out.
+
+    Args:
+        update_s: of each frame, seconds.
+        frames: numbers of the frames (default: counted from 0); there may be more than values.
+    """
     figure, axes = _new("Time of one update", "frame", "ms")
     ms = np.asarray(update_s, float) * 1e3
-    axes.plot(ms, color=_BLUE, lw=1.1, marker="o", ms=2.2, mew=0)
+    axes.plot(_numbers(frames, ms), ms, color=_BLUE, lw=1.1, marker="o", ms=2.2, mew=0)
     if np.isfinite(ms).any():
         median, p95 = np.nanpercentile(ms, [50, 95])
         axes.axhline(median, color=_BLUE, lw=1.4, alpha=0.9)
@@ -48,6 +53,7 @@ def error_over_frames(
     errors_mm: Mapping[str, Float[np.ndarray, "frames"]],
     labels: Mapping[str, int] | None = None,
     limit_mm: float | None = None,
+    frames: Sequence[int] | None = None,
 ) -> Figure:
     """Position error of each object in mm, one line per object.
 
@@ -55,10 +61,12 @@ def error_over_frames(
         errors_mm: name to error in each frame; NaN where there is no ground truth.
         labels: name to label, which gives the line its colour (default: counted from 1).
         limit_mm: a target, drawn dashed.
+        frames: as for `update_time`.
     """
     figure, axes = _new("Centroid error", "frame", "mm")
     for i, (name, error) in enumerate(errors_mm.items()):
-        axes.plot(error, color=_rgb(labels[name] if labels else i + 1), lw=1.6, label=name)
+        color = _rgb(labels[name] if labels else i + 1)
+        axes.plot(_numbers(frames, error), error, color=color, lw=1.6, label=name)
     if limit_mm is not None:
         axes.axhline(limit_mm, color=FAINT, lw=1.0, ls=_DASHED)
         _margin_label(axes, limit_mm, f"{limit_mm:g} mm", FAINT)
@@ -127,18 +135,21 @@ def fit_curves(runs: Mapping[str, Sequence[Mapping[str, float | None]]]) -> Figu
 def psnr_over_frames(
     tracked: Mapping[str, Float[np.ndarray, "frames"]],
     held_out: Mapping[str, Float[np.ndarray, "frames"]] | None = None,
+    frames: Sequence[int] | None = None,
 ) -> Figure:
     """PSNR in dB over frames, one line per camera: solid for tracked cameras, dashed for held-out ones.
 
     Args:
         tracked: camera to PSNR of each frame.
         held_out: the same for cameras that the method did not see.
+        frames: as for `update_time`.
     """
     figure, axes = _new("PSNR", "frame", "dB")
     lines = [(n, v, "-", "tracked") for n, v in tracked.items()]
     lines += [(n, v, (0, (4, 2)), "held out") for n, v in (held_out or {}).items()]
     for i, (name, values, style, kind) in enumerate(lines):
-        axes.plot(values, color=_rgb(i + 1), lw=1.6, ls=style, label=f"{name} ({kind})")
+        label = f"{name} ({kind})"
+        axes.plot(_numbers(frames, values), values, color=_rgb(i + 1), lw=1.6, ls=style, label=label)
     _legend(figure, axes)
     return figure
 
@@ -186,6 +197,10 @@ def save(figure: Figure, path: str | Path) -> Path:
     with matplotlib.rc_context({"svg.hashsalt": "gsjax"}):
         figure.savefig(path, dpi=160, metadata=metadata)
     return path
+
+
+def _numbers(frames: Sequence[int] | None, values: Float[np.ndarray, "frames"]) -> Sequence[int]:
+    return (range(len(values)) if frames is None else frames)[: len(values)]
 
 
 def _new(title: str, xlabel: str, ylabel: str) -> tuple[Figure, Axes]:

@@ -15,6 +15,7 @@ from rich.console import Console
 from gsjax.data import open_sequence
 from gsjax.data.objects import Truth
 from gsjax.engine.messages import Notes
+from gsjax.engine.parts.outputs import _note_absences
 from gsjax.engine.parts.run import Options, _warn_if_doubtful
 from gsjax.engine.parts.scoring import part_rows, score_parts, warn_of_runaways
 from gsjax.engine.recording import Recording
@@ -62,6 +63,16 @@ def test_a_part_is_compared_in_the_frames_in_which_it_is_there(absent, rests, an
     assert row["axis_deg"] < 0.1
     assert row["value_mm"] < 0.1
     assert row["point_error_mm"] < 0.1
+
+
+def test_the_frames_without_a_part_have_their_numbers_in_the_data():
+    _, trajectory = scene_and_trajectory()
+    shown = np.ones((4, 3), np.float32)
+    shown[[0, 1, 3], 1] = 0
+    notes = Notes(Console(quiet=True))
+    trajectory = eqx.tree_at(lambda t: t.opacities, trajectory, shown)
+    _note_absences(trajectory, np.ones(4, bool), (100, 105, 110, 115), notes)
+    assert notes.all == ["Part 1 is not there in 3 of 4 frames: 100 to 105, 115."]
 
 
 def test_the_error_of_points_is_their_distance_from_where_they_truly_are():

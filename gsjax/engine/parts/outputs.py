@@ -1,5 +1,6 @@
 """The files of a run of `gsjax parts`: parts.npz, scene.ply, videos, and the scores in metrics.json."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -69,7 +70,7 @@ def write_outputs(
             notes.warn(f"scoring was stopped after {counted(scores.num_frames, 'frame')} by {reason(error)}")
             progress.stopped = error if isinstance(error, KeyboardInterrupt) else None
     rows, against_truth = part_rows(scene, trajectory, joints), {}
-    _note_absences(trajectory, found.done, notes)
+    _note_absences(trajectory, found.done, recording.tracked.frame_ids, notes)
     warn_of_runaways(rows, scene, notes)
     for row in rows if origin is not None else ():
         row["point"] = None if row["point"] is None else in_world(np.array(row["point"]), origin).tolist()
@@ -115,19 +116,23 @@ def write_outputs(
     }
 
 
-def _note_absences(trajectory: Trajectory, done: Bool[np.ndarray, "T"], notes: Notes) -> None:
-    """Note which parts are absent in which frames."""
+def _note_absences(
+    trajectory: Trajectory, done: Bool[np.ndarray, "T"], frame_ids: Sequence[int], notes: Notes
+) -> None:
+    """Note which parts are absent in which frames, by their numbers in the data."""
     absent = (np.asarray(trajectory.opacities) == 0) & done[:, None]
     for part in np.flatnonzero(absent.any(0)).tolist():
         frames = np.flatnonzero(absent[:, part]).tolist()
-        notes.add(f"Part {part} is not there in {len(frames)} of {int(done.sum())} frames: {_runs(frames)}.")
+        where = _runs(frames, frame_ids)
+        notes.add(f"Part {part} is not there in {len(frames)} of {int(done.sum())} frames: {where}.")
 
 
-def _runs(frames: list[int]) -> str:
-    """Frames as ranges of consecutive ones: "3 to 5, 9"."""
+def _runs(frames: list[int], frame_ids: Sequence[int]) -> str:
+    """Frames as ranges of consecutive ones, by their numbers: "3 to 5, 9"."""
     ends = [t for t in frames if t + 1 not in frames]
     begins = [t for t in frames if t - 1 not in frames]
-    return ", ".join(f"{a} to {b}" if b > a else f"{a}" for a, b in zip(begins, ends, strict=True))
+    numbers = ((frame_ids[a], frame_ids[b]) for a, b in zip(begins, ends, strict=True))
+    return ", ".join(f"{a} to {b}" if b != a else f"{a}" for a, b in numbers)
 
 
 def write_parts(

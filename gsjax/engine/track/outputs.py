@@ -108,12 +108,13 @@ def write_plots(
         written.append(Media(plots.save(figure, folder.plot(name)), caption))
 
     labels, moved = {name: label for label, name in names.items()}, tracking.num_frames > 1
+    frames = recording.tracked.frame_ids
     scored = {names[k]: s.centroid_errors_mm for k, s in motion.items() if k in names and s.num_scored}
     if moved and scored:
-        figure = plots.error_over_frames(scored, labels, limit_mm=5.0)
+        figure = plots.error_over_frames(scored, labels, limit_mm=5.0, frames=frames)
         keep("centroid_error", figure, "Distance of each object's centroid from the truth")
     if moved:
-        times = plots.update_time(np.array([np.nan, *tracking.update_s[1:]]))
+        times = plots.update_time(np.array([np.nan, *tracking.update_s[1:]]), frames)
         keep("update_time", times, "Time of each update, without compiling")
     if scores.num_frames > 1:
         held_out, tracked = (
@@ -124,7 +125,7 @@ def write_plots(
             }
             for kind in (True, False)
         )
-        keep("psnr", plots.psnr_over_frames(tracked, held_out), "PSNR of rendered pictures")
+        keep("psnr", plots.psnr_over_frames(tracked, held_out, frames), "PSNR of rendered pictures")
     if moved:
         paths = _centroids(tracking, names, group_labels)
         both = paths, _true_paths(recording, tracking, paths, names)

@@ -1,5 +1,6 @@
 """A run of `gsjax track`: a recording in, a folder with the tracked scene, its scores and a report out."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -200,7 +201,7 @@ def _evaluate(
     found = _run_metrics(tracking, recording, mask, scores, budget_ms, tracking.stopped or failed)
     found |= metrics(tracking, recording, mask, scores, motion, values, true_labels)
     _note_unscored(found, tracking, recording, mask, values, notes)
-    _note_lost(found, tracking, values, names, notes)
+    _note_lost(found, tracking, values, names, recording.tracked.frame_ids, notes)
     media = {
         "plots": write_plots(folder, tracking, recording, scores, motion, names, labels),
         "images": write_first_mask(folder, recording, mask),
@@ -314,9 +315,11 @@ def _note_lost(
     tracking: Tracking,
     values: np.ndarray | None,
     names: dict[int, str],
+    frame_ids: Sequence[int],
     notes: Notes,
 ) -> None:
-    """Note when each object was lost, its rotation unknown, in doubt at the end, or seen by no camera."""
+    """Note when each object was lost, its rotation unknown, in doubt at the end, or seen by no camera, in
+    frames by their numbers in the data."""
     groups = labels_of_groups(tracking, values)[1:]
     unseen = (~np.asarray(tracking.visible, bool).reshape(len(tracking.visible), len(groups))).sum(axis=0)
     labels = sorted({*groups.tolist()})
@@ -325,14 +328,14 @@ def _note_lost(
         lost = 1 + np.flatnonzero(lost_over_frames(tracking, values, label))
         to_the_end = len(lost) > 0 and lost[-1] == tracking.num_frames - 1
         if len(lost):
-            last = "the end" if to_the_end else str(lost[-1])
-            between = f"between {lost[0]} and {last}" if len(lost) > 1 or to_the_end else f"number {lost[0]}"
+            first, last = frame_ids[lost[0]], "the end" if to_the_end else frame_ids[lost[-1]]
+            between = f"between {first} and {last}" if len(lost) > 1 or to_the_end else f"number {first}"
             notes.say(f"{names[label]}: lost in {counted(len(lost), 'frame')}, {between}.")
         unknown = turn_unknown_from(tracking, values, label)
         begins = lost[np.diff(lost, prepend=-1) > 1]  # where each loss begins; frame 0 is never lost
         if unknown is not None and (not to_the_end or unknown < begins[-1]):
             why = "it was lost then" if unknown in lost else "other rotations agree as well"
-            notes.say(f"{names[label]}: its rotation is unknown from frame {unknown} on: {why}.")
+            notes.say(f"{names[label]}: its rotation is unknown from frame {frame_ids[unknown]} on: {why}.")
         agrees = found["objects"][names[label]]["agrees_last"] if label else None
         if agrees is not None and agrees < DOUBTFUL and not to_the_end:
             notes.say(

@@ -273,10 +273,10 @@ def test_what_the_masks_count_as_background_has_that_name_when_it_is_lost():
     flags = {"lost": [no, yes], "visible": [yes, no], "turn_known": [yes, yes], "agrees": [np.ones(1)] * 2}
     tracking = Mock(spec=Tracking, num_frames=3, scene=SimpleNamespace(label_ids=(0, 4)), **flags)
     notes = Notes(Console(quiet=True))
-    _note_lost({"objects": {}}, tracking, np.array([0, 0]), {}, notes)
+    _note_lost({"objects": {}}, tracking, np.array([0, 0]), {}, (100, 105, 110), notes)
     name = "a segment that the recording's masks count as background"
     assert notes.all == [
-        f"{name}: lost in 1 frame, between 2 and the end.",
+        f"{name}: lost in 1 frame, between 110 and the end.",  # the number of the frame in the data
         f"{name}: no camera saw it, or one of its rigid parts, in 1 frame; it was not moved then.",
     ]
 
