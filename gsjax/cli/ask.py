@@ -110,5 +110,6 @@ def _list(result: DeformResult) -> None:
     console.print(f"F and G are frames: [bold]{frames.min()} to {frames.max()}[/]\n", soft_wrap=True)
     table = Table("type", "question", "answer", box=None, padding=(0, 3, 0, 0))
     for kind in QUESTIONS:
-        table.add_row(f"[bold cyan]{kind.name}[/]", kind.example, kind.gives)
+        gives = kind.gives if result.timeline.metric else kind.gives.replace(" mm", " % of the depth")
+        table.add_row(f"[bold cyan]{kind.name}[/]", kind.example, gives)
     console.print(table)

@@ -100,6 +100,10 @@ def test_a_scene_that_began_on_a_plane_has_no_millimetres(gsjax, tmp_path):
         deep = re.search(r"tool is ([\d.]+) % of the depth deep", said)
         assert deep is not None, said
         assert float(deep[1]) == pytest.approx(per_cent, abs=2)
+    code, said = gsjax("ask", run)
+    assert code == 0
+    assert re.search(r"\bmm\b", said) is None
+    assert said.count("% of the") == 5
 
 
 def test_without_a_question_it_says_what_can_be_asked(gsjax, scene, tmp_path):
