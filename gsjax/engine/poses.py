@@ -1,6 +1,7 @@
 """A run of `gsjax poses`: photographs without poses in, a dataset with cameras out."""
 
 import os
+import shlex
 import shutil
 import tempfile
 from collections import Counter
@@ -98,7 +99,7 @@ def run(options: Options) -> int:
             found["compared"] = compare(photographs, reference)
             write_json(options.out / REPORT, found)
     print_facts(_facts(found), title=str(options.out))
-    print(f"\nNext: gsjax fit {options.out} --out RUN")
+    print(f"\nNext: gsjax fit {shlex.quote(str(options.out))} --out RUN")
     return 0
 
 

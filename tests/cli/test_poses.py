@@ -1,6 +1,7 @@
 """`gsjax poses`: from pictures without poses to a dataset that `gsjax fit` opens."""
 
 import json
+import shlex
 import shutil
 import sys
 from dataclasses import replace
@@ -82,11 +83,12 @@ def test_the_report_says_what_was_found_and_what_was_left(found):
 @pytest.mark.thorough
 def test_again_gives_the_same_bits_and_compares(found, photographs, say, tmp_path):
     """In place this time: the photographs stay where they are."""
-    folder = tmp_path / "mine/images"
+    folder = tmp_path / "my data/images"
     shutil.copytree(photographs, folder)
     before = {path: path.stat().st_mtime_ns for path in folder.iterdir()}
     code, said = say(folder, "--out", folder.parent, "--compare", found)
     assert code == 0, said
+    assert f"Next: gsjax fit {shlex.quote(str(folder.parent))} --out RUN" in said
     assert f"{COUNT} of {COUNT + 1} photographs" in said
     assert "1: else.png" in said
     assert f"with {COUNT} of dataset: turned by 0.000°" in " ".join(said.split())

@@ -1,5 +1,7 @@
 """The summary of a distillation: agreement with the teacher, classes, and pictures of the features."""
 
+import shlex
+
 from gsjax.engine.folder import RunFolder
 from gsjax.engine.messages import counted
 from gsjax.engine.summary import (
@@ -71,6 +73,6 @@ def summarize(folder: RunFolder, found: Metrics) -> Summary:
         ],
         notes=[*names, *found["notes"]],
         machine=found["machine"],
-        hints=[("query it", f"gsjax query {folder.path} {asked_by(found['features'])}")],
+        hints=[("query it", f"gsjax query {shlex.quote(str(folder.path))} {asked_by(found['features'])}")],
         complete=found["complete"],
     )

@@ -1,6 +1,7 @@
 """A run of `gsjax distill`: a scene and its photographs in, a folder with a field and a report out."""
 
 import dataclasses
+import shlex
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
@@ -130,8 +131,9 @@ def run(options: Options) -> int:
             """Writes the field of the solution, which can be queried while it is trained further."""
             if now.step == solved < total:
                 write_field(folder.path / NAME, now.result)
-                ask = f"gsjax query {out} {asked_by(teaching.source.kind)}"
-                words = f"a first answer is there: {ask}, or gsjax view {out}"
+                field = shlex.quote(str(out))
+                ask = f"gsjax query {field} {asked_by(teaching.source.kind)}"
+                words = f"a first answer is there: {ask}, or gsjax view {field}"
                 console.print(Text(words), soft_wrap=True)
 
         watch(ticks, progress, schedule, folder, console, budget=budget, evaluate=first_answer)

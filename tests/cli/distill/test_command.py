@@ -1,5 +1,6 @@
 """`gsjax distill` on bad folders, options and views, and runs that are resumed with other data."""
 
+import shlex
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -84,15 +85,17 @@ def test_views_that_are_odd_cost_nothing_but_themselves(gsjax, recording, scene,
     seen = cv2.imread(str(recording / "seg/2/000001.png"), cv2.IMREAD_UNCHANGED)
     cv2.imwrite(str(recording / "seg/2/000001.png"), np.where(seen == 2, 77, np.where(seen == 3, 0, seen)))
     told = ("--images", recording, "--frames", "0:2", "--eval-cameras", 2, "--features", "closed", *SMALL)
-    code, said = gsjax("distill", scene, "--out", tmp_path / "field", *told, "--distill.iterations", 2)
+    field = tmp_path / "my field"
+    code, said = gsjax("distill", scene, "--out", field, *told, "--distill.iterations", 2)
     assert code == 0, said
+    assert f"query it gsjax query {shlex.quote(str(field))} TEXT" in " ".join(said.split())
     assert "no mask says anything teach nothing: 1/0, 1/1" in said
     assert said.count("teach nothing") == 1
-    found = metrics(tmp_path / "field")
+    found = metrics(field)
     assert found["views"] == {"taught": 2, "held_out": 2}
     assert [row["cosine"] is None for row in found["scores"]] == [True, False]
     assert any("2/0 was not compared" in n and "ims/2/000000.png" in n for n in found["notes"])
-    assert all((tmp_path / "field" / row["picture"]).is_file() for row in found["scores"])
+    assert all((field / row["picture"]).is_file() for row in found["scores"])
 
 
 @pytest.mark.thorough
