@@ -51,7 +51,7 @@ def show(scene: Any, *, up: str | Sequence[float] | None = None, height: int = 4
             result of `gsjax.track`, `parts` or `deform`; a film of edited parts, layers in a tuple; what
             `gsjax.open_scene` opened, or a path as for it.
         up: the up direction, [3], or by its name: "z", "-y" (default: that of a run's photographs; for a path
-            of files -y, as in most; else +z).
+            without any -y, as in most files; else +z).
         height: height of the page in the cell, pixels.
 
     Raises:
@@ -82,10 +82,10 @@ def page_options(scene: Viewable, frames: range, path: Path | None) -> dict[str,
     from gsjax.viz.viewer.cameras import first_pose, scene_up
     from gsjax.viz.viewer.player import frame_pause
 
-    of_files = path is not None and bool(files_of(path))
+    unknown = path is not None and scene.shots is None  # then -y, as in most files
     options: dict[str, Any] = {
         "antialiased": scene.antialiased,
-        "up": [0.0, -1.0, 0.0] if of_files else scene_up(scene).tolist(),
+        "up": [0.0, -1.0, 0.0] if unknown else scene_up(scene).tolist(),
         "background": scene.background,
     }
     if scene.shots is not None:  # outdoor fits have Gaussians far beyond what was photographed

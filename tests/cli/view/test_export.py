@@ -47,6 +47,7 @@ def test_photographs_that_are_gone_are_missed_by_a_page_alone(export, fitted, tm
     settings = (fitted / "config.yml").read_text()
     (fitted / "config.yml").write_text(re.sub("(?m)^data(set)?: .*", r"data\1: /gone/away", settings))
     assert "its photographs are not shown: " in export(fitted, tmp_path / "scene.html")[1]
+    assert '"up": [0.0, -1.0, 0.0]' in (tmp_path / "scene.html").read_text()  # as of its scene.ply
     assert "warning" not in export(fitted, tmp_path / "scene.spz")[1]
 
 
