@@ -82,7 +82,7 @@ def page_options(scene: Viewable, frames: range, path: Path | None) -> dict[str,
     from gsjax.viz.viewer.cameras import first_pose, scene_up
     from gsjax.viz.viewer.player import frame_pause
 
-    unknown = path is not None and scene.shots is None  # then -y, as in most files
+    unknown = path is not None and scene.up is None and scene.shots is None  # then -y, as in most files
     options: dict[str, Any] = {
         "antialiased": scene.antialiased,
         "up": [0.0, -1.0, 0.0] if unknown else scene_up(scene).tolist(),
