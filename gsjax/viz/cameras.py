@@ -8,7 +8,7 @@ from jaxtyping import Float
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 
-from gsjax.viz.plots import FAINT, INK, style_axes
+from gsjax.viz.plots import FAINT, INK, literal, style_axes
 from gsjax.viz.viewer.cameras import up_direction
 
 _FRUSTUM = 0.05  # length of a drawn frustum, as a fraction of the extent of the picture
@@ -67,7 +67,7 @@ def cameras_and_points(
     span = high - low
     tall = np.clip(_PANEL * max(span[1], span[2]) / span[0], *_HEIGHTS)
     figure = Figure(figsize=(2 * _PANEL + 1, tall + 1.2), facecolor="white", layout="constrained")
-    figure.suptitle(title, x=0.01, ha="left", fontsize=13, fontweight="bold", color=INK)
+    figure.suptitle(literal(title), x=0.01, ha="left", fontsize=13, fontweight="bold", color=INK)
     above, side = figure.subplots(1, 2)
     length = _FRUSTUM * float(np.max(span))
     order = _thinned(np.flatnonzero(inside), _DRAWN_POINTS)

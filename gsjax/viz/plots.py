@@ -66,7 +66,7 @@ def error_over_frames(
     figure, axes = _new("Centroid error", "frame", "mm")
     for i, (name, error) in enumerate(errors_mm.items()):
         color = _rgb(labels[name] if labels else i + 1)
-        axes.plot(_numbers(frames, error), error, color=color, lw=1.6, label=name)
+        axes.plot(_numbers(frames, error), error, color=color, lw=1.6, label=literal(name))
     if limit_mm is not None:
         axes.axhline(limit_mm, color=FAINT, lw=1.0, ls=_DASHED)
         _margin_label(axes, limit_mm, f"{limit_mm:g} mm", FAINT)
@@ -110,7 +110,7 @@ def losses_over_steps(rows: Sequence[Mapping[str, float | None]]) -> Figure:
     for i, name in enumerate(names):
         values = np.array([row[name] or np.nan for row in rows], float)
         if np.isfinite(values).any():
-            axes.plot(steps, values, color=_rgb(i + 1), lw=1.4, label=name)
+            axes.plot(steps, values, color=_rgb(i + 1), lw=1.4, label=literal(name))
     axes.set_yscale("log")
     _legend(figure, axes)
     return figure
@@ -125,8 +125,9 @@ def fit_curves(runs: Mapping[str, Sequence[Mapping[str, float | None]]]) -> Figu
     figure, axes = _new("Held-out PSNR", "minutes", "dB")
     for i, (name, rows) in enumerate(runs.items()):
         minutes, psnr = _held_out_psnr(rows)
-        axes.plot(minutes, psnr, color=_rgb(i + 1), lw=1.6, marker="o", ms=2.6, mew=0, label=name)
-        axes.plot(minutes[-1:], psnr[-1:], color=_rgb(i + 1), marker="o", ms=7, mfc="white", mew=1.6)
+        color = _rgb(i + 1)
+        axes.plot(minutes, psnr, color=color, lw=1.6, marker="o", ms=2.6, mew=0, label=literal(name))
+        axes.plot(minutes[-1:], psnr[-1:], color=color, marker="o", ms=7, mfc="white", mew=1.6)
     axes.set_xlim(left=0)
     _legend(figure, axes)
     return figure
@@ -175,7 +176,7 @@ def trajectories(
             color = _rgb(labels[name] if labels else i + 1)
             if truth and name in truth:
                 panel.plot(*np.asarray(truth[name])[:, plane].T, color=INK, lw=0.9, alpha=0.55)
-            panel.plot(*np.asarray(path)[:, plane].T, color=color, lw=2.0, label=name)
+            panel.plot(*np.asarray(path)[:, plane].T, color=color, lw=2.0, label=literal(name))
             finite = np.asarray(path)[np.isfinite(path).all(axis=1)][:, plane]
             if len(finite):
                 panel.plot(*finite[:1].T, color=color, marker="o", ms=7, mfc="white", mew=1.6)
@@ -197,6 +198,12 @@ def save(figure: Figure, path: str | Path) -> Path:
     with matplotlib.rc_context({"svg.hashsalt": "gsjax"}):
         figure.savefig(path, dpi=160, metadata=metadata)
     return path
+
+
+def literal(name: str) -> str:
+    """A name as matplotlib draws it letter by letter: it would leave one that begins with _ out of a legend,
+    and typeset what stands between two $."""
+    return ("\u200b" if name.startswith("_") else "") + name.replace("$", r"\$")
 
 
 def _numbers(frames: Sequence[int] | None, values: Float[np.ndarray, "frames"]) -> Sequence[int]:

@@ -92,7 +92,7 @@ def test_an_oblique_world_has_axes_of_its_own():
     ],
 )
 def test_little_or_nothing_to_draw(groups, points, tmp_path):
-    figure = cameras_and_points(groups, points)
+    figure = cameras_and_points(groups, points, title=r"$\room$")  # no command to typeset
     assert save(figure, tmp_path / "a.png").stat().st_size > 5000
     for panel in figure.axes:
         assert np.isfinite([*panel.get_xlim(), *panel.get_ylim()]).all()

@@ -52,6 +52,14 @@ def test_curves_of_fits_leave_out_rows_without_evaluation():
     assert all(len(line.get_xdata()) == 0 for line in never)
 
 
+@pytest.mark.filterwarnings("error")
+def test_names_are_drawn_letter_by_letter(tmp_path):
+    names = ["_old", r"a$\d$b", "$x"]
+    figure = plots.fit_curves({name: [{"seconds": 60.0, "test_psnr": 20.0}] for name in names})
+    drawn = plots.save(figure, tmp_path / "curves.svg").read_text()
+    assert all(f"{name} -->" in drawn for name in names)  # each text is also a comment
+
+
 def test_trajectories_survive_gaps_and_absent_objects(tmp_path):
     path = np.cumsum(np.ones((10, 3)) * 0.01, axis=0)
     path[3] = np.nan
