@@ -266,7 +266,8 @@ def _apply_colormap(name: str, values: np.ndarray) -> np.ndarray:
 
 
 def captioned(picture: UInt8[np.ndarray, "h w 3"], text: str) -> UInt8[np.ndarray, "h w 3"]:
-    """The picture with its caption on a dark chip in the upper left corner, sized by the picture's height."""
+    """The picture with its caption on a dark chip in the upper left corner, sized by the picture's height; a
+    caption that is too wide loses its beginning."""
     picture = picture.copy()
     _write(picture, text)
     return picture
@@ -275,8 +276,12 @@ def captioned(picture: UInt8[np.ndarray, "h w 3"], text: str) -> UInt8[np.ndarra
 def _write(picture: UInt8[np.ndarray, "h w 3"], text: str, beside: tuple[int, int] | None = None) -> None:
     """Draw text on a dark chip, in place: in the upper left corner, or left of `beside` (column, row)."""
     scale = max(len(picture) / 650, 0.42)
-    (text_width, text_height), baseline = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, scale, 1)
     pad = round(5 * scale) + 2
+    while True:
+        (text_width, text_height), baseline = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, scale, 1)
+        if text_width + 2 * pad <= picture.shape[1] or len(text) <= 4:
+            break
+        text = "..." + text[4:]
     wide, high = text_width + 2 * pad, text_height + baseline + 2 * pad
     left, top = (0, 0) if beside is None else (max(beside[0] - wide, 0), max(beside[1] - high // 2, 0))
     chip = picture[top : top + high, left : left + wide]

@@ -124,6 +124,16 @@ def test_what_is_highlighted_keeps_its_colours_and_the_rest_loses_them():
     assert (image == (200, 40, 40)).all()
 
 
+def test_a_caption_that_is_too_wide_loses_its_beginning():
+    name = "name" * 50
+    blank = np.zeros((60, 400, 3), np.uint8)
+    short, same, other = (
+        colors.captioned(blank, text) for text in (f"{name}1 dB", f"a {name}1 dB", f"{name}2 dB")
+    )
+    np.testing.assert_array_equal(short, same)
+    assert (short != other).any()
+
+
 def test_labels_have_their_numbers_where_there_is_room():
     labels = np.zeros((240, 320), int)
     labels[40:140, 60:160] = 7
