@@ -88,6 +88,9 @@ class _Encoder:
         # Takes a quarter of the time of x264's default for files no larger; runs film every camera.
         target = ["-c:v", "libx264", "-preset", "veryfast", "-crf", quality]
         target += ["-pix_fmt", "yuv420p", "-movflags", "+faststart"]
+        # ffmpeg's matrix for RGB, which old OpenCV assumes too; without a name, browsers take another for
+        # videos of 720 rows and more.
+        target += ["-colorspace", "smpte170m", "-color_range", "tv"]
         # Its messages go to a file, because an unread pipe would fill up and block it.
         self._messages = tempfile.TemporaryFile()  # noqa: SIM115  (`finish` closes it)
         # imageio-ffmpeg's own writer forks with a `preexec_fn`, which may deadlock with JAX's threads.

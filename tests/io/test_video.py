@@ -10,7 +10,7 @@ import time
 import numpy as np
 import pytest
 
-from gsjax.io.video import VideoWriter, read_video_frames
+from gsjax.io.video import VideoWriter, _ffmpeg, read_video_frames
 
 
 def ramp(index, height=32, width=48):
@@ -36,6 +36,14 @@ def test_a_colon_in_a_relative_path_is_no_protocol(tmp_path, monkeypatch):
     with VideoWriter("12:30/a.mp4", fps=10) as video:
         video.write(ramp(0))
     assert len(read_video_frames("12:30/a.mp4")) == 1
+
+
+def test_a_video_names_its_colour_matrix(tmp_path):
+    """Players guess otherwise, and differ from 720 rows on."""
+    with VideoWriter(tmp_path / "a.mp4", fps=10) as video:
+        video.write(ramp(0))
+    told = subprocess.run([_ffmpeg(), "-i", tmp_path / "a.mp4"], capture_output=True, text=True).stderr
+    assert "yuv420p(tv, smpte170m" in told
 
 
 def test_odd_sizes_are_padded_and_bytes_taken(tmp_path):
