@@ -1,7 +1,7 @@
 """Neighbour queries on the host, for building point sets; nothing here runs inside a jitted step."""
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, Num
 from scipy.spatial import cKDTree
 
 ENDLESS = 1e6
@@ -70,7 +70,7 @@ def voxel_thin(points: Float[np.ndarray, "n 3"], voxel: float) -> Int[np.ndarray
     return np.sort(order[first])
 
 
-def valid_depth(depths: Float[np.ndarray, "*n"]) -> Bool[np.ndarray, "*n"]:
+def valid_depth(depths: Num[np.ndarray, "*n"]) -> Bool[np.ndarray, "*n"]:
     """Where depth is known: positive, and less than `ENDLESS`."""
     return (depths > 0) & (depths < ENDLESS)
 

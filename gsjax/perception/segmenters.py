@@ -16,6 +16,7 @@ from skimage.color import rgb2lab
 from skimage.segmentation import felzenszwalb
 
 from gsjax.geometry.cameras import unproject
+from gsjax.geometry.neighbors import valid_depth
 from gsjax.perception.masks import name_by_size
 from gsjax.perception.pictures import unit_floats
 from gsjax.perception.planes import find_levels, find_planes, surface_normals
@@ -73,7 +74,7 @@ class PlaneSegmenter:
             raise ValueError("depth, K: expected both, found None; without depth use RegionSegmenter")
         if image.shape[:2] != depth.shape:
             raise ValueError(f"depth: expected shape {image.shape[:2]} to match image, found {depth.shape}")
-        valid = _valid(depth)
+        valid = valid_depth(depth)
         if not valid.any():
             raise ValueError(
                 "depth: expected positive, finite pixels, found none; without depth use RegionSegmenter"
@@ -176,7 +177,7 @@ class PlaneOrRegionSegmenter:
         K: Float[np.ndarray, "3 3"] | None = None,
     ) -> Int[np.ndarray, "image_H image_W"]:
         """Labels of an image: 0 for background, then 1, 2, ... by size. Errors are the chosen segmenter's."""
-        if depth is None or K is None or not _valid(depth).any():
+        if depth is None or K is None or not valid_depth(depth).any():
             return self.region(image)
         return self.plane(image, depth, K)
 
@@ -206,13 +207,9 @@ class PieceSegmenter:
     ) -> Int[np.ndarray, "image_H image_W"]:
         """Labels of an image: 0 for background, then 1, 2, ... by size."""
         regions = self.region(image)
-        if depth is not None and K is not None and _valid(depth).any():
+        if depth is not None and K is not None and valid_depth(depth).any():
             regions = np.where(self.plane(image, depth, K) > 0, regions, 0)
         return name_by_size(regions, self.min_pixels)
-
-
-def _valid(depth: Num[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"]:
-    return np.isfinite(depth) & (depth > 0)
 
 
 def _camera_points(depth: np.ndarray, K: np.ndarray) -> Float[np.ndarray, "H W 3"]:

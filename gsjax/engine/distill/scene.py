@@ -125,11 +125,9 @@ def scene_of_run(path: Path, images: str | None = None, read_scene: Read | None 
         if images is not None:
             raise ValueError(f"--images: a run of `gsjax {record.kind}` knows its recording; leave it out")
         recording, _ = reopen(path / "config.yml", _AGAIN)
-        at = (
-            0
-            if record.kind == "track"
-            else int(read_arrays(path / "parts.npz", ("anchor",), _AGAIN)["anchor"])
-        )
+        at = 0
+        if record.kind == "parts":
+            at = int(read_arrays(path / "parts.npz", ("anchor",), _AGAIN)["anchor"])
         first = relative_to_scene(recording, report.origin).judged.select(frames=slice(at, at + 1))
         indices, count = list(range(first.num_cameras)), recording.tracked.num_cameras
         return FieldScene(file, gaussians, photographs_of(first), indices[:count], indices[count:])
